@@ -1,0 +1,29 @@
+"""Errors that say what was wrong and what to do about it.
+
+>>> raise unknown_name("search", "halten", ["uniform", "halton"])
+UnknownNameError: unknown search 'halten'; did you mean 'halton'? Known: uniform, halton.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UnknownNameError(ValueError):
+    """A name that does not exist, with the nearest ones that do."""
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownNameError:
+    """The error to raise for `name`, which is none of the `known` names of this `kind`."""
+    known = [str(k) for k in known]
+    near = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
+    hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else "."
+    listing = f" Known: {', '.join(known)}." if known else f" There is no {kind} at all."
+    return UnknownNameError(f"unknown {kind} {name!r}{hint}{listing}")
+
+
+def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `UnknownNameError` for the first of `names` that is not `known`."""
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known)

@@ -1,0 +1,134 @@
+"""What a simulation leaves behind: named signals on one clock.
+
+    Trace({"x": xs, "theta": thetas}, dt=0.02)
+    Trace({"x": xs}, times=ts)                              # a recording, not evenly sampled
+    Trace({"x": xs}, dt=0.02, valid=k)                      # ended early: k samples count
+
+A trace is a pytree, so `jax.vmap` over a system gives a batch of traces.
+"""
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class Status(enum.IntEnum):
+    """How a simulation ended. Only `OK` rows carry a verdict."""
+
+    OK = 0
+    NONFINITE = 1
+    ERROR = 2
+    TIMEOUT = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Signals of one simulation, sampled on one clock.
+
+    **Arguments:**
+
+    - `signals`: name -> array `[time]` or `[time, k]`; all with the same `time`.
+    - `dt`: sampling period in seconds. Exactly one of `dt` and `times` is given.
+    - `times`: `[time]` strictly increasing sample times in seconds.
+    - `valid`: how many samples count, `1 <= valid <= time`; all when left out. Samples from
+      `valid` on never influence a verdict.
+    - `status`: a `Status` code; `Status.OK` when left out.
+    - `held`: a promise of the producer that every sample from `valid` on repeats the last valid
+      one, which saves the monitor a pass over the signals.
+
+    **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, or a
+    clock that is missing, given twice or not positive.
+    """
+
+    signals: Mapping[str, Float[Array, "time *k"]]
+    dt: float | None = None
+    times: Float[Array, " time"] | None = None
+    valid: Int[Array, ""] | int | None = None
+    status: Int[Array, ""] | int | None = None
+    held: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.signals:
+            raise ValueError("a trace needs at least one signal; got none")
+        lengths = {}
+        for name, signal in self.signals.items():
+            shape = np.shape(signal)
+            if len(shape) not in (1, 2):
+                raise ValueError(
+                    f"signal {name!r} must have shape [time] or [time, k]; got {list(shape)}"
+                )
+            lengths[name] = shape[0]
+        if len(set(lengths.values())) > 1:
+            listing = ", ".join(f"{name}: {n}" for name, n in lengths.items())
+            raise ValueError(f"signals must have one length; got {listing}")
+        length = next(iter(lengths.values()))
+        if length == 0:
+            raise ValueError("a trace needs at least one sample; got signals of length 0")
+        if (self.dt is None) == (self.times is None):
+            raise ValueError("a trace has either a sampling period dt or sample times; give one")
+        if self.dt is not None and not self.dt > 0:
+            raise ValueError(f"the sampling period dt must be positive; got {self.dt}")
+        if self.times is not None and np.shape(self.times) != (length,):
+            raise ValueError(
+                f"times must have shape [{length}], like the signals; "
+                f"got {list(np.shape(self.times))}"
+            )
+
+    @property
+    def length(self) -> int:
+        """Number of samples stored (valid or not)."""
+        return np.shape(next(iter(self.signals.values())))[0]
+
+    def clock(self) -> Float[Array, " time"]:
+        """Sample times `[time]` in seconds."""
+        if self.times is not None:
+            return jnp.asarray(self.times)
+        return jnp.arange(self.length) * self.dt
+
+    def hold(self) -> "Trace":
+        """The same trace with every sample from `valid` on set to the last valid one."""
+        if self.valid is None or self.held:
+            return self
+        index = jnp.minimum(jnp.arange(self.length), jnp.asarray(self.valid) - 1)
+        signals = {name: jnp.asarray(signal)[index] for name, signal in self.signals.items()}
+        return replace(self, signals=signals, held=True)
+
+    def trim(self) -> "Trace":
+        """The valid part only, as NumPy arrays; for people and plots, not under `jit`."""
+        n = self.length if self.valid is None else int(self.valid)
+        return replace(
+            self,
+            signals={name: np.asarray(signal)[:n] for name, signal in self.signals.items()},
+            times=None if self.times is None else np.asarray(self.times)[:n],
+            valid=None,
+        )
+
+    def __getitem__(self, name: str) -> Float[Array, "time *k"]:
+        return self.signals[name]
+
+
+_CHILDREN = ("signals", "times", "valid", "status")
+
+
+def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], tuple[float | None, bool]]:
+    keys = [(jax.tree_util.GetAttrKey(name), getattr(trace, name)) for name in _CHILDREN]
+    return keys, (trace.dt, trace.held)
+
+
+def _unflatten(static: tuple[float | None, bool], children: Any) -> Trace:
+    # JAX unflattens with placeholders (and with batched leaves), which the checks would refuse.
+    trace = object.__new__(Trace)
+    for name, value in zip(_CHILDREN, children, strict=True):
+        object.__setattr__(trace, name, value)
+    object.__setattr__(trace, "dt", static[0])
+    object.__setattr__(trace, "held", static[1])
+    return trace
+
+
+jax.tree_util.register_pytree_with_keys(Trace, _flatten, _unflatten)
