@@ -1,0 +1,68 @@
+# `make falsify` and `make test` need Python >= 3.11, make and nothing else.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: help falsify test test-slow lint notebooks bench policy wheel clean
+
+help:
+	@echo "make falsify    set up, then break the trained cart-pole controller"
+	@echo "make test       set up, then run the tests"
+	@echo "make test-slow  the tests marked slow"
+	@echo "make lint       ruff and pyright"
+	@echo "make notebooks  execute the notebooks"
+	@echo "make bench      measure; see benchmarks/RESULTS.md"
+	@echo "make policy     train the cart-pole network again from its seed"
+
+# The stamp is renewed when the dependencies change. Debian splits venv's pip into a package of
+# its own; where it is missing, the pip of the system fills the environment.
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("verifai_jax needs Python >= 3.11, this is " + sys.version.split()[0] + "; try make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv .venv 2>/dev/null || $(PYTHON) -m venv --without-pip --clear .venv
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'; \
+	else \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[test]'; \
+	fi
+	@touch $@
+
+.venv/lint: .venv/installed
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[lint]'; \
+	else \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[lint]'; \
+	fi
+	@touch $@
+
+falsify: .venv/installed
+	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
+
+test: .venv/installed
+	$(BIN)/python -m pytest
+
+test-slow: .venv/installed
+	$(BIN)/python -m pytest -m slow
+
+lint: .venv/lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+notebooks: .venv/installed
+	$(BIN)/python notebooks/execute.py
+
+bench: .venv/installed
+	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/search_quality.py
+	$(BIN)/python benchmarks/monitor.py
+
+policy: .venv/installed
+	$(BIN)/python -m envs.train_cartpole
+
+# The wheel must work away from the checkout, where there is no envs/ and no specs/.
+wheel: .venv/lint
+	rm -rf dist
+	$(BIN)/python -m build --wheel --outdir dist .
+	sh tests/wheel_smoke.sh dist/*.whl
+
+clean:
+	rm -rf .venv dist build .pytest_cache .ruff_cache

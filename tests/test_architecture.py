@@ -1,0 +1,87 @@
+"""The direction of imports, and how little `import verifai_jax` brings along."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "verifai_jax"
+
+# Which rooms a room may import. A room not named here may import any that is.
+ALLOWED = {
+    "errors": set(),
+    "trace": set(),
+    "devices": set(),
+    "rates": set(),
+    "features": {"errors"},
+    "search": {"errors"},
+    "mtl": {"errors", "trace"},
+    "systems": {"errors", "trace"},
+    "table": {"errors"},
+    "progress": set(),
+    "problem": {"features", "mtl", "trace", "errors"},
+    "engine": {"problem", "devices", "mtl", "trace"},
+    "host": {"engine", "problem", "mtl", "trace"},
+    "run": {"engine", "problem", "rates", "table", "trace", "report"},
+    "falsify": {
+        "engine", "errors", "host", "problem", "progress", "run", "search", "table", "trace",
+    },
+    "rl": {"errors", "systems", "trace"},
+    "targets": {"errors", "problem"},
+}
+
+
+def imports_of(file: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{file}: imports are absolute"
+            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def room_of(file: Path) -> str:
+    return file.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("room", sorted(ALLOWED))
+def test_imports_point_downwards(room):
+    files = [PACKAGE / f"{room}.py"] if (PACKAGE / f"{room}.py").exists() else []
+    files += sorted((PACKAGE / room).rglob("*.py"))
+    assert files, f"there is no room {room}"
+    rooms = {room_of(file) for file in PACKAGE.rglob("*.py")}
+    for file in files:
+        used = {name.split(".")[1] for name in imports_of(file) if name.startswith("verifai_jax.")}
+        outside = (used & rooms) - ALLOWED[room] - {room}
+        assert not outside, f"{file.name} imports {sorted(outside)}"
+
+
+def test_library_does_not_know_its_content():
+    for file in PACKAGE.rglob("*.py"):
+        tops = {name.split(".")[0] for name in imports_of(file)}
+        assert not tops & {"envs", "specs", "tests"}, f"{file} imports content"
+
+
+def test_import_is_light():
+    heavy = "pandas sklearn brax mujoco gymnax matplotlib pyarrow optax lark rich scipy.stats"
+    code = (
+        "import sys, verifai_jax\n"
+        f"print(*[m for m in {heavy.split()} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+def test_rooms_have_room():
+    # A file that outgrows a room hides a second concept.
+    long = {
+        str(file.relative_to(ROOT)): n
+        for file in [*PACKAGE.rglob("*.py"), *(ROOT / "envs").rglob("*.py")]
+        if (n := len(file.read_text().splitlines())) > 450
+    }
+    assert not long

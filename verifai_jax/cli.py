@@ -1,0 +1,211 @@
+"""The command line: each command is one call into the Python API.
+
+    verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
+    verifai-jax replay runs/balance-1 417
+    verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from verifai_jax import __version__
+
+
+class _Group(click.Group):
+    """Says what a user did wrong in one line, and keeps tracebacks for our own mistakes."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (ValueError, TypeError, IndexError, FileNotFoundError, OSError) as error:
+            if ctx.params.get("traceback"):
+                raise
+            raise click.ClickException(str(error)) from error
+        except RuntimeError as error:
+            from verifai_jax.falsify import RunError
+
+            if ctx.params.get("traceback") or not isinstance(error, RunError):
+                raise
+            raise click.ClickException(str(error)) from error
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        from verifai_jax.errors import unknown_name
+
+        if args and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
+            raise click.UsageError(str(unknown_name("command", args[0], self.list_commands(ctx))))
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="verifai-jax")
+@click.option("--traceback", is_flag=True, help="Show where an error was raised.")
+def main(traceback: bool) -> None:
+    """Find inputs that make a closed-loop system break a temporal-logic property."""
+
+
+@main.command()
+@click.argument("target")
+@click.option("--search", default="cross_entropy", show_default=True, help="Name of the search.")
+@click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
+@click.option("--budget", default=10_000, show_default=True, help="Simulations at most.")
+@click.option("--batch", default=1024, show_default=True, help="Simulations a round.")
+@click.option("--seed", default=0, show_default=True)
+@click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
+@click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+@click.option("--out", type=click.Path(path_type=Path), help="Run folder [runs/NAME-1, -2, ...].")
+@click.option("--pictures/--no-pictures", default=True, help="Draw pictures into the run folder.")
+def falsify(
+    target: str,
+    search: str,
+    options: tuple[str, ...],
+    budget: int,
+    batch: int,
+    seed: int,
+    max_seconds: float | None,
+    stop_after: int | None,
+    out: Path | None,
+    pictures: bool,
+) -> None:
+    """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
+    from verifai_jax.falsify import falsify as run_falsify
+    from verifai_jax.search import named
+    from verifai_jax.targets import load_target
+
+    chosen = named(search, **_options(options))
+    problem = load_target(target)
+    run = run_falsify(
+        problem,
+        chosen,
+        budget,
+        batch=batch,
+        seed=seed,
+        max_seconds=max_seconds,
+        stop_after=stop_after,
+        folder=out or _next_folder(problem.name),
+        target=target,
+    )
+    click.echo(run.summary())
+    assert run.folder is not None
+    click.echo(f"  table        {run.folder / 'table.parquet'}")
+    if pictures and run.simulations:
+        from verifai_jax.report import draw_run
+
+        for path in draw_run(run, run.folder):
+            click.echo(f"  picture      {path}")
+    if run.simulations and len(run.table.failed) < run.simulations:
+        click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
+
+
+@main.command(name="list")
+@click.argument("place", default="specs")
+def list_problems(place: str) -> None:
+    """List the problems of a file or folder (PLACE, by default specs/), and the searches."""
+    from verifai_jax.search import names
+    from verifai_jax.targets import TargetError, problems_in
+
+    path = Path(place)
+    files = sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
+    if not files:
+        raise TargetError(f"{place}/ has no Python file with problems")
+    for file in files:
+        for name, problem in problems_in(str(file)).items():
+            click.echo(f"{file}:{name}  {problem.description}")
+            for formula in problem.formulas.values():
+                click.echo(f"    {formula}")
+            click.echo(f"    over {', '.join(problem.space.columns)}")
+    click.echo(f"searches: {', '.join(names())}")
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("row", type=int, required=False)
+@click.option("--problem", "target", help="FILE.py:NAME of the problem [the one recorded].")
+@click.option(
+    "--precision", type=click.Choice(["float32", "float64"]), default="float64", show_default=True
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of pictures [the run's].")
+@click.option("--pictures/--no-pictures", default=True)
+def replay(
+    folder: Path,
+    row: int | None,
+    target: str | None,
+    precision: str,
+    out: Path | None,
+    pictures: bool,
+) -> None:
+    """Simulate a ROW (by default the worst) of the run in FOLDER again, and draw it."""
+    from verifai_jax.report import draw_replay
+    from verifai_jax.run import load
+    from verifai_jax.targets import load_target
+
+    run = load(folder, load_target(target or _recorded_target(folder)))
+    number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
+    seen = run.replay(number, precision)
+    stored = run.table.all.iloc[number]
+    click.echo(f"{run.name}, row {number}, {precision}")
+    for name in run.table.features:
+        click.echo(f"  {name:<12} {stored[name]:.6g}" if _is_number(stored[name]) else
+                   f"  {name:<12} {stored[name]}")
+    for name, rho in seen.rho.items():
+        click.echo(f"  {run.formulas[name]}")
+        click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")
+    click.echo(f"  status {seen.status.name.lower()}; {'violated' if seen.violated else 'kept'}")
+    if pictures:
+        for path in draw_replay(seen, out or folder):
+            click.echo(f"  picture      {path}")
+
+
+@main.command()
+def doctor() -> None:
+    """Report versions, devices, cores and the compile cache."""
+    from verifai_jax.doctor import report
+
+    click.echo(report())
+
+
+def _options(pairs: tuple[str, ...]) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise click.UsageError(f"--set needs NAME=VALUE; got {pair!r}")
+        try:
+            options[name] = json.loads(value)
+        except json.JSONDecodeError:
+            options[name] = value
+    return options
+
+
+def _next_folder(name: str) -> Path:
+    number = 1
+    while (folder := Path("runs") / f"{name}-{number}").exists():
+        number += 1
+    return folder
+
+
+def _recorded_target(folder: Path) -> str:
+    """The target in the run's record, if it is a file of the user's own project.
+
+    Loading a target runs its file; a run folder that came from elsewhere must not choose one.
+    """
+    from verifai_jax.run import RECORD
+
+    if not (folder / RECORD).exists():
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
+    target = json.loads((folder / RECORD).read_text()).get("target")
+    here = Path.cwd().resolve()
+    if isinstance(target, str) and ".py" in target:
+        file = (here / target.rpartition(":")[0]).resolve()
+        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
+            return target
+    raise ValueError(
+        f"{folder} does not say which problem of this project it is of; "
+        "give it: --problem specs/FILE.py:NAME"
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) or hasattr(value, "dtype")

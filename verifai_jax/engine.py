@@ -1,0 +1,233 @@
+"""The compiled evaluation of a batch: unit cube in, robustness and status out.
+
+    engine = engine_for(problem, batch=1024)
+    engine.compile()
+    engine.evaluate(u, key, first=0)                                  # robustness, status
+    engine_for(problem, 1024, gradient=True).evaluate(u, key, 0, temperature=0.1)
+
+A batch is padded to a fixed shape, split over the devices, and worked through in chunks of lanes
+small enough for the cache, so that there is one executable for each (problem, batch, mode).
+"""
+
+import time
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.devices import enable_compile_cache
+from verifai_jax.mtl import robustness, satisfied, smooth
+from verifai_jax.problem import Problem
+from verifai_jax.trace import Status, Trace
+
+CHUNK = 512  # Lanes worked on together: about 1 MB of a 200-sample trace with two signals.
+FORWARD_MODE_LIMIT = 16  # Features up to which a forward sweep each beats one reverse sweep.
+
+
+class Evaluation(NamedTuple):
+    """What a batch of simulations gave, on the host, one row a simulation.
+
+    `rho` is `[n, formulas]`, hard robustness; NaN where the status is not OK. `gradient` is
+    `[n, d]`, of the least smooth robustness with respect to the unit coordinates. `features` are
+    the simulated values. `messages` say what a black box raised, one a row, empty where nothing.
+    """
+
+    rho: Float[np.ndarray, "n formulas"]
+    status: Int[np.ndarray, " n"]
+    features: dict[str, Any]
+    gradient: Float[np.ndarray, "n d"] | None = None
+    messages: list[str] | None = None
+
+
+def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array, ""]:
+    """The random key of one simulation: a function of the run's key and the row alone."""
+    return jax.random.fold_in(key, row)
+
+
+def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
+    """Hard robustness of each formula, and the status, of one trace.
+
+    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN.
+    """
+    trace = trace.hold()
+    rho = jnp.stack(
+        [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
+    )
+    finite = jnp.array(True)
+    for name in dict.fromkeys(n for f in problem.formulas.values() for n in f.signals()):
+        signal = jnp.asarray(trace.signals[name])
+        if jnp.issubdtype(signal.dtype, jnp.inexact):
+            finite &= jnp.all(jnp.isfinite(signal))
+    status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
+    status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
+    return jnp.where(status == Status.OK, rho, jnp.nan), status
+
+
+class Engine:
+    """Evaluates batches of one problem; see the module's docstring.
+
+    **Arguments:**
+
+    - `problem`: a checked `Problem` whose system JAX can trace.
+    - `batch`: rows of a call at most; fewer are padded.
+    - `gradient`: whether `evaluate` also differentiates the smooth robustness.
+    - `devices`: JAX devices to split the batch over; all of the default backend when left out.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        batch: int,
+        gradient: bool = False,
+        devices: list[Any] | None = None,
+    ) -> None:
+        self.problem = problem
+        self.batch = batch
+        self.gradient = gradient
+        devices = jax.devices() if devices is None else devices
+        # A batch smaller than the number of devices is not worth splitting.
+        self.devices = devices[: max(1, min(len(devices), batch))]
+        per_device = -(-batch // len(self.devices))
+        self.chunks = -(-per_device // CHUNK)
+        self.lanes = -(-per_device // self.chunks)
+        self.padded = self.lanes * self.chunks * len(self.devices)
+        self.compile_seconds = 0.0
+        self._executables: dict[str, Any] = {}
+
+    def compile(self) -> None:
+        """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
+        self._executable("evaluate")
+
+    def evaluate(
+        self,
+        u: Float[Array, "n d"],
+        key: Key[Array, ""],
+        first: int,
+        temperature: Float[Array, ""] | float = 1.0,
+    ) -> Evaluation:
+        """Simulate and judge `n <= batch` points of the unit cube.
+
+        - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
+        - `temperature`: of the smooth robustness that is differentiated; unused without gradient.
+        """
+        n = len(u)
+        arguments = (_pad(u, self.padded), key, jnp.int32(first), jnp.float32(temperature))
+        rho, status, features, gradient = self._executable("evaluate")(*arguments)
+        return Evaluation(
+            rho=np.asarray(rho)[:n],
+            status=np.asarray(status)[:n],
+            features=jax.tree.map(lambda leaf: np.asarray(leaf)[:n], features),
+            gradient=np.asarray(gradient)[:n] if self.gradient else None,
+        )
+
+    def verdicts(
+        self, u: Float[Array, "n d"], key: Key[Array, ""], first: int
+    ) -> np.ndarray:
+        """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
+        arguments = (_pad(u, self.padded), key, jnp.int32(first), jnp.float32(1.0))
+        return np.asarray(self._executable("verdicts")(*arguments))[: len(u)]
+
+    def _executable(self, mode: str) -> Any:
+        if mode not in self._executables:
+            enable_compile_cache()
+            started = time.perf_counter()
+            one_row = {"evaluate": self._evaluate_row, "verdicts": self._verdict_row}[mode]
+            arguments = (
+                jax.ShapeDtypeStruct((self.padded, self.problem.space.dim), jnp.float32),
+                jax.eval_shape(lambda: jax.random.key(0)),
+                jax.ShapeDtypeStruct((), jnp.int32),
+                jax.ShapeDtypeStruct((), jnp.float32),
+            )
+            program = jax.jit(self._batched(one_row))
+            self._executables[mode] = program.lower(*arguments).compile()
+            self.compile_seconds += time.perf_counter() - started
+        return self._executables[mode]
+
+    def _batched(self, one_row: Any) -> Any:
+        """Spread `one_row(u, key, temperature)` over chunks of lanes and over the devices."""
+
+        def on_device(u: Array, rows: Array, key: Array, temperature: Array) -> Any:
+            def chunk(block: tuple[Array, Array]) -> Any:
+                keys = jax.vmap(partial(simulation_key, key))(block[1])
+                return jax.vmap(one_row, in_axes=(0, 0, None))(block[0], keys, temperature)
+
+            if self.chunks == 1:
+                return chunk((u, rows))
+            blocks = (
+                u.reshape(self.chunks, self.lanes, u.shape[-1]),
+                rows.reshape(self.chunks, self.lanes),
+            )
+            results = jax.lax.map(chunk, blocks)
+            return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), results)
+
+        if len(self.devices) > 1:
+            split, whole = PartitionSpec("batch"), PartitionSpec()
+            on_device = jax.shard_map(
+                on_device,
+                mesh=Mesh(np.array(self.devices), ("batch",)),
+                in_specs=(split, split, whole, whole),
+                out_specs=split,
+            )
+
+        def program(u: Array, key: Array, first: Array, temperature: Array) -> Any:
+            rows = first + jnp.arange(self.padded, dtype=jnp.int32)
+            return on_device(u, rows, key, temperature)
+
+        return program
+
+    def _evaluate_row(self, u: Array, key: Array, temperature: Array) -> Any:
+        if not self.gradient:
+            features = self.problem.space.unflatten(u)
+            rho, status = judge(self.problem, self.problem.system(features, key))
+            return rho, status, features, ()
+
+        def objective(u: Array) -> tuple[Array, Any]:
+            features = self.problem.space.unflatten(u)
+            trace = self.problem.system(features, key).hold()
+            semantics = smooth(temperature)
+            smoothed = [
+                robustness(formula, trace, semantics, end=self.problem.end)
+                for formula in self.problem.formulas.values()
+            ]
+            return jnp.min(jnp.stack(smoothed)), (*judge(self.problem, trace), features)
+
+        if u.shape[0] <= FORWARD_MODE_LIMIT:
+            derivative, (rho, status, features) = _forward(objective, u)
+        else:
+            derivative, (rho, status, features) = jax.grad(objective, has_aux=True)(u)
+        return rho, status, features, derivative
+
+    def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
+        trace = self.problem.system(self.problem.space.unflatten(u), key).hold()
+        formulas = self.problem.formulas.values()
+        return jnp.stack([satisfied(formula, trace, end=self.problem.end) for formula in formulas])
+
+
+def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"], Any]:
+    """Gradient and auxiliary output by one forward sweep a coordinate, all in one pass."""
+
+    def sweep(direction: Array) -> Any:
+        return jax.jvp(objective, (u,), (direction,), has_aux=True)
+
+    # Only the tangents depend on the direction: the simulation itself is done once.
+    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(jnp.eye(u.shape[0]))
+    return derivative, aux
+
+
+def _pad(u: Float[Array, "n d"], rows: int) -> Float[Array, "rows d"]:
+    missing = rows - len(u)
+    if missing == 0:
+        return u
+    return jnp.concatenate([u, jnp.broadcast_to(u[-1:], (missing, u.shape[1]))])
+
+
+def engine_for(problem: Problem, batch: int, gradient: bool = False) -> Engine:
+    """The engine of this (problem, batch, mode), made once and kept as long as the problem."""
+    mode = (batch, gradient)
+    if mode not in problem.engines:
+        problem.engines[mode] = Engine(problem, batch, gradient)
+    return problem.engines[mode]

@@ -1,0 +1,125 @@
+"""A falsification problem: which inputs, which system, which property.
+
+    Problem("balance", space={"x0": Box(-1, 1)}, system=simulate, spec="always[0, 4] x <= 2.4")
+    Problem("drive", ..., spec={"safe": "always dist > 2", "arrives": "eventually x > 90"})
+
+`Problem.check()` says everything that is wrong with it before anything compiles.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import Formula, parse, robustness
+from verifai_jax.trace import Trace
+
+System = Callable[..., Trace]
+
+
+class ProblemError(ValueError):
+    """The parts of a problem do not fit together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A feature space, a system and the properties it must keep, under a name.
+
+    **Arguments:**
+
+    - `name`: how the command line and the report call it.
+    - `space`: a `FeatureSpace`, or a dictionary of domains.
+    - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a
+      `blackbox`.
+    - `spec`: a formula (text or `Formula`), or several by name; the overall robustness of a
+      simulation is the least of them.
+    - `nominal`: features of an ordinary day; must lie in the space.
+    - `description`: one line for `verifai-jax list`.
+    - `end`: what a formula sees behind the end of a trace; `"hold"` repeats the last sample.
+
+    `formulas` holds the parsed spec by name; `engines` what has been compiled for this problem.
+
+    **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, or nominal
+    features outside the space.
+    """
+
+    name: str
+    space: FeatureSpace
+    system: System
+    spec: Formula | str | Mapping[str, Formula | str]
+    nominal: Mapping[str, Any] | None = None
+    description: str = ""
+    end: str = "hold"
+    formulas: Mapping[str, Formula] = field(init=False, repr=False)
+    engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise ProblemError(f"a problem needs a name; got {self.name!r}")
+        if isinstance(self.space, Mapping):
+            object.__setattr__(self, "space", FeatureSpace(self.space))
+        if not isinstance(self.space, FeatureSpace):
+            raise ProblemError(
+                f"space must be a FeatureSpace or a dictionary of domains; got {self.space!r}"
+            )
+        if not callable(self.system):
+            raise ProblemError(
+                f"system must be a function (features, key) -> Trace; got {self.system!r}"
+            )
+        spec = self.spec if isinstance(self.spec, Mapping) else {"spec": self.spec}
+        if not spec:
+            raise ProblemError("spec has no formula; give a formula or a dictionary of them")
+        formulas = {name: _formula(name, formula) for name, formula in spec.items()}
+        object.__setattr__(self, "formulas", formulas)
+        if self.nominal is not None:
+            self.space.check(self.nominal)
+
+    @property
+    def black_box(self) -> bool:
+        """Whether the system runs on the host, out of JAX's sight."""
+        return bool(getattr(self.system, "black_box", False))
+
+    def check(self) -> None:
+        """Trace the system and its monitor abstractly: no simulation, nothing compiles.
+
+        **Raises:** `ProblemError` for a system that raises or returns no `Trace`; what the
+        monitor says for a formula over a signal that the system does not produce.
+        """
+        if self.black_box:
+            return
+        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        try:
+            trace = jax.eval_shape(self.system, features, key)
+        except Exception as error:
+            raise ProblemError(
+                f"the system of problem {self.name!r} raised {type(error).__name__} when JAX "
+                f"traced it with features {list(features)}: {error}"
+            ) from error
+        if not isinstance(trace, Trace):
+            raise ProblemError(
+                f"the system of problem {self.name!r} must return a Trace; "
+                f"it returned {type(trace).__name__}"
+            )
+        for formula in self.formulas.values():
+            jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
+
+    def __str__(self) -> str:
+        lines = [f"{self.name}: {self.description}" if self.description else self.name]
+        for name, formula in self.formulas.items():
+            lines.append(f"  {name}: {formula}")
+        lines.append(f"  features: {', '.join(self.space.columns)}")
+        return "\n".join(lines)
+
+
+def _formula(name: str, formula: Formula | str) -> Formula:
+    if isinstance(formula, str):
+        return parse(formula)
+    if isinstance(formula, Formula):
+        return formula
+    raise ProblemError(
+        f"spec {name!r} must be a formula or its text; got {type(formula).__name__} {formula!r}"
+    )

@@ -1,0 +1,304 @@
+"""The result of a falsification: its table, its statistics, and how to see a row again.
+
+    run.summary()                      what failed, how often, the worst case
+    run.table.counterexamples          a DataFrame
+    run.replay(run.best)               the trace behind a row
+    run.save("runs/mine"); vj.load("runs/mine", problem)
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from verifai_jax.engine import judge, simulation_key
+from verifai_jax.problem import Problem
+from verifai_jax.rates import Rate, clopper_pearson
+from verifai_jax.table import ErrorTable
+from verifai_jax.trace import Status, Trace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RECORD = "run.json"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One simulation, looked at again.
+
+    `rho` holds the robustness of each formula by name; NaN where `status` is not OK.
+    """
+
+    problem: Problem
+    row: int | None
+    features: dict[str, Any]
+    trace: Trace
+    rho: dict[str, float]
+    status: Status
+
+    @property
+    def violated(self) -> bool:
+        """Whether the simulation ended properly and breaks a formula."""
+        return self.status == Status.OK and min(self.rho.values()) < 0
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the signals with the violated bound and instant marked; returns the figure."""
+        from verifai_jax.report import plot_replay
+
+        return plot_replay(self, path)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What `falsify` returns.
+
+    **Fields:** `name` and `formulas` (texts) of the problem; `table`; `search` (its repr), `seed`
+    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"` or `"interrupted"`;
+    `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
+    independent samples of the feature space; `folder` on disk, if any; `target`: how the command
+    line names the problem; `problem` itself, None for a loaded run without one.
+    """
+
+    name: str
+    formulas: dict[str, str]
+    table: ErrorTable
+    search: str
+    seed: int
+    batch: int
+    stopped: str
+    compile_seconds: float
+    run_seconds: float
+    version: str
+    prior: bool
+    folder: Path | None = None
+    target: str | None = None
+    problem: Problem | None = None
+
+    @property
+    def simulations(self) -> int:
+        """Simulations in the table."""
+        return len(self.table)
+
+    @property
+    def best(self) -> "pd.Series":
+        """The row with the least robustness among those that ended properly.
+
+        **Raises:** `ValueError` when no simulation ended properly.
+        """
+        table = self.table.all
+        proper = table[table["status"] == "ok"]
+        if not len(proper):
+            raise ValueError(
+                f"run of {self.name!r} has no simulation with a verdict: "
+                f"{len(table)} simulated, {len(self.table.failed)} of them failed"
+            )
+        return proper.loc[proper["rho"].idxmin()]
+
+    @property
+    def failure_rate(self) -> Rate | None:
+        """Failures per simulation with a 95 % Clopper-Pearson interval.
+
+        None unless the rows are independent samples of the feature space, their number was not
+        decided by the outcomes, and at least one of them has a verdict: an active search may
+        refute, it never certifies. Simulations without a verdict do not count.
+        """
+        failures, safe = len(self.table.counterexamples), len(self.table.safe)
+        if not self.prior or self.stopped == "stop_after" or failures + safe == 0:
+            return None
+        return clopper_pearson(failures, failures + safe)
+
+    def replay(
+        self, row: "int | pd.Series | Mapping[str, Any]", precision: str = "float32"
+    ) -> Replay:
+        """Simulate a row of the table again and keep its trace.
+
+        - `row`: a row number, or a row of `table.all` (its index is the row number), or any
+          mapping with the feature columns.
+        - `precision`: `"float32"` as in the search, or `"float64"`.
+
+        **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
+        in the table.
+        """
+        if self.problem is None:
+            raise ValueError(
+                f"the run of {self.name!r} was loaded without its problem; "
+                "give it: vj.load(path, problem)"
+            )
+        number: int | None
+        if isinstance(row, (int, np.integer)):
+            if not 0 <= row < len(self.table):
+                raise IndexError(f"row {row} is not in the table of {len(self.table)} simulations")
+            number, values = int(row), self.table.all.iloc[int(row)]
+        else:
+            number, values = getattr(row, "name", None), row
+        return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+
+    def summary(self) -> str:
+        """What failed, how often, the worst case and how to see it again, for people."""
+        return _summary(self)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the feature space with safe and failing samples, and robustness over the budget."""
+        from verifai_jax.report import plot_run
+
+        return plot_run(self, path)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the run to a folder: `run.json` and `table.parquet`; returns the folder."""
+        folder = Path(path)
+        self.table.save(folder)
+        write_record(self, folder)
+        return folder
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+
+def run_keys(seed: int) -> tuple[Key[Array, ""], Key[Array, ""]]:
+    """The two keys of a run: that of the search and that of the simulations."""
+    # The generator is named so that a user's JAX settings do not change results.
+    search, simulations = jax.random.split(jax.random.key(seed, impl="threefry2x32"))
+    return search, simulations
+
+
+def replay(
+    problem: Problem,
+    row: Any,
+    key: Key[Array, ""],
+    number: int | None = None,
+    precision: str = "float32",
+) -> Replay:
+    """Simulate the features of `row` with the random key that simulation `number` had.
+
+    **Raises:** `ValueError` for a precision other than float32 and float64.
+    """
+    if precision not in ("float32", "float64"):
+        raise ValueError(f"precision must be 'float32' or 'float64'; got {precision!r}")
+    key = simulation_key(key, 0 if number is None else number)
+    with jax.enable_x64(precision == "float64"):
+        features = problem.space.from_row(row)
+        if problem.black_box:
+            trace = problem.system(features, key)
+        else:
+            precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
+            trace = jax.jit(problem.system)(precise, key)
+        rho, status = jax.jit(judge, static_argnums=0)(problem, trace)
+        return Replay(
+            problem=problem,
+            row=number,
+            features=features,
+            trace=trace.trim(),
+            rho={name: float(value) for name, value in zip(problem.formulas, rho, strict=True)},
+            status=Status(int(status)),
+        )
+
+
+def _cast(leaf: Any, precision: str) -> Any:
+    leaf = jnp.asarray(leaf)
+    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
+
+
+def write_record(run: Run, folder: Path) -> None:
+    """Write everything about a run but its table to `run.json`."""
+    record = {"format": FORMAT, "features": list(run.table.features)}
+    for name in _RECORDED:
+        record[name] = getattr(run, name)
+    partial = folder / f"{RECORD}.part"
+    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.replace(folder / RECORD)
+
+
+_RECORDED = (
+    "name",
+    "formulas",
+    "search",
+    "seed",
+    "batch",
+    "stopped",
+    "compile_seconds",
+    "run_seconds",
+    "version",
+    "prior",
+    "target",
+)
+
+
+def load(path: str | Path, problem: Problem | None = None) -> Run:
+    """Read a run back from its folder, also one that was cut off.
+
+    - `problem`: needed to replay rows; a file names no code to run.
+
+    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record of
+    another format, or a problem whose name, formulas or features differ from the recorded ones.
+    """
+    folder = Path(path)
+    if not (folder / RECORD).exists():
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
+    record = json.loads((folder / RECORD).read_text())
+    if record.get("format") != FORMAT:
+        raise ValueError(
+            f"{folder / RECORD} has format {record.get('format')!r}; this version reads {FORMAT}"
+        )
+    features = tuple(record["features"])
+    if problem is not None:
+        texts = {name: str(formula) for name, formula in problem.formulas.items()}
+        for what, recorded, given in (
+            ("name", record["name"], problem.name),
+            ("formulas", record["formulas"], texts),
+            ("features", features, tuple(problem.space.columns)),
+        ):
+            if recorded != given:
+                raise ValueError(
+                    f"the run in {folder} is of another problem: its {what} is {recorded!r}, "
+                    f"the given one's {given!r}"
+                )
+    return Run(
+        table=ErrorTable.load(folder, features),
+        folder=folder,
+        problem=problem,
+        **{name: record[name] for name in _RECORDED},
+    )
+
+
+def _summary(run: Run) -> str:
+    failures, failed = len(run.table.counterexamples), run.table.failed
+    lines = [f"{run.name}: {failures} of {run.simulations} simulations violate the property"]
+    for name, text in run.formulas.items():
+        lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
+    rate = run.failure_rate
+    if rate is not None:
+        lines.append(f"  failure rate {rate}")
+    elif run.prior and run.stopped == "stop_after":
+        lines.append("  failure rate not given: the run was stopped by its own counterexamples")
+    elif not run.prior:
+        lines.append(
+            "  failure rate not given: this search goes where failures are; "
+            "use search='uniform' for a rate"
+        )
+    if failures + len(run.table.safe):
+        best = run.best
+        where = ", ".join(f"{name}={_short(best[name])}" for name in run.table.features)
+        lines.append(f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
+                     f"robustness {best['rho']:.4g} at {where}")
+    if len(failed):
+        counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
+        lines.append(f"  no verdict   {counts}")
+    speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
+    lines.append(
+        f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "
+        f"{speed:,.0f} simulations/s; stopped by {run.stopped}"
+    )
+    lines.append(f"  search       {run.search}, seed {run.seed}")
+    return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)

@@ -1,0 +1,183 @@
+"""The error table: one row a simulation, written to disk while it grows.
+
+    table.all               every simulation: features, rho, violated, status
+    table.counterexamples   rows that ended properly and broke the property
+    table.safe              rows that ended properly and kept it
+
+On disk a growing table is an Arrow stream, to which each batch is appended; a process that dies
+loses at most the batch in flight. A finished table is one Parquet file.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STREAM = "rows.arrows"
+FINISHED = "table.parquet"
+RESERVED = ("row", "rho", "violated", "status", "message")
+
+
+class ErrorTable:
+    """Rows in the order in which they were simulated; append-only.
+
+    **Arguments:**
+
+    - `features`: names of the feature columns; may not be one of `RESERVED`.
+    - `folder`: where to keep the rows; in memory only when left out.
+
+    **Raises:** `ValueError` for a feature with a reserved name.
+    """
+
+    def __init__(self, features: tuple[str, ...], folder: Path | None = None) -> None:
+        for name in features:
+            if name in RESERVED:
+                raise ValueError(
+                    f"a feature may not be called {name!r}: the error table has a column of that "
+                    f"name; reserved are {', '.join(RESERVED)}"
+                )
+        self.features = tuple(features)
+        self._batches: list[dict[str, Any]] = []
+        self._frame: pd.DataFrame | None = None
+        self._rows = 0
+        self._stream = _Stream(folder) if folder is not None else None
+
+    def __len__(self) -> int:
+        return self._rows
+
+    def append(self, columns: Mapping[str, Any]) -> None:
+        """Add a batch: a mapping of column name to `[n]` values, with `rho` and `status`."""
+        batch = dict(columns)
+        n = len(batch["rho"])
+        self._batches.append({"row": np.arange(self._rows, self._rows + n), **batch})
+        self._rows += n
+        self._frame = None
+        if self._stream is not None:
+            self._stream.append(self._batches[-1])
+
+    def close(self) -> None:
+        """Turn the stream on disk into a Parquet file."""
+        if self._stream is not None:
+            self._stream.close(self.all)
+            self._stream = None
+
+    @property
+    def all(self) -> "pd.DataFrame":
+        """Every simulation asked for, once, indexed by row number."""
+        import pandas as pd
+
+        if self._frame is None:
+            if self._batches:
+                merged = {
+                    name: np.concatenate([np.asarray(batch[name]) for batch in self._batches])
+                    for name in self._batches[0]
+                }
+                # One array per column from here on: appending stays linear.
+                self._batches = [merged]
+                self._frame = pd.DataFrame(merged).set_index("row")
+            else:
+                empty = {"rho": np.zeros(0, np.float32), "violated": np.zeros(0, bool)}
+                names = {name: np.zeros(0) for name in self.features}
+                self._frame = pd.DataFrame({**names, **empty, "status": np.zeros(0, object)})
+                self._frame.index.name = "row"
+        return self._frame
+
+    @property
+    def counterexamples(self) -> "pd.DataFrame":
+        """Rows that ended properly and violate the property."""
+        table = self.all
+        return table[(table["status"] == "ok") & table["violated"]]
+
+    @property
+    def safe(self) -> "pd.DataFrame":
+        """Rows that ended properly and satisfy the property."""
+        table = self.all
+        return table[(table["status"] == "ok") & ~table["violated"]]
+
+    @property
+    def failed(self) -> "pd.DataFrame":
+        """Rows without a verdict: the simulation raised, timed out or went non-finite."""
+        table = self.all
+        return table[table["status"] != "ok"]
+
+    @classmethod
+    def load(cls, folder: Path, features: tuple[str, ...]) -> "ErrorTable":
+        """Read a table back, finished or cut off.
+
+        **Raises:** `FileNotFoundError` where there is none.
+        """
+        table = cls(features)
+        frame = _read(folder)
+        if len(frame):
+            table.append({name: frame[name].to_numpy() for name in frame.columns})
+        return table
+
+    def save(self, folder: Path) -> None:
+        """Write the rows to `folder` as one Parquet file."""
+        folder.mkdir(parents=True, exist_ok=True)
+        # A reader never meets a half-written file under the final name.
+        partial = folder / f"{FINISHED}.part"
+        self.all.to_parquet(partial)
+        partial.replace(folder / FINISHED)
+
+    def __repr__(self) -> str:
+        return (
+            f"ErrorTable({len(self)} simulations: {len(self.counterexamples)} counterexamples, "
+            f"{len(self.safe)} safe, {len(self.failed)} without a verdict)"
+        )
+
+
+class _Stream:
+    """An Arrow stream on disk that stays readable however the process ends."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        self._file: Any = None
+        self._writer: Any = None
+
+    def append(self, columns: dict[str, Any]) -> None:
+        import pyarrow as pa
+
+        batch = pa.RecordBatch.from_pydict({name: pa.array(v) for name, v in columns.items()})
+        if self._writer is None:
+            self._file = open(self.folder / STREAM, "wb")  # noqa: SIM115 - lives as long as the run
+            self._writer = pa.ipc.new_stream(self._file, batch.schema)
+        self._writer.write_batch(batch)
+        self._file.flush()
+
+    def close(self, frame: "pd.DataFrame") -> None:
+        if self._writer is not None:
+            self._writer.close()
+            self._file.close()
+        partial = self.folder / f"{FINISHED}.part"
+        frame.to_parquet(partial)
+        partial.replace(self.folder / FINISHED)
+        (self.folder / STREAM).unlink(missing_ok=True)
+
+
+def _read(folder: Path) -> "pd.DataFrame":
+    import pandas as pd
+
+    if (folder / FINISHED).exists():
+        return pd.read_parquet(folder / FINISHED)
+    if not (folder / STREAM).exists():
+        raise FileNotFoundError(f"no error table in {folder}: neither {FINISHED} nor {STREAM}")
+    import pyarrow as pa
+
+    batches = []
+    with open(folder / STREAM, "rb") as file:
+        try:
+            # Reading ends in an error where the process died in the middle of writing a batch;
+            # those before it are whole.
+            for batch in pa.ipc.open_stream(file):
+                batches.append(batch)
+        except (pa.ArrowInvalid, OSError):
+            pass
+    if not batches:
+        return pd.DataFrame()
+    return pa.Table.from_batches(batches).to_pandas().set_index("row")
