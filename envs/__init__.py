@@ -1,0 +1,1 @@
+"""Systems under test, one file each: dynamics, controllers, and how features enter them."""

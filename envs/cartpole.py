@@ -1,0 +1,150 @@
+"""The cart-pole of Gymnasium's CartPole-v1 as a system under test.
+
+    cartpole(linear())                                   # 4 s, a linear controller
+    cartpole(linear(gains), duration=2.0, terminate=True)
+    cartpole(neural())                                   # the trained network that is shipped
+
+Also the worked example of writing one's own environment: an `ode` needs a function for the slope
+of the state, one for the initial state, and a controller.
+
+Features, all optional, with CartPole-v1's values where missing: `x0` and `theta0` (initial
+position in m and angle in rad), `x_dot0`, `theta_dot0` (m/s, rad/s), `masscart`, `masspole` (kg),
+`length` (m, half the pole's), `force_mag` (N), and a `push` (N) against the cart that begins at
+`push_time` (s) and lasts 0.1 s.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from verifai_jax.systems import Ode, ode, sin_cos
+
+Features = Mapping[str, Any]
+Scalar = Float[Array, ""]
+Controller = Callable[[Any, "State", Features], Scalar]
+
+DT = 0.02
+GRAVITY = 9.8
+X_LIMIT = 2.4
+THETA_LIMIT = 12 * 2 * math.pi / 360
+PUSH_SECONDS = 0.1
+
+# Discrete-time LQR of the nominal plant at 50 Hz with unit weights on state and force.
+LQR_GAINS = (0.91, 2.13, 30.6, 7.84)
+
+NOMINAL = {
+    "x0": 0.0,
+    "x_dot0": 0.0,
+    "theta0": 0.0,
+    "theta_dot0": 0.0,
+    "masscart": 1.0,
+    "masspole": 0.1,
+    "length": 0.5,
+    "force_mag": 10.0,
+    "push": 0.0,
+    "push_time": 1.0,
+}
+
+
+class State(NamedTuple):
+    """Position of the cart in m, angle of the pole from upright in rad, and their rates."""
+
+    x: Scalar
+    x_dot: Scalar
+    theta: Scalar
+    theta_dot: Scalar
+
+
+def feature(features: Features, name: str) -> Any:
+    """A feature's value, or CartPole-v1's where it is missing."""
+    return features.get(name, NOMINAL[name])
+
+
+def initial(features: Features, key: Any = None) -> State:
+    """The state at time 0."""
+    return State(*(feature(features, name) for name in ("x0", "x_dot0", "theta0", "theta_dot0")))
+
+
+def dynamics(time: Scalar, state: State, force: Scalar, features: Features) -> State:
+    """Slope of the state under `force` (N) on the cart.
+
+    Source: Florian, Correct equations for the dynamics of the cart-pole system (2007), eqs. 23-24
+    without friction, as in Gymnasium.
+    """
+    masspole, length = feature(features, "masspole"), feature(features, "length")
+    total_mass = masspole + feature(features, "masscart")
+    polemass_length = masspole * length
+    if "push" in features:
+        force = force + features["push"] * pushed(time, feature(features, "push_time"))
+    sin, cos = sin_cos(state.theta)
+    temp = (force + polemass_length * (state.theta_dot * state.theta_dot) * sin) / total_mass
+    theta_acc = (GRAVITY * sin - cos * temp) / (
+        length * (4.0 / 3.0 - masspole * (cos * cos) / total_mass)
+    )
+    x_acc = temp - polemass_length * theta_acc * cos / total_mass
+    return State(state.x_dot, x_acc, state.theta_dot, theta_acc)
+
+
+def pushed(time: Scalar, push_time: Scalar | float) -> Scalar:
+    """The part of the step that begins at `time` during which the push acts, in `[0, 1]`.
+
+    Continuous in `push_time`, so that a gradient search can shift the push.
+    """
+    begin = jnp.maximum(time, push_time)
+    end = jnp.minimum(time + DT, push_time + PUSH_SECONDS)
+    return jnp.maximum(end - begin, 0.0) / DT
+
+
+def terminated(state: State, features: Features) -> Bool[Array, ""]:
+    """Whether CartPole-v1's episode is over: off the track, or more than 12 degrees away."""
+    return (jnp.abs(state.x) > X_LIMIT) | (jnp.abs(state.theta) > THETA_LIMIT)
+
+
+def linear(gains: Sequence[float] = LQR_GAINS) -> Controller:
+    """A linear state feedback, saturated at the `force_mag` of the features.
+
+    - `gains`: N per m, m/s, rad and rad/s.
+    """
+    if len(gains) != 4:
+        raise ValueError(f"a linear controller needs 4 gains; got {list(gains)}")
+    k_x, k_x_dot, k_theta, k_theta_dot = map(float, gains)
+
+    def control(time: Scalar, state: State, features: Features) -> Scalar:
+        x, x_dot, theta, theta_dot = state
+        force = k_x * x + k_x_dot * x_dot + k_theta * theta + k_theta_dot * theta_dot
+        largest = feature(features, "force_mag")
+        return jnp.clip(force, -largest, largest)
+
+    return control
+
+
+def cartpole(
+    controller: Controller | None = None,
+    *,
+    duration: float = 4.0,
+    terminate: bool = False,
+    method: str = "euler",
+    dt: float = DT,
+) -> Ode:
+    """The closed loop as a system with signals `x`, `x_dot`, `theta`, `theta_dot` and `force`.
+
+    - `controller(time, state, features) -> force` in N; `linear()` when left out.
+    - `duration`: simulated seconds, a multiple of `dt`.
+    - `terminate`: end where CartPole-v1 would; otherwise the pole may fall and the cart run on.
+    - `method`, `dt`: CartPole-v1 has explicit Euler with 0.02 s. The controller runs every 0.02 s
+      at any step, which must divide it.
+    """
+    return ode(
+        dynamics,
+        initial,
+        controller=linear() if controller is None else controller,
+        control_period=DT,
+        dt=dt,
+        duration=duration,
+        method=method,
+        signals=lambda time, state, force, features: {**state._asdict(), "force": force},
+        terminate=terminated if terminate else None,
+    )

@@ -1,0 +1,114 @@
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs import cartpole as cp
+from verifai_jax.trace import Status
+
+KEY = jax.random.key(0)
+
+
+def gymnasium_episode(features, actions):
+    """States of CartPole-v1 under these actions, up to the terminal one."""
+    env = gymnasium.make("CartPole-v1").unwrapped
+    env.reset(seed=0)
+    for name in ("masscart", "masspole", "length", "force_mag"):
+        setattr(env, name, features[name])
+    env.total_mass = env.masspole + env.masscart
+    env.polemass_length = env.masspole * env.length
+    env.state = np.array([features[n] for n in ("x0", "x_dot0", "theta0", "theta_dot0")])
+    states, terminated = [env.state], False
+    for action in actions:
+        _, _, terminated, _, _ = env.step(int(action))
+        states.append(env.state)
+        if terminated:
+            break
+    return np.array(states), terminated
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_equal_to_gymnasium_step_for_step(seed):
+    rng = np.random.default_rng(seed)
+    features = {
+        "x0": rng.uniform(-2, 2),
+        "x_dot0": rng.uniform(-1, 1),
+        "theta0": rng.uniform(-0.1, 0.1),
+        "theta_dot0": rng.uniform(-0.5, 0.5),
+        "masscart": rng.uniform(0.5, 2),
+        "masspole": rng.uniform(0.05, 0.5),
+        "length": rng.uniform(0.3, 2),
+        "force_mag": rng.uniform(5, 15),
+    }
+    actions = rng.integers(0, 2, 201)
+    expected, terminated = gymnasium_episode(features, actions[:200])
+    with jax.enable_x64():
+
+        def controller(time, state, features):
+            k = jnp.round(time / cp.DT).astype(int)
+            return jnp.where(jnp.asarray(actions)[k] == 1, 1, -1) * features["force_mag"]
+
+        trace = jax.jit(cp.cartpole(controller, terminate=True))(features, KEY)
+    assert int(trace.valid) == len(expected)
+    got = np.stack([trace[n] for n in ("x", "x_dot", "theta", "theta_dot")], axis=1)
+    np.testing.assert_allclose(got[: len(expected)], expected, rtol=1e-11, atol=1e-11)
+    assert terminated == (int(trace.valid) < 201)
+    assert got.dtype == np.float64
+
+
+def test_missing_features_are_those_of_cartpole_v1():
+    env = gymnasium.make("CartPole-v1").unwrapped
+    for name in ("masscart", "masspole", "length", "force_mag"):
+        assert getattr(env, name) == cp.NOMINAL[name]
+    assert env.x_threshold == cp.X_LIMIT
+    assert env.theta_threshold_radians == cp.THETA_LIMIT
+    assert env.tau == cp.DT
+
+
+def test_linear_controller_balances_the_nominal_plant_and_not_every_plant():
+    system = jax.jit(cp.cartpole(cp.linear(), duration=10.0))
+    trace = system({"x0": 0.5, "theta0": 0.1}, KEY)
+    assert int(trace.status) == Status.OK
+    assert float(jnp.max(jnp.abs(trace["theta"]))) <= cp.THETA_LIMIT
+    assert abs(float(trace["theta"][-1])) < 1e-3
+    assert abs(float(trace["x"][-1])) < 0.05
+    heavy = system({"theta0": 0.2, "masspole": 5.0, "length": 0.2}, KEY)
+    assert float(jnp.max(jnp.abs(heavy["theta"]))) > cp.THETA_LIMIT
+
+
+def test_force_is_saturated_at_the_features_force():
+    trace = cp.cartpole(cp.linear())({"theta0": 0.2, "force_mag": 3.0}, KEY)
+    assert float(trace["force"][0]) == 3.0
+
+
+def test_linear_refuses_wrong_gains():
+    with pytest.raises(ValueError, match=r"needs 4 gains; got \[1.0, 2.0\]"):
+        cp.linear([1.0, 2.0])
+
+
+@pytest.mark.parametrize("push_time", [1.0, 1.0123])
+def test_push_gives_its_impulse_at_its_time(push_time):
+    # Without gravity's lever (a massless-like pole at rest) the cart gains F t / m.
+    system = cp.cartpole(lambda t, s, f: 0.0, duration=2.0)
+    features = {"push": 7.0, "push_time": push_time, "masspole": 1e-6}
+    x_dot = np.asarray(system(features, KEY)["x_dot"])
+    assert np.all(x_dot[:51] == 0)
+    assert x_dot[57] == pytest.approx(0.7, rel=1e-4)
+    assert x_dot[-1] == pytest.approx(0.7, rel=1e-4)
+
+
+def test_push_can_be_shifted_by_a_gradient():
+    system = cp.cartpole(lambda t, s, f: 0.0, duration=2.0)
+
+    def reached(push_time):
+        return system({"push": 7.0, "push_time": push_time, "masspole": 1e-6}, KEY)["x"][-1]
+
+    # A push that comes later by one second reaches 0.7 m less far.
+    assert float(jax.grad(reached)(1.005)) == pytest.approx(-0.7, rel=1e-3)
+
+
+def test_finer_step_converges():
+    coarse = cp.cartpole(cp.linear())({"theta0": 0.1}, KEY)
+    fine = cp.cartpole(cp.linear(), method="rk4", dt=0.005)({"theta0": 0.1}, KEY)
+    np.testing.assert_allclose(coarse["theta"], fine["theta"][::4], atol=0.02)

@@ -1,0 +1,137 @@
+"""What a user's functions must return, and the errors that say so before anything compiles.
+
+States, controls and memories are pytrees; here they are compared leaf by leaf, by name.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+
+def floating(tree: Any, origin: str) -> Any:
+    """The same pytree with every leaf an array of one common floating-point dtype.
+
+    **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is no real
+    number.
+    """
+    leaves = jax.tree.leaves(tree)
+    if not leaves:
+        raise ValueError(f"{origin} must return a state; got {tree!r}, which has no numbers in it")
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        if not _is_real(leaf):
+            raise ValueError(f"{origin} must return real numbers; {_name(path)} is {leaf!r}")
+    dtype = jnp.result_type(float, *leaves)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+
+
+def check_like(got: Any, wanted: Any, origin: str, role: str, note: str = "") -> None:
+    """Refuse a pytree of shapes that differs from the `wanted` one in structure, shape or dtype.
+
+    A weakly typed number (a Python literal) may stand for any dtype that it can turn into.
+
+    **Raises:** `ValueError`: `origin` must return `role`, and the first difference.
+    """
+    must = f"{origin} must return {role}"
+    if jax.tree.structure(got) != jax.tree.structure(wanted):
+        raise ValueError(f"{must}: {outline(wanted)}; got {outline(got)}{note}")
+    pairs = zip(jax.tree.leaves_with_path(wanted), jax.tree.leaves(got), strict=True)
+    for (path, want), have in pairs:
+        if have.shape != want.shape:
+            raise ValueError(
+                f"{must}; {_name(path)} must have shape {list(want.shape)}, "
+                f"got {list(have.shape)}{note}"
+            )
+        fits = have.dtype == want.dtype or (
+            have.weak_type and jnp.promote_types(have.dtype, want.dtype) == want.dtype
+        )
+        if not fits:
+            raise ValueError(f"{must}; {_name(path)} must be {want.dtype}, got {have.dtype}{note}")
+
+
+def default_signals(state: Any, control: Any) -> dict[str, Array]:
+    """Signals named after the state's own names, and the control's.
+
+    A state without names (an array, a plain tuple) has no default. `(positions, velocities)` of
+    two dictionaries has the names of both. A control without names is called `control`.
+
+    **Raises:** `ValueError` where there are no names, or one is used twice.
+    """
+    parts = [_named(state)]
+    if parts[0] is None and isinstance(state, tuple | list):
+        parts = [_named(part) for part in state]
+    if any(part is None for part in parts):
+        raise ValueError(
+            f"a state of the form {outline(state)} has no names to call its signals by; "
+            "give signals=..., a function (time, state, control, features) -> dict"
+        )
+    if control is not None:
+        named = _named(control)
+        parts.append({"control": control} if named is None else named)
+    signals: dict[str, Array] = {}
+    for part in parts:
+        for name, value in (part or {}).items():
+            if name in signals:
+                raise ValueError(
+                    f"two parts of the state and the control are called {name!r}; "
+                    "give signals=... to tell them apart"
+                )
+            signals[name] = value
+    return signals
+
+
+def check_signals(signals: Any) -> None:
+    """Refuse samples that no `Trace` can hold.
+
+    **Raises:** `ValueError` for anything but a dictionary of scalars and vectors.
+    """
+    if not isinstance(signals, Mapping) or not signals:
+        raise ValueError(
+            f"signals must return a dictionary of named samples; got {outline(signals)}"
+        )
+    for name, value in signals.items():
+        if not hasattr(value, "shape") or len(value.shape) > 1:
+            raise ValueError(
+                f"signal {name!r} must be a scalar or a vector at each sample; got {outline(value)}"
+            )
+
+
+def _named(tree: Any) -> dict[str, Any] | None:
+    if isinstance(tree, Mapping):
+        return {str(name): value for name, value in tree.items()}
+    fields = getattr(tree, "_fields", None)
+    return None if fields is None else dict(zip(fields, tree, strict=True))
+
+
+def _is_real(leaf: Any) -> bool:
+    try:
+        dtype = jnp.result_type(leaf)
+    except TypeError:
+        return False
+    return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path) or "it"
+
+
+def outline(tree: Any) -> str:
+    """The tree in one line, arrays by dtype and shape: `{'x': float32[]}`."""
+
+    def leaf(value: Any) -> str:
+        if not hasattr(value, "shape"):
+            return repr(value)
+        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
+
+    return str(jax.tree.map(lambda value: _Verbatim(leaf(value)), tree))
+
+
+class _Verbatim(str):
+    """Text that prints without quotes."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        return str(self)
