@@ -39,6 +39,7 @@ class Problem:
     - `nominal`: features of an ordinary day; must lie in the space.
     - `description`: one line for `verifai-jax list`.
     - `end`: what a formula sees behind the end of a trace; `"hold"` repeats the last sample.
+    - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
 
     `formulas` holds the parsed spec by name; `engines` what has been compiled for this problem.
 
@@ -53,6 +54,7 @@ class Problem:
     nominal: Mapping[str, Any] | None = None
     description: str = ""
     end: str = "hold"
+    draw: Callable[..., None] | None = None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 

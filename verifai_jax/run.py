@@ -291,6 +291,9 @@ def _summary(run: Run) -> str:
     if len(failed):
         counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
         lines.append(f"  no verdict   {counts}")
+        if "message" in failed and len(raised := failed[failed["message"] != ""]):
+            number, message = raised.index[0], raised["message"].iloc[0]
+            lines.append(f"               first in row {number}: {message}")
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
     lines.append(
         f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "

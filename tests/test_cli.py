@@ -1,0 +1,118 @@
+"""The command line, as a person uses it from the root of the checkout."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from verifai_jax.cli import main
+
+ROOT = Path(__file__).parent.parent
+PROBLEM = '''
+import jax.numpy as jnp
+import verifai_jax as vj
+
+ramp = vj.Problem(
+    "ramp",
+    space={"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)},
+    system=lambda f, key: vj.Trace({"x": f["a"] + f["b"] * jnp.linspace(0, 1, 9)}, dt=1 / 8),
+    spec="always[0, 1] x <= 1",
+    description="a ramp that should stay below one",
+)
+flat = vj.Problem("flat", ramp.space, ramp.system, "eventually x > 0.5")
+'''
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "specs").mkdir()
+    (tmp_path / "specs" / "ramp.py").write_text(PROBLEM)
+
+    def run(*arguments, code=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments])
+        assert result.exit_code == code, result.output
+        return result.output
+
+    return run
+
+
+def test_falsify_and_replay(call, tmp_path):
+    output = call(
+        "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300, "--seed", 2
+    )
+    assert "simulations violate the property" in output
+    assert "always[0, 1] (x <= 1" in output or "always[0, 1] x <= 1" in output
+    assert "95 % interval" in output
+    folder = tmp_path / "runs" / "ramp-1"
+    for picture in ("features.png", "robustness.png", "worst.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+        assert str(Path("runs/ramp-1") / picture) in output
+    record = json.loads((folder / "run.json").read_text())
+    assert record["target"] == "specs/ramp.py:ramp"
+    command = next(line for line in output.splitlines() if "verifai-jax replay" in line)
+    again = call(*command.split("verifai-jax ")[1].split())
+    assert "violated" in again
+    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures")
+    assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
+
+
+def test_options_of_a_search(call, tmp_path):
+    output = call(
+        "falsify", "specs/ramp.py:ramp", "--set", "elite=0.3", "--budget", 64, "--batch", 32,
+        "--out", "here", "--no-pictures",
+    )
+    assert "0.3" in json.loads((tmp_path / "here" / "run.json").read_text())["search"]
+    assert "here" in output
+
+
+def test_list(call):
+    output = call("list")
+    assert "specs/ramp.py:ramp  a ramp that should stay below one" in output
+    assert "specs/ramp.py:flat" in output
+    assert "searches: " in output
+    assert "cross_entropy" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["falsify", "specs/ramp.py:rampe"], "unknown problem in specs/ramp.py 'rampe'; did you mean"),
+        (["falsify", "specs/ramp.py"], "has 2 problems; name one: specs/ramp.py:ramp"),
+        (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
+        (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
+        (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "elit=1"], "did you mean 'elite"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "elite"], "--set needs NAME=VALUE"),
+        (["falsify", "specs/ramp.py:ramp", "--budget", "0"], "budget must be an integer of at least"),
+        (["falsify", "specs/ramp.py:ramp", "--budgets", "3"], "--budget"),
+        (["falsfy", "specs/ramp.py:ramp"], "did you mean 'falsify'"),
+        (["replay", "runs/none"], "no run in runs/none"),
+    ],
+)
+def test_mistakes_get_one_line(call, arguments, message):
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code != 0
+    assert message in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
+    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures", "--out", "r")
+    record = json.loads((tmp_path / "r" / "run.json").read_text())
+    evil = tmp_path / "r" / "evil.py"
+    evil.write_text("raise SystemExit('ran')")
+    for target in ("r/evil.py:ramp", "/etc/evil.py:ramp", "../evil.py:x", "os:path", None):
+        (tmp_path / "r" / "run.json").write_text(json.dumps(record | {"target": target}))
+        result = CliRunner().invoke(main, ["replay", "r", "0"])
+        assert "does not say which problem of this project" in result.output
+    output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")
+    assert "robustness" in output
+
+
+def test_doctor(call):
+    output = call("doctor")
+    assert "jax " in output
+    assert "devices" in output
+    assert "cores" in output

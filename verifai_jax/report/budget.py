@@ -1,0 +1,76 @@
+"""How a search went: the robustness of each simulation in the order they were made."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+if TYPE_CHECKING:
+    from verifai_jax.run import Run
+
+DOTS = 4000  # More dots than this are thinned out; the lines are exact.
+
+
+def plot_budget(
+    run: "Run | dict[str, Run]", path: str | Path | None = None, axes: Any = None
+) -> Any:
+    """Draw robustness over simulations with the running minimum; several runs share the axes.
+
+    - `run`: a run, or runs by the label that the legend gives them.
+
+    Returns the figure.
+    """
+    runs = run if isinstance(run, dict) else {"": run}
+    figure = axes.figure if axes is not None else new_figure(figsize=(7.5, 4))
+    axes = figure.subplots() if axes is None else axes
+    if len(runs) == 1:
+        _one(axes, next(iter(runs.values())))
+    else:
+        for label, each in runs.items():
+            rho = _robustness(each)
+            number = np.arange(1, len(rho) + 1)
+            (line,) = axes.plot(number, np.fmin.accumulate(rho), label=label, linewidth=1.8)
+            _mark_first(axes, rho, line.get_color())
+        axes.set_xscale("log")
+        axes.legend(frameon=False)
+    axes.axhline(0, color=BOUND, linewidth=1, linestyle="--")
+    axes.set_xlabel("simulations")
+    axes.set_ylabel("robustness (negative: violated)")
+    tidy(axes)
+    return show_or_save(figure, path)
+
+
+def _one(axes: Any, run: "Run") -> None:
+    rho = _robustness(run)
+    number = np.arange(1, len(rho) + 1)
+    shown = np.unique(np.linspace(0, len(rho) - 1, DOTS).astype(int))
+    # The counterexamples are what one looks for: they are never thinned out.
+    shown = np.union1d(shown, np.flatnonzero(rho < 0)[:DOTS])
+    colors = np.where(rho[shown] < 0, FAILING, SAFE)
+    axes.scatter(number[shown], rho[shown], c=colors, s=5, alpha=0.5, linewidths=0)
+    axes.plot(number, np.fmin.accumulate(rho), color=BOUND, linewidth=1.6, label="best so far")
+    _mark_first(axes, rho, FAILING)
+    failures = int(np.sum(rho < 0))
+    axes.set_title(f"{run.name}: {failures:,} of {len(rho):,} simulations violate the property")
+    axes.legend(frameon=False, loc="lower left")
+
+
+def _mark_first(axes: Any, rho: np.ndarray, color: str) -> None:
+    failing = np.flatnonzero(rho < 0)
+    if len(failing):
+        first = failing[0]
+        axes.annotate(
+            f"first counterexample: simulation {first + 1:,}",
+            (first + 1, rho[first]),
+            textcoords="offset points",
+            xytext=(14, -16),
+            fontsize=8,
+            color=color,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.8},
+        )
+
+
+def _robustness(run: "Run") -> np.ndarray:
+    return run.table.all["rho"].to_numpy(float)

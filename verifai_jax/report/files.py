@@ -1,0 +1,44 @@
+"""The pictures of a run in its folder: features.png, robustness.png, worst.png, worst.gif."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from verifai_jax.report.animation import animate
+from verifai_jax.report.scatter import plot_features
+from verifai_jax.report.budget import plot_budget
+from verifai_jax.report.worst import plot_replay
+
+if TYPE_CHECKING:
+    from verifai_jax.run import Replay, Run
+
+
+def draw_run(run: "Run", folder: str | Path) -> list[Path]:
+    """Draw all pictures of a run into `folder`; returns their paths.
+
+    The worst simulation is drawn when the run has its problem and a row with a verdict.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / "features.png", folder / "robustness.png"]
+    plot_features(run, paths[0])
+    plot_budget(run, paths[1])
+    if run.problem is not None and len(run.table.failed) < run.simulations:
+        paths += draw_replay(run.replay(run.best), folder, "worst")
+    return paths
+
+
+def draw_replay(replay: "Replay", folder: str | Path, name: str | None = None) -> list[Path]:
+    """Draw one simulation into `folder`, animated too where its problem can; returns the paths."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    name = name or ("replay" if replay.row is None else f"row-{replay.row}")
+    paths = [folder / f"{name}.png"]
+    plot_replay(replay, paths[0])
+    if replay.problem.draw is not None:
+        paths.append(animate(replay, folder / f"{name}.gif"))
+    return paths
+
+
+def plot_run(run: "Run", path: str | Path | None = None) -> Any:
+    """Draw the feature space of a run; see `plot_budget` for its course."""
+    return plot_features(run, path)

@@ -1,0 +1,157 @@
+"""One simulation: its signals, the bounds they must keep, and the instant that decided."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.mtl import Formula, robustness, robustness_signal
+from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal
+from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.trace import Trace
+
+if TYPE_CHECKING:
+    from verifai_jax.run import Replay
+
+MOST_PANELS = 6
+
+
+def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
+    """Draw the signals over time, the monitored first, with bounds, violations and the instant.
+
+    Returns the figure.
+    """
+    trace = replay.trace
+    name = min(replay.rho, key=lambda n: np.nan_to_num(replay.rho[n], nan=np.inf))
+    formula = replay.problem.formulas[name]
+    monitored = [signal for signal in formula.signals() if signal in trace.signals]
+    others = [signal for signal in trace.signals if signal not in monitored]
+    shown = (monitored + others)[: max(MOST_PANELS, len(monitored))]
+    clock = np.asarray(trace.clock())
+    decisive = decisive_instant(formula, trace, replay.problem.end)
+
+    figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
+    panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
+    for axes, signal in zip(panels, shown, strict=True):
+        values = np.asarray(trace.signals[signal])
+        color = BOUND if signal in monitored else "#8d99ae"
+        axes.plot(clock, values, color=color, linewidth=1.6 if signal in monitored else 1.1)
+        axes.set_ylabel(signal)
+        tidy(axes)
+        for predicate, bounds in _bounds(formula, signal):
+            _draw_bounds(axes, clock, values, predicate, bounds, trace, replay.problem.end)
+        if decisive is not None:
+            axes.axvline(clock[decisive[1]], color=FAILING, linewidth=1, linestyle=":")
+    if decisive is not None and decisive[0] in shown:
+        _mark(panels[shown.index(decisive[0])], trace, *decisive)
+    panels[-1].set_xlabel("time [s]")
+    verdict = "violated" if replay.violated else replay.status.name.lower()
+    where = ", ".join(f"{k}={_short(v)}" for k, v in _flat(replay).items())
+    figure.suptitle(
+        f"{formula}\nrobustness {replay.rho[name]:.4g} ({verdict}) at {where}"[:400],
+        fontsize=9,
+        color=FAILING if replay.violated else BOUND,
+        wrap=True,
+    )
+    return show_or_save(figure, path)
+
+
+def decisive_instant(formula: Formula, trace: Trace, end: str = "hold") -> tuple[str, int] | None:
+    """The signal and sample that set the robustness at time 0; None where nothing does.
+
+    The gradient of the hard semantics is the diagnosis: it vanishes everywhere else.
+    """
+    import jax
+
+    real = {
+        name: np.asarray(values, float)
+        for name, values in trace.signals.items()
+        if name in formula.signals()
+    }
+    fixed = {name: values for name, values in trace.signals.items() if name not in real}
+
+    def value(signals: Any) -> Any:
+        whole = Trace({**fixed, **signals}, trace.dt, trace.times)
+        return robustness(formula, whole, end=end)
+
+    gradient = jax.grad(value)(real)
+    sizes = {
+        name: np.nan_to_num(np.abs(np.asarray(g))).reshape(trace.length, -1).sum(axis=1)
+        for name, g in gradient.items()
+    }
+    if not sizes or max(size.max() for size in sizes.values()) == 0:
+        return None
+    name = max(sizes, key=lambda n: sizes[n].max())
+    return name, int(sizes[name].argmax())
+
+
+def _bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
+    """Predicates that compare this signal, or its absolute value, with a number."""
+    found = []
+    for part in dict.fromkeys(formula.subformulas()):
+        if isinstance(part, Predicate) and isinstance(part.right, Number):
+            limit = part.right.value
+            inner = part.left
+            if isinstance(inner, Arithmetic) and inner.name == "abs":
+                inner, limits = inner.arguments[0], [limit, -limit]
+            else:
+                limits = [limit]
+            if isinstance(inner, Component):
+                inner = inner.vector
+            if inner == Signal(signal):
+                found.append((part, limits))
+    return found
+
+
+def _draw_bounds(
+    axes: Any,
+    clock: np.ndarray,
+    values: np.ndarray,
+    predicate: Predicate,
+    limits: list[float],
+    trace: Trace,
+    end: str,
+) -> None:
+    reach = max(float(np.nanmax(np.abs(values))), 1e-9)
+    for limit in limits:
+        # A bound far away would squeeze the signal into a flat line.
+        if abs(limit) <= 4 * reach:
+            axes.axhline(limit, color=BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
+    margin = np.asarray(robustness_signal(predicate, trace, end=end))
+    axes.fill_between(
+        clock, 0, 1, where=margin < 0, transform=axes.get_xaxis_transform(),
+        color=FAILING, alpha=0.13, linewidth=0, step="mid",
+    )
+    axes.annotate(
+        str(predicate), (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom",
+        fontsize=7, color=SAFE if (margin >= 0).all() else FAILING,
+    )
+
+
+def _mark(axes: Any, trace: Trace, signal: str, sample: int) -> None:
+    time = float(np.asarray(trace.clock())[sample])
+    value = np.asarray(trace.signals[signal])[sample]
+    if np.ndim(value):
+        value = value[int(np.argmax(np.abs(value)))]
+    axes.plot([time], [value], "o", color=FAILING, markersize=6)
+    right = sample > trace.length / 2
+    axes.annotate(
+        f"{signal} = {value:.4g} at {time:.4g} s",
+        (time, value),
+        textcoords="offset points",
+        xytext=(-10 if right else 10, 8),
+        ha="right" if right else "left",
+        fontsize=8,
+        color=FAILING,
+    )
+
+
+def _flat(replay: "Replay") -> dict[str, Any]:
+    import jax
+
+    one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], replay.features)
+    return {name: column[0] for name, column in replay.problem.space.rows(one).items()}
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
