@@ -1,0 +1,43 @@
+"""Cases that at least two other monitors and a brute-force oracle agree on."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.mtl import boolean, parse, robustness, robustness_signal, satisfied
+from verifai_jax.trace import Trace
+
+CASES = json.loads((Path(__file__).parent / "conformance.json").read_text())["cases"]
+
+
+@pytest.fixture(params=["float64", "float32"])
+def precision(request):
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+def trace_of(case, precision):
+    signals = {name: np.asarray(v, precision) for name, v in case["signals"].items()}
+    return Trace(signals, dt=case["period"])
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case["id"])
+def test_agrees_with_other_monitors(case, precision):
+    trace, index = trace_of(case, precision), case["eval_index"]
+    tolerance = {"float64": 1e-6, "float32": 1e-4}[precision]
+    formula = parse(case["formula"])
+    for end, expected in (("hold", case["rho"]), ("truncate", case["rho_truncate"])):
+        everywhere = robustness_signal(formula, trace, end=end)
+        assert everywhere.dtype == jnp.dtype(precision)
+        np.testing.assert_allclose(everywhere[index], float(expected), rtol=0, atol=tolerance)
+        if index == 0:
+            value = robustness(formula, trace, end=end)
+            np.testing.assert_allclose(value, float(expected), rtol=0, atol=tolerance)
+    verdict = robustness_signal(formula, trace, boolean)[index]
+    assert bool(verdict > 0) == case["satisfied"]
+    if index == 0:
+        assert bool(satisfied(formula, trace)) == case["satisfied"]

@@ -1,0 +1,36 @@
+"""Metric temporal logic: formulas, their text, their robustness on traces."""
+
+from verifai_jax.mtl.certificate import Certificate as Certificate
+from verifai_jax.mtl.evaluate import IntervalError as IntervalError
+from verifai_jax.mtl.formula import FALSE as FALSE
+from verifai_jax.mtl.formula import TRUE as TRUE
+from verifai_jax.mtl.formula import Expression as Expression
+from verifai_jax.mtl.formula import Formula as Formula
+from verifai_jax.mtl.formula import always as always
+from verifai_jax.mtl.formula import eventually as eventually
+from verifai_jax.mtl.formula import historically as historically
+from verifai_jax.mtl.formula import next_ as next_
+from verifai_jax.mtl.formula import once as once
+from verifai_jax.mtl.formula import prev as prev
+from verifai_jax.mtl.formula import signal as signal
+from verifai_jax.mtl.formula import since as since
+from verifai_jax.mtl.formula import until as until
+from verifai_jax.mtl.parse import FormulaSyntaxError as FormulaSyntaxError
+from verifai_jax.mtl.parse import parse as parse
+from verifai_jax.mtl.printing import latex as latex
+from verifai_jax.mtl.recording import read as read
+from verifai_jax.mtl.recording import resample as resample
+from verifai_jax.mtl.robustness import HorizonError as HorizonError
+from verifai_jax.mtl.robustness import certificate as certificate
+from verifai_jax.mtl.robustness import robustness as robustness
+from verifai_jax.mtl.robustness import robustness_signal as robustness_signal
+from verifai_jax.mtl.robustness import satisfied as satisfied
+from verifai_jax.mtl.semantics import Semantics as Semantics
+from verifai_jax.mtl.semantics import boolean as boolean
+from verifai_jax.mtl.semantics import hard as hard
+from verifai_jax.mtl.semantics import smooth as smooth
+from verifai_jax.mtl.services import history as history
+from verifai_jax.mtl.services import horizon as horizon
+from verifai_jax.mtl.services import nnf as nnf
+from verifai_jax.mtl.services import signals as signals
+from verifai_jax.mtl.services import simplify as simplify

@@ -1,0 +1,130 @@
+"""How far the smooth robustness can be from the hard one, in temperatures.
+
+A smooth maximum of n values exceeds the hard one by at most tau log n, a smooth minimum falls short
+of it by as much. Along a path of sub-formulas these add up; adjacent maxima count as one.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.evaluate import Evaluator
+from verifai_jax.mtl.formula import Formula
+
+
+class Certificate(NamedTuple):
+    """`smooth - tau * above <= hard <= smooth + tau * below`."""
+
+    above: float
+    below: float
+
+    @property
+    def total(self) -> float:
+        """The greater of both: `|smooth - hard| <= tau * total`."""
+        return max(self.above, self.below)
+
+
+@dataclass(frozen=True)
+class _Slack:
+    """Slack of a value that is itself a maximum (or minimum) of exp(`log_count`) values.
+
+    `above` and `below` are those of the values it joins, without the join itself.
+    """
+
+    above: float = 0.0
+    below: float = 0.0
+    kind: str = ""
+    log_count: float = 0.0
+
+    def settled(self) -> tuple[float, float]:
+        above = self.above + (self.log_count if self.kind == "max" else 0.0)
+        below = self.below + (self.log_count if self.kind == "min" else 0.0)
+        return above, below
+
+    def negated(self) -> "_Slack":
+        kind = {"max": "min", "min": "max", "": ""}[self.kind]
+        return _Slack(self.below, self.above, kind, self.log_count)
+
+
+def slack(evaluator: Evaluator, f: Formula, first: int, last: int) -> Certificate:
+    """The certificate of `f`'s smooth value at any of the instants `first` to `last`."""
+    return Certificate(*_slack(evaluator, f, first, last).settled())
+
+
+def _joined(kind: str, parts: list[_Slack], repeats: float = 1.0) -> _Slack:
+    """A join of the `parts`, each of them `repeats` times."""
+    above = below = 0.0
+    logs = []
+    for part in parts:
+        if part.kind in (kind, ""):
+            above, below = max(above, part.above), max(below, part.below)
+            logs.append(part.log_count)
+        else:
+            a, b = part.settled()
+            above, below = max(above, a), max(below, b)
+            logs.append(0.0)
+    top = max(logs)
+    log_count = top + math.log(sum(math.exp(x - top) for x in logs)) + math.log(repeats)
+    return _Slack(above, below, kind, log_count)
+
+
+def _slack(e: Evaluator, f: Formula, first: int, last: int) -> _Slack:
+    match f:
+        case ast.Not(operand):
+            return _slack(e, operand, first, last).negated()
+        case ast.And(parts) | ast.Or(parts):
+            kind = "min" if isinstance(f, ast.And) else "max"
+            return _joined(kind, [_slack(e, p, first, last) for p in parts])
+        case ast.Always(operand, interval) | ast.Eventually(operand, interval):
+            kind = "min" if isinstance(f, ast.Always) else "max"
+            return _future(e, operand, kind, *e.span(interval), first, last)
+        case ast.Historically(operand, interval) | ast.Once(operand, interval):
+            kind = "min" if isinstance(f, ast.Historically) else "max"
+            return _past(e, operand, kind, *e.span(interval), first, last)
+        case ast.Next(operand) | ast.Prev(operand):
+            step = 1 if isinstance(f, ast.Next) else -1
+            return _slack(e, operand, max(0, first + step), max(0, last + step))
+        case ast.Until(left, right, interval):
+            a, b = e.span(interval)
+            end = max(e.settles(left), e.settles(right), first + a)
+            begin = min(first + a, end)
+            terms = [_until(e, left, right, end - begin + 1, begin, end)]
+            if math.isfinite(b):
+                terms.append(_future(e, right, "max", a, b, first, last))
+            if a > 0:
+                terms.append(_future(e, left, "min", 0, a - 1, first, last))
+            return _joined("min", terms) if len(terms) > 1 else terms[0]
+        case ast.Since(left, right, interval):
+            a, b = e.span(interval)
+            end = max(last - a, 0)
+            terms = [_until(e, left, right, end + 1, 0, end)]
+            if math.isfinite(b):
+                terms.append(_past(e, right, "max", a, b, first, last))
+            if a > 0:
+                terms.append(_past(e, left, "min", 0, a - 1, first, last))
+            return _joined("min", terms) if len(terms) > 1 else terms[0]
+    return _Slack()
+
+
+def _until(e: Evaluator, f: Formula, g: Formula, n: int, first: int, last: int) -> _Slack:
+    # By induction along the recursion each sample adds one to the count under the logarithm, on
+    # both sides.
+    parts = [_slack(e, h, first, last).settled() for h in (f, g)]
+    above, below = (max(side) + math.log(n) for side in zip(*parts, strict=True))
+    return _Slack(above, below)
+
+
+def _future(e: Evaluator, f: Formula, kind: str, a: int, b: float, first: int, last: int) -> _Slack:
+    end = max(e.settles(f), first + a)
+    stop = end if math.isinf(b) else min(last + int(b), end)
+    count = min(stop - (first + a) + 1, b - a + 1)
+    begin = min(first + a, e.settles(f))
+    return _joined(kind, [_slack(e, f, begin, max(begin, stop))], max(1.0, count))
+
+
+def _past(e: Evaluator, f: Formula, kind: str, a: int, b: float, first: int, last: int) -> _Slack:
+    stop = max(0, last - a)
+    begin = 0 if math.isinf(b) else max(0, first - int(b))
+    count = min(stop - begin + 1, b - a + 1)
+    return _joined(kind, [_slack(e, f, begin, stop)], max(1.0, count))

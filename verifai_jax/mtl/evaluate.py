@@ -1,0 +1,369 @@
+"""The value of a formula over a range of instants, computing no instant that is not needed.
+
+Signals are time-major `[time, *lanes]`. Under `hold` a trace goes on for ever with its last sample,
+so every sub-formula is constant from some instant on (where it *settles*): asking for later
+instants costs nothing, and an unbounded window need only reach that far.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl import windows
+from verifai_jax.mtl.formula import Expression, Formula, Interval
+
+End = Literal["hold", "truncate", "strict"]
+
+
+class IntervalError(ValueError):
+    """An interval that is not a multiple of the trace's sampling period."""
+
+
+def samples(time: float, dt: float, interval: Interval) -> float:
+    """`time` in samples. **Raises:** `IntervalError` if it is not a multiple of `dt`."""
+    if math.isinf(time):
+        return math.inf
+    n = time / dt
+    if abs(n - round(n)) > 1e-6 * max(1.0, abs(n)):
+        low, high = math.floor(n), math.ceil(n)
+        raise IntervalError(
+            f"the interval {interval} does not fit the sampling period of {dt:g} s: {time:g} s is "
+            f"not a multiple of it; the nearest are {low * dt:g} s and {high * dt:g} s"
+        )
+    return round(n)
+
+
+@dataclass
+class Evaluator:
+    """Evaluates sub-formulas of one trace (or of many, in lanes) under one semantics.
+
+    `kind` is the semantics' kind, `tau` its temperature (smooth only), `valid` the number of
+    samples that count, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane
+    axes; `open_right` makes windows half-open, as in `compat="pymtl"`.
+    """
+
+    signals: Mapping[str, Float[Array, "time *lanes"]]
+    length: int
+    dt: float
+    kind: str = "hard"
+    tau: Any = None
+    end: End = "hold"
+    valid: Any = None
+    open_right: bool = False
+    lanes: int = 0
+    _memo: dict[Any, Array] = field(default_factory=dict)
+
+    @property
+    def _last(self) -> int:
+        return self.length - 1
+
+    @property
+    def _hold(self) -> bool:
+        return self.end != "truncate"
+
+    def span(self, interval: Interval) -> tuple[int, float]:
+        """First and last sample of an interval, relative to now."""
+        a = samples(interval.start, self.dt, interval)
+        b = samples(interval.end, self.dt, interval)
+        if self.open_right and b > a:
+            b -= 1
+        return int(a), b
+
+    def settles(self, f: Formula) -> int:
+        """The instant from which `f` is constant under `hold`; the last sample otherwise."""
+        if not self._hold:
+            return self._last
+        below = [self.settles(part) for part in f.operands()]
+        match f:
+            case ast.Constant():
+                return 0
+            case ast.Predicate() | ast.Atom():
+                return self._last
+            case ast.Always(_, interval) | ast.Eventually(_, interval):
+                return max(0, below[0] - self.span(interval)[0])
+            case ast.Next():
+                return max(0, below[0] - 1)
+            case ast.Prev():
+                return below[0] + 1
+            case ast.Historically(_, interval) | ast.Once(_, interval) | ast.Since(_, _, interval):
+                a, b = self.span(interval)
+                return max(below) + int(a if math.isinf(b) else b)
+        return max(below)
+
+    def value(self, f: Formula, first: int, last: int) -> Float[Array, "instants *lanes"]:
+        """Values of `f` at the instants `first` to `last`, both included."""
+        key = (f, first, last)
+        if key not in self._memo:
+            self._memo[key] = self._value(f, first, last)
+        return self._memo[key]
+
+    def _value(self, f: Formula, first: int, last: int) -> Array:
+        match f:
+            case ast.Constant(value):
+                return self._full(value, last - first + 1)
+            case ast.Predicate() | ast.Atom():
+                return self._leaf(f, first, last)
+            case ast.Not(operand):
+                return -self.value(operand, first, last)
+            case ast.And(parts):
+                return -self._greatest([-self.value(p, first, last) for p in parts])
+            case ast.Or(parts):
+                return self._greatest([self.value(p, first, last) for p in parts])
+            case ast.Eventually(operand, interval):
+                return self._future(operand, 1, *self.span(interval), first, last)
+            case ast.Always(operand, interval):
+                return -self._future(operand, -1, *self.span(interval), first, last)
+            case ast.Next(operand):
+                return self._next(operand, first, last)
+            case ast.Once(operand, interval):
+                return self._past(operand, 1, *self.span(interval), first, last)
+            case ast.Historically(operand, interval):
+                return -self._past(operand, -1, *self.span(interval), first, last)
+            case ast.Prev(operand, weak):
+                sign = -1 if weak else 1
+                return sign * self._past(operand, sign, 1, 1, first, last)
+            case ast.Until(left, right, interval):
+                return self._until(left, right, *self.span(interval), first, last)
+            case ast.Since(left, right, interval):
+                return self._since(left, right, *self.span(interval), first, last)
+        raise TypeError(f"not a formula: {f!r}")
+
+    # Leaves
+
+    def _full(self, value: bool, n: int) -> Array:
+        some = next(iter(self.signals.values()), None)
+        dtype = jnp.result_type(float) if some is None else some.dtype
+        top = {"boolean": 1.0, "smooth": windows.NEVER}.get(self.kind, jnp.inf)
+        return jnp.full((n,) + (1,) * self.lanes, top if value else -top, dtype)
+
+    def _leaf(self, f: Formula, first: int, last: int) -> Array:
+        start, stop = min(first, self._last), min(last, self._last)
+        match f:
+            case ast.Predicate(comparison, left, right):
+                a, b = (self._expression(e, start, stop) for e in (left, right))
+                value = self._compared(comparison, a, b)
+            case ast.Atom(e):
+                value = self._compared(">", self._expression(e, start, stop), 0.0)
+        if value.ndim == 0:  # A predicate over constants only.
+            value = jnp.broadcast_to(value, (stop - start + 1,) + (1,) * self.lanes)
+        return self._extended(value, last - first + 1)
+
+    def _compared(self, comparison: str, a: Any, b: Any) -> Array:
+        match comparison:
+            case ">" | ">=":
+                margin = a - b
+            case "<" | "<=":
+                margin = b - a
+            case "==":
+                margin = -jnp.abs(a - b)
+            case _:
+                margin = jnp.abs(a - b)
+        if self.kind != "boolean":
+            return jnp.asarray(margin)
+        holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
+        verdict = jnp.where(holds, 1.0, -1.0).astype(margin.dtype)
+        return jnp.where(jnp.isnan(margin), margin, verdict)
+
+    def _expression(self, e: Expression, start: int, stop: int) -> Any:
+        match e:
+            case ast.Number(value):
+                return value
+            case ast.Signal(name):
+                signal = self.signals[name]
+                if signal.ndim != 1 + self.lanes:
+                    raise TypeError(
+                        f"signal {name!r} is a vector of {signal.shape[-1]} components and cannot "
+                        f"be used as a number: take a component, {e}[0], or norm({e})"
+                    )
+                return signal[start : stop + 1]
+            case ast.Component(ast.Signal(name), index):
+                return self._vector(name, f"{e}", index)[start : stop + 1, ..., index]
+            case ast.Arithmetic("norm", (argument,)):
+                if not isinstance(argument, ast.Signal):
+                    raise TypeError(f"norm takes a vector signal; got norm({argument})")
+                vector = self._vector(argument.name, f"{e}")[start : stop + 1]
+                square = jnp.sum(vector * vector, axis=-1)
+                # The gradient of a square root is infinite at 0, where that of the norm is not.
+                safe = jnp.where(square == 0, 1.0, square)
+                return jnp.where(square == 0, square, jnp.sqrt(safe))
+            case ast.Arithmetic(name, arguments):
+                return _apply(name, [self._expression(a, start, stop) for a in arguments])
+        raise TypeError(f"not an expression: {e!r}")
+
+    def _vector(self, name: str, text: str, index: int = 0) -> Array:
+        signal = self.signals[name]
+        if signal.ndim != 2 + self.lanes:
+            raise TypeError(f"signal {name!r} is a scalar: {text} needs a vector [time, k]")
+        if index >= signal.shape[-1]:
+            raise TypeError(
+                f"signal {name!r} has {signal.shape[-1]} components, counted from 0; got {text}"
+            )
+        return signal
+
+    # Joining values
+
+    def _greatest(self, values: list[Array]) -> Array:
+        if self.kind != "smooth":
+            result = values[0]
+            for value in values[1:]:
+                result = jnp.maximum(result, value)
+            return result
+        shape = jnp.broadcast_shapes(*(v.shape for v in values))
+        return windows.maximum(jnp.stack([jnp.broadcast_to(v, shape) for v in values]), self.tau)
+
+    @property
+    def _nothing(self) -> float:
+        """The value of a maximum over no sample."""
+        return {"boolean": -1.0, "smooth": -windows.NEVER}.get(self.kind, -math.inf)
+
+    def _extended(self, x: Array, n: int) -> Array:
+        """`x` with `n` instants: the last one repeated under `hold`, nothing otherwise."""
+        if x.shape[0] >= n:
+            return x
+        shape = (n - x.shape[0], *x.shape[1:])
+        tail = jnp.broadcast_to(x[-1:], shape) if self._hold else jnp.full(shape, self._nothing)
+        return jnp.concatenate([x, tail.astype(x.dtype)])
+
+    def _cut(self, x: Array, first: int) -> Array:
+        """Samples that do not count, replaced by nothing (for a maximum)."""
+        if self._hold or self.valid is None:
+            return x
+        return jnp.where(self._index(first, x) < self.valid, x, self._nothing)
+
+    # Temporal operators, as maxima of `sign * operand`
+
+    def _future(self, f: Formula, sign: int, a: int, b: float, first: int, last: int) -> Array:
+        end = self.settles(f)
+        begin = first + a
+        if begin > end and not self._hold:
+            return self._blank(f, last - first + 1)
+        begin = min(begin, end)
+        # Instants beyond this one see nothing but the settled value.
+        count = max(1, min(last, end - a) - first + 1)
+        stop = end if math.isinf(b) else min(first + count - 1 + int(b), end)
+        x = self._cut(sign * self.value(f, begin, stop), begin)
+        if count == 1:
+            value = windows.maximum(x, self._tau(x))[None]
+        else:
+            width = x.shape[0] if math.isinf(b) else int(b) - a + 1
+            value = self._window(x, width, reverse=True)[:count]
+        return self._extended(value, last - first + 1)
+
+    def _past(self, f: Formula, sign: int, a: int, b: float, first: int, last: int) -> Array:
+        n = last - first + 1
+        if last < a:
+            return self._blank(f, n)
+        begin = 0 if math.isinf(b) else max(0, first - int(b))
+        x = sign * self.value(f, begin, last - a)
+        count = last - max(first, a) + 1
+        if count == 1:
+            start = 0 if math.isinf(b) else max(0, last - int(b)) - begin
+            value = windows.maximum(x[start:], self._tau(x))[None]
+        else:
+            width = x.shape[0] if math.isinf(b) else int(b) - a + 1
+            value = self._window(x, width, reverse=False)[-count:]
+        if count == n:
+            return value
+        blank = jnp.full((n - count, *value.shape[1:]), self._nothing, value.dtype)
+        return jnp.concatenate([blank, value])
+
+    def _next(self, f: Formula, first: int, last: int) -> Array:
+        end = self._last if not self._hold else self.settles(f)
+        x = self.value(f, min(first + 1, end), min(last + 1, end))
+        if x.shape[0] < last - first + 1:
+            # Repeats the last value, so that next stays its own dual.
+            x = jnp.concatenate(
+                [x, jnp.broadcast_to(x[-1:], (last - first + 1 - x.shape[0], *x.shape[1:]))]
+            )
+        if self._hold or self.valid is None:
+            return x
+        index = self._index(first, x)
+        return jnp.where(index < self.valid - 1, x, self.value(f, first, last))
+
+    def _index(self, first: int, x: Array) -> Array:
+        return (first + jnp.arange(x.shape[0])).reshape((-1,) + (1,) * (x.ndim - 1))
+
+    def _tau(self, x: Array) -> Any:
+        return self.tau if self.kind == "smooth" else None
+
+    def _window(self, x: Array, width: int, reverse: bool) -> Array:
+        if width <= 1:
+            return x
+        return windows.windowed(x, width, self._tau(x), reverse)
+
+    def _blank(self, f: Formula, n: int) -> Array:
+        like = self.value(f, 0, 0)
+        return jnp.full((n, *like.shape[1:]), self._nothing, like.dtype)
+
+    def _until(
+        self, f: Formula, g: Formula, a: int, b: float, first: int, last: int
+    ) -> Float[Array, "instants *lanes"]:
+        # f U[a,b] g = G[0,a-1] f  &  X^a (F[0,b-a] g  &  f U g), exact for the half-open until
+        # (Donze, Ferrere, Maler 2013, eq. 6 for the closed one).
+        end = max(self.settles(f), self.settles(g))
+        begin = first + a
+        n = last - first + 1
+        if not self._hold and begin > end:
+            return self._blank(g, n)
+        begin = min(begin, end)
+        count = max(1, min(last, end - a) - first + 1)
+        left = self.value(f, begin, end)
+        right = self._cut(self.value(g, begin, end), begin)
+        left, right = jnp.broadcast_arrays(left, right)
+        value = windows.until(left, right, self._tau(right))[:count]
+        terms = []
+        if math.isfinite(b):
+            terms.append(self._extended(self._future(g, 1, a, b, first, first + count - 1), count))
+        value = self._extended(value, n)
+        terms = [self._extended(term, n) for term in terms]
+        if a > 0:
+            terms.append(-self._future(f, -1, 0, a - 1, first, last))
+        return -self._greatest([-value, *(-term for term in terms)]) if terms else value
+
+    def _since(
+        self, f: Formula, g: Formula, a: int, b: float, first: int, last: int
+    ) -> Float[Array, "instants *lanes"]:
+        n = last - first + 1
+        if last < a:
+            return self._blank(g, n)
+        left, right = (self.value(h, 0, last - a) for h in (f, g))
+        left, right = jnp.broadcast_arrays(left, right)
+        count = last - max(first, a) + 1
+        value = windows.until(left, right, self._tau(right), reverse=False)[-count:]
+        terms = [value]
+        if math.isfinite(b):
+            terms.append(self._past(g, 1, a, b, max(first, a), last))
+        if a > 0:
+            terms.append(-self._past(f, -1, 0, a - 1, max(first, a), last))
+        if len(terms) > 1:
+            value = -self._greatest([-term for term in terms])
+        if count == n:
+            return value
+        blank = jnp.full((n - count, *value.shape[1:]), self._nothing, value.dtype)
+        return jnp.concatenate([blank, value])
+
+
+def _apply(name: str, values: list[Any]) -> Any:
+    first, *others = values
+    match name:
+        case "neg":
+            return -first
+        case "+":
+            return first + others[0]
+        case "-":
+            return first - others[0]
+        case "*":
+            return first * others[0]
+        case "/":
+            return first / others[0]
+        case "min" | "max":
+            operation = jnp.minimum if name == "min" else jnp.maximum
+            for other in others:
+                first = operation(first, other)
+            return first
+    return {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos}[name](first)

@@ -1,0 +1,192 @@
+"""Recorded signals as a trace: from CSV and Parquet files, and from uneven sample times.
+
+read("flight.csv")                                        # a column `time`
+read("flight.parquet", dt=0.02)                           # rows 0.02 s apart
+read("flight.csv", resample_to=0.1, method="linear")
+resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from verifai_jax.errors import unknown_name
+from verifai_jax.trace import Trace
+
+Method = Literal["hold", "linear"]
+
+
+def resample(trace: Trace, dt: float, method: Method) -> Trace:
+    """The same signals on an even clock, from the first sample time to the last.
+
+    **Arguments:**
+
+    - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
+    - `dt`: the new sampling period in seconds.
+    - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
+
+    **Raises:** `ValueError` for a period that is not positive, an unknown method, or sample times
+    that do not increase.
+    """
+    if method not in ("hold", "linear"):
+        raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
+    if not dt > 0:
+        raise ValueError(f"the sampling period dt must be positive; got {dt}")
+    trace = trace.trim()
+    times = (
+        np.asarray(trace.clock(), float) if trace.dt is None else trace.dt * np.arange(trace.length)
+    )
+    _check_increasing(times)
+    count = int(np.floor((times[-1] - times[0]) / dt * (1 + 1e-9) + 1e-9)) + 1
+    clock = times[0] + dt * np.arange(count)
+    # A sample due at `t` counts from `t` on, whatever the last digit of the clock says.
+    index = np.searchsorted(times, clock + 1e-6 * dt, side="right") - 1
+    following = np.minimum(index + 1, len(times) - 1)
+    gap = times[following] - times[index]
+    share = np.clip(np.where(gap > 0, (clock - times[index]) / np.where(gap > 0, gap, 1), 0), 0, 1)
+    signals = {}
+    for name, values in trace.signals.items():
+        values = np.asarray(values)
+        here, there = values[index], values[following]
+        if method == "linear" and values.dtype != bool:
+            weight = share.reshape((-1,) + (1,) * (values.ndim - 1))
+            # Not a weighted sum, which would spread the NaN of a neighbour with no weight.
+            signals[name] = np.where(weight == 0, here, here + weight * (there - here))
+        else:
+            signals[name] = here
+    return replace(trace, signals=signals, dt=float(dt), times=None)
+
+
+def read(
+    path: str | Path,
+    *,
+    time: str = "time",
+    dt: float | None = None,
+    columns: Sequence[str] | None = None,
+    resample_to: float | None = None,
+    method: Method | None = None,
+) -> Trace:
+    """A recorded trace from a CSV or Parquet file, one column a signal, one row a sample.
+
+    Columns `p[0]`, `p[1]`, ... make one vector signal `p`. Columns that hold no numbers are left
+    out, unless named in `columns`.
+
+    **Arguments:**
+
+    - `path`: `.csv` (first line: names) or `.parquet`.
+    - `time`: the column of sample times in seconds.
+    - `dt`: the sampling period, instead of a column of times.
+    - `columns`: the signals to read; all when left out.
+    - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
+
+    **Raises:** `FileNotFoundError`; `ValueError` for another kind of file, no rows, a column that
+    does not exist or holds no numbers, times that do not increase, or `resample_to` without
+    `method`.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"there is no recording {path}")
+    if (resample_to is None) != (method is None):
+        raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    table = _columns(path)
+    if time not in table and dt is None:
+        raise ValueError(
+            f"{path} has no column {time!r} of sample times: give the sampling period dt, or the "
+            f"name of the column. It has: {', '.join(table)}"
+        )
+    times = table.pop(time, None)
+    signals = _signals(path, table, columns)
+    if dt is not None:
+        trace = Trace(signals, dt=dt)
+    else:
+        times = _numbers(path, time, times)
+        _check_increasing(times)
+        trace = Trace(signals, times=times)
+    if resample_to is not None and method is not None:
+        return resample(trace, resample_to, method)
+    return trace
+
+
+def _check_increasing(times: np.ndarray) -> None:
+    steps = np.diff(times)
+    if not np.all(steps > 0):
+        k = int(np.argmin(np.where(np.isnan(steps), -np.inf, steps)))
+        raise ValueError(
+            f"sample times must increase; row {k + 1} has {times[k]:g} s and row {k + 2} "
+            f"{times[k + 1]:g} s"
+        )
+
+
+def _columns(path: Path) -> dict[str, Any]:
+    """Columns by name, as Arrow arrays."""
+    import pyarrow
+    from pyarrow import csv, parquet
+
+    readers = {".csv": csv.read_csv, ".parquet": parquet.read_table}
+    if path.suffix.lower() not in readers:
+        raise ValueError(f"a recording is a .csv or a .parquet file; got {path.name}")
+    try:
+        table = readers[path.suffix.lower()](path)
+    except (pyarrow.ArrowInvalid, OSError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from None
+    if table.num_rows == 0:
+        raise ValueError(f"{path} has no rows")
+    names = table.column_names
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{path} has more than one column {', '.join(map(repr, repeated))}")
+    return {name: table.column(name) for name in names}
+
+
+def _numeric(column: Any) -> bool:
+    from pyarrow import types
+
+    kind = column.type
+    return types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)
+
+
+def _numbers(path: Path, name: str, column: Any) -> np.ndarray:
+    if not _numeric(column):
+        raise ValueError(
+            f"column {name!r} of {path} holds no numbers; it starts with {column[0].as_py()!r}"
+        )
+    values = column.to_numpy()
+    # A column of truth values with gaps comes as objects, in which None is a gap.
+    return values.astype(float) if values.dtype == object else values
+
+
+def _signals(
+    path: Path, table: dict[str, Any], columns: Sequence[str] | None
+) -> dict[str, np.ndarray]:
+    if columns is None:
+        table = {name: column for name, column in table.items() if _numeric(column)}
+        if not table:
+            raise ValueError(f"{path} has no column of numbers")
+    vectors: dict[str, dict[int, str]] = {}
+    for name in table:
+        stem, bracket, index = name.partition("[")
+        if bracket and index.endswith("]") and index[:-1].isdigit():
+            vectors.setdefault(stem, {})[int(index[:-1])] = name
+    vectors = {
+        stem: parts
+        for stem, parts in vectors.items()
+        if sorted(parts) == list(range(len(parts))) and stem not in table
+    }
+    in_vectors = {name for parts in vectors.values() for name in parts.values()}
+    scalars = [name for name in table if name not in in_vectors]
+    wanted = [*scalars, *vectors] if columns is None else list(columns)
+    signals = {}
+    for name in wanted:
+        if name in vectors:
+            parts = vectors[name]
+            signals[name] = np.stack(
+                [_numbers(path, parts[i], table[parts[i]]) for i in range(len(parts))], axis=1
+            )
+        elif name in table:
+            signals[name] = _numbers(path, name, table[name])
+        else:
+            raise unknown_name("column", name, [*scalars, *vectors])
+    return signals

@@ -1,0 +1,73 @@
+"""What a formula's operators mean as numbers: hard, boolean, or smooth at a temperature.
+
+    robustness(f, trace)                              # hard: min and max
+    robustness(f, trace, smooth(0.1))                 # log-sum-exp at temperature 0.1
+    robustness(f, trace, smooth(tau, bound="lower"))  # never above the hard value
+    robustness(f, trace, smooth(error=0.05))          # tau chosen so that |smooth - hard| <= 0.05
+
+A `Semantics` is a pytree whose only leaf is the temperature, so annealing does not recompile.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+Kind = Literal["hard", "boolean", "smooth"]
+Bound = Literal["none", "lower", "upper"]
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["tau"],
+    meta_fields=["kind", "error", "bound"],
+)
+@dataclass(frozen=True)
+class Semantics:
+    """How to give a formula its value; made by `hard`, `boolean` and `smooth`."""
+
+    kind: Kind
+    tau: Any = None
+    error: float | None = None
+    bound: Bound = "none"
+
+
+#: Quantitative semantics by min and max: positive where the formula holds, negative where not.
+hard = Semantics("hard")
+
+#: +1 where the formula holds, -1 where not, NaN where a signal is NaN. At robustness 0 the
+#: comparison decides: `>=` holds, `>` does not.
+boolean = Semantics("boolean")
+
+
+def smooth(
+    tau: Float[Array, ""] | float | None = None,
+    *,
+    error: float | None = None,
+    bound: Bound = "none",
+) -> Semantics:
+    """Quantitative semantics by log-sum-exp, differentiable everywhere.
+
+    **Arguments:**
+
+    - `tau`: temperature, positive, in the unit of the predicates; may be traced. As it tends to 0
+      the value tends to the hard one. It is not itself differentiated.
+    - `error`: instead of `tau`, the greatest distance from the hard value that is acceptable; the
+      temperature follows from the certificate (see `certificate`).
+    - `bound`: shift the value by the certificate so that it never exceeds the hard one (`"lower"`),
+      never falls below it (`"upper"`), or leave it (`"none"`). The gradient is the same.
+
+    **Raises:** `ValueError` unless exactly one of `tau` and `error` is given and positive.
+    """
+    if (tau is None) == (error is None):
+        raise ValueError("smooth needs a temperature tau or an error, one of the two")
+    if bound not in ("none", "lower", "upper"):
+        raise ValueError(f"bound is 'none', 'lower' or 'upper'; got {bound!r}")
+    for name, value in (("tau", tau), ("error", error)):
+        concrete = isinstance(value, (int, float, np.number, np.ndarray))
+        if concrete and not bool(np.all(np.asarray(value) > 0)):
+            raise ValueError(f"{name} must be positive; got {value}")
+    return Semantics("smooth", tau=tau, error=error, bound=bound)

@@ -1,0 +1,206 @@
+"""Questions about a formula that need no trace, and rewritings that keep its value.
+
+signals(f), horizon(f)                            # also f.signals(), f.horizon()
+nnf(f)                                            # negations only at the leaves
+simplify(f)                                       # fewer nodes, the same robustness
+"""
+
+import math
+from decimal import Decimal
+
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.formula import FALSE, TRUE, Expression, Formula, Interval
+
+
+def signals(f: Formula) -> tuple[str, ...]:
+    """Names of the signals a formula speaks of, in order of appearance."""
+    names: dict[str, None] = {}
+    for part in f.subformulas():
+        for e in expressions(part):
+            _collect(e, names)
+    return tuple(names)
+
+
+def expressions(f: Formula) -> tuple[Expression, ...]:
+    """The expressions a leaf compares; none for an operator."""
+    match f:
+        case ast.Predicate(_, left, right):
+            return left, right
+        case ast.Atom(e):
+            return (e,)
+    return ()
+
+
+def _collect(e: Expression, names: dict[str, None]) -> None:
+    match e:
+        case ast.Signal(name):
+            names[name] = None
+        case ast.Component(vector, _):
+            _collect(vector, names)
+        case ast.Arithmetic(_, arguments):
+            for argument in arguments:
+                _collect(argument, names)
+
+
+def horizon(f: Formula, dt: float = 0.0) -> float:
+    """Seconds of trace beyond an instant on which a formula's truth there depends.
+
+    Infinite for an unbounded future operator. `next` reaches one sampling period `dt` ahead. Past
+    operators look back, so they never add (and are not subtracted, which keeps the bound simple).
+    """
+    below = max((horizon(part, dt) for part in f.operands()), default=0.0)
+    match f:
+        case ast.Always(_, interval) | ast.Eventually(_, interval) | ast.Until(_, _, interval):
+            return below + interval.end
+        case ast.Next():
+            return below + dt
+    return below
+
+
+def nnf(f: Formula) -> Formula:
+    """Negation normal form: `!` only on equalities and bare signals. Keeps the robustness.
+
+    Inequalities absorb their negation (`!(x > 1)` is `x <= 1`). The dual of until has no node of
+    its own, so that one case stays `!(f until g)` with `f` and `g` in normal form; the same for
+    since.
+    """
+    return _nnf(f, positive=True)
+
+
+_OPPOSITE = {">": "<=", ">=": "<", "<": ">=", "<=": ">", "==": "!=", "!=": "=="}
+_DUAL: dict[type, type] = {
+    ast.Always: ast.Eventually,
+    ast.Eventually: ast.Always,
+    ast.Historically: ast.Once,
+    ast.Once: ast.Historically,
+}
+
+
+def _nnf(f: Formula, positive: bool) -> Formula:
+    match f:
+        case ast.Constant(value):
+            return TRUE if value == positive else FALSE
+        case ast.Predicate(comparison, left, right):
+            return f if positive else ast.Predicate(_OPPOSITE[comparison], left, right)
+        case ast.Atom():
+            return f if positive else ast.Not(f)
+        case ast.Not(operand):
+            return _nnf(operand, not positive)
+        case ast.And(parts) | ast.Or(parts):
+            kind = ast.And if isinstance(f, ast.And) == positive else ast.Or
+            return kind(tuple(_nnf(part, positive) for part in parts))
+        case ast.Next(operand):
+            return ast.Next(_nnf(operand, positive))
+        case ast.Prev(operand, weak):
+            return ast.Prev(_nnf(operand, positive), weak == positive)
+        case ast.Until(left, right, interval) | ast.Since(left, right, interval):
+            kept = type(f)(_nnf(left, True), _nnf(right, True), interval)
+            return kept if positive else ast.Not(kept)
+        case (
+            ast.Always(operand, interval)
+            | ast.Eventually(operand, interval)
+            | ast.Historically(operand, interval)
+            | ast.Once(operand, interval)
+        ):
+            kind = type(f) if positive else _DUAL[type(f)]
+            return kind(_nnf(operand, positive), interval)
+    raise TypeError(f"not a formula: {f!r}")
+
+
+def simplify(f: Formula) -> Formula:
+    """A formula of the same robustness on every trace under `hold`, with fewer nodes.
+
+    Folds constants, double negations, duplicates in `&` and `|`, nested `always always` and
+    `eventually eventually`, and operators over `[0,0]`. Windows cut at the end of a trace
+    (`end="truncate"`) may tell the nested windows apart where one is empty.
+    """
+    f = _rebuilt(f, tuple(simplify(part) for part in f.operands()))
+    match f:
+        case ast.Not(ast.Not(inner)):
+            return inner
+        case ast.Not(ast.Constant(value)):
+            return FALSE if value else TRUE
+        case ast.Not(ast.Predicate()):
+            return nnf(f)
+        case ast.And(parts):
+            return _simplified_join(parts, neutral=TRUE, absorbing=FALSE)
+        case ast.Or(parts):
+            return _simplified_join(parts, neutral=FALSE, absorbing=TRUE)
+        case ast.Always(ast.Constant() as c, _) | ast.Eventually(ast.Constant() as c, _):
+            return c
+        case (
+            ast.Always(inner, Interval(0.0, 0.0))
+            | ast.Eventually(inner, Interval(0.0, 0.0))
+            | ast.Historically(inner, Interval(0.0, 0.0))
+            | ast.Once(inner, Interval(0.0, 0.0))
+        ):
+            return inner
+        case ast.Always(ast.Always(inner, low), high):
+            return ast.Always(inner, _sum(low, high))
+        case ast.Eventually(ast.Eventually(inner, low), high):
+            return ast.Eventually(inner, _sum(low, high))
+        case ast.Until(ast.Constant(True), right, interval):
+            return simplify(ast.Eventually(right, interval))
+        case ast.Until(_, ast.Constant(False), _) | ast.Since(_, ast.Constant(False), _):
+            return FALSE
+        case ast.Until(_, right, Interval(0.0, 0.0)) | ast.Since(_, right, Interval(0.0, 0.0)):
+            return right
+        case ast.Since(ast.Constant(True), right, interval):
+            return ast.Once(right, interval)
+    return f
+
+
+def _sum(low: Interval, high: Interval) -> Interval:
+    # In decimal, so that 0.1 + 0.2 stays a multiple of the sampling period to the last digit.
+    start, end = (
+        float(Decimal(repr(a)) + Decimal(repr(b)))
+        for a, b in ((low.start, high.start), (low.end, high.end))
+    )
+    return Interval(start, end)
+
+
+def _simplified_join(parts: tuple[Formula, ...], neutral: Formula, absorbing: Formula) -> Formula:
+    kind = ast.And if neutral == TRUE else ast.Or
+    parts = tuple(q for p in parts for q in (p.parts if isinstance(p, kind) else (p,)))
+    if absorbing in parts:
+        return absorbing
+    kept = tuple(dict.fromkeys(part for part in parts if part != neutral))
+    if not kept:
+        return neutral
+    return kept[0] if len(kept) == 1 else kind(kept)
+
+
+def _rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
+    """The same operator over other operands."""
+    match f:
+        case ast.And():
+            return ast.And(operands)
+        case ast.Or():
+            return ast.Or(operands)
+        case ast.Until() | ast.Since():
+            return type(f)(*operands, f.interval)
+        case ast.Always() | ast.Eventually() | ast.Historically() | ast.Once():
+            return type(f)(operands[0], f.interval)
+        case ast.Next():
+            return ast.Next(operands[0])
+        case ast.Prev():
+            return ast.Prev(operands[0], f.weak)
+        case ast.Not():
+            return ast.Not(operands[0])
+    return f
+
+
+def history(f: Formula, dt: float = 0.0) -> float:
+    """Seconds of trace before an instant on which a formula's truth there depends."""
+    below = max((history(part, dt) for part in f.operands()), default=0.0)
+    match f:
+        case ast.Once(_, interval) | ast.Historically(_, interval) | ast.Since(_, _, interval):
+            return below + interval.end
+        case ast.Prev():
+            return below + dt
+    return below
+
+
+def unbounded(f: Formula) -> bool:
+    """Whether a future operator in it has no end."""
+    return math.isinf(horizon(f))
