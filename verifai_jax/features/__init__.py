@@ -1,0 +1,10 @@
+"""Feature spaces: what varies from simulation to simulation, and how."""
+
+from verifai_jax.features.box import Box as Box
+from verifai_jax.features.box import DiscreteBox as DiscreteBox
+from verifai_jax.features.choice import Categorical as Categorical
+from verifai_jax.features.choice import Constant as Constant
+from verifai_jax.features.compound import Array as Array
+from verifai_jax.features.compound import Struct as Struct
+from verifai_jax.features.domain import Domain as Domain
+from verifai_jax.features.space import FeatureSpace as FeatureSpace

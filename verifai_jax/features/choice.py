@@ -1,0 +1,230 @@
+"""Values without an order: one of several choices (`Categorical`), or a single one (`Constant`)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.features.domain import (
+    MOST_LEVELS,
+    Domain,
+    as_numbers,
+    as_real,
+    as_scalar,
+    as_tuple,
+    cell,
+    centre,
+    listed,
+    short,
+)
+
+
+@dataclass(frozen=True, init=False, repr=False)
+class Categorical(Domain):
+    """One of several choices, equally likely and without an order: `Categorical("ppo", "sac")`.
+
+    Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
+    value is its place in `choices`, an `int32`. The table always shows the choice itself.
+
+    **Raises:** `ValueError` for no choices, or for the same choice twice.
+    """
+
+    choices: tuple[Any, ...]
+
+    def __init__(self, *choices: Any) -> None:
+        object.__setattr__(self, "choices", tuple(as_scalar(choice) for choice in choices))
+        if not self.choices:
+            raise ValueError("a Categorical needs at least one choice; got none")
+        if len(choices) == 1 and isinstance(self.choices[0], list | tuple | set | dict):
+            raise ValueError(
+                f"choices are given one by one, Categorical('a', 'b'); got {choices[0]!r}"
+            )
+        if len(self.choices) > MOST_LEVELS:
+            raise ValueError(f"a Categorical has at most {MOST_LEVELS} choices")
+        seen: set[Any] = set()
+        for choice in self.choices:
+            keys: set[Any] = {str(choice)}  # All that the table shows of most objects.
+            if isinstance(choice, int | float):
+                most = 2**31 - 1 if isinstance(choice, int) else np.finfo(np.float32).max
+                if not abs(choice) <= most:
+                    raise ValueError(
+                        "choices that are numbers must be finite, integers must fit into 32 bits; "
+                        f"got {choice!r}"
+                    )
+                keys.add(float(np.float32(choice)))  # All that a system sees of a number.
+            if keys & seen:
+                raise ValueError(f"the choice {choice!r} is given twice in {listed(self.choices)}")
+            seen |= keys
+
+    @cached_property
+    def numeric(self) -> bool:
+        """Whether a value is the choice itself rather than its place in `choices`."""
+        return self._dtype.kind != "O"
+
+    @cached_property
+    def _dtype(self) -> Any:
+        kinds = {type(choice) for choice in self.choices}
+        if kinds == {bool}:
+            return np.dtype(bool)
+        if kinds <= {int, float}:
+            return np.dtype(np.int32 if kinds == {int} else np.float64)
+        return np.dtype(object)
+
+    @cached_property
+    def _shown(self) -> np.ndarray:
+        """The choices as the table shows them."""
+        if self.numeric:
+            return np.array(self.choices, self._dtype)
+        return np.array([str(choice) for choice in self.choices], dtype=object)
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        return (len(self.choices),)
+
+    def from_unit(self, u: Float[Array, "1"]) -> Any:
+        index = cell(u[0], len(self.choices))
+        if not self.numeric:
+            return index
+        dtype = u.dtype if self._dtype == np.float64 else self._dtype
+        return jnp.asarray(self._shown, dtype)[index]
+
+    def to_unit(self, value: Any) -> Float[Array, "1"]:
+        index = jnp.asarray(value)
+        if self.numeric:
+            index = jnp.argmin(jnp.abs(as_real(index) - self._shown.astype(np.float32)))
+        return centre(index, len(self.choices))
+
+    def coerce(self, value: Any) -> Any:
+        if self.numeric:
+            return as_real(value) if self._dtype == np.float64 else jnp.asarray(value, self._dtype)
+        if isinstance(value, jax.Array):
+            return value
+        values = np.asarray(value, dtype=object)
+        places = [self._place(choice) for choice in values.ravel()]
+        return jnp.asarray(np.array(places, np.int32).reshape(values.shape))
+
+    def check(self, value: Any, name: str) -> None:
+        known = f"one of {listed(self.choices)}"
+        if np.ndim(np.asarray(value, dtype=object)) != 0:
+            raise ValueError(f"{name} must be {known}; got {value!r}")
+        value = as_scalar(value)
+        if self.numeric:
+            if isinstance(value, bool | int | float) and self._nearest(float(value)) is not None:
+                return
+        elif self._place(value) is not None:
+            return
+        raise ValueError(f"{name} must be {known}; got {value!r}")
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return (name,)
+
+    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+        index = np.asarray(values)
+        if self.numeric:
+            distance = np.abs(index.astype(np.float64)[:, None] - self._shown.astype(np.float64))
+            index = np.argmin(distance, axis=1)
+        return {name: self._shown[index]}
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+        shown = as_scalar(row[name])
+        if not self.numeric:
+            places = {text: i for i, text in enumerate(self._shown)}
+            if str(shown) in places:
+                return jnp.asarray(places[str(shown)], jnp.int32)
+        else:
+            place = self._nearest(shown) if isinstance(shown, bool | int | float) else None
+            if place is not None:
+                return self.coerce(self.choices[place])
+        raise ValueError(f"{name} must be one of {listed(self.choices)}; got {shown!r}")
+
+    def _place(self, value: Any) -> int | None:
+        """Where a choice stands; integers are places already, as systems see them."""
+        if type(value) in (int, np.int32, np.int64):
+            return int(value) if 0 <= value < len(self.choices) else None
+        return self.choices.index(value) if value in self.choices else None
+
+    def _nearest(self, value: float) -> int | None:
+        numbers = self._shown.astype(np.float64)
+        place = int(np.argmin(np.abs(numbers - value)))
+        return place if np.float32(numbers[place]) == np.float32(value) else None
+
+    def __repr__(self) -> str:
+        return f"Categorical({listed(self.choices)})"
+
+
+@dataclass(frozen=True, repr=False)
+class Constant(Domain):
+    """One value that never varies: a number, a bool, an array of numbers, or a text.
+
+    It takes no unit coordinate and no column of the table. A system sees a text as the place 0, as
+    in a `Categorical` with one choice.
+
+    **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
+    """
+
+    value: Any
+
+    def __post_init__(self) -> None:
+        value = self.value
+        if isinstance(value, str):
+            return
+        try:
+            numbers = np.asarray(value)
+            plain = numbers.dtype.kind in "biuf" and bool(np.all(np.isfinite(numbers)))
+        except (TypeError, ValueError):
+            plain = False
+        if not plain:
+            raise ValueError(
+                f"a Constant is a finite number, an array of them, or a text; got {value!r}"
+            )
+        object.__setattr__(self, "value", as_tuple(numbers.tolist()))
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        return ()
+
+    def from_unit(self, u: Float[Array, "0"]) -> Any:
+        return self._value(u.dtype)
+
+    def to_unit(self, value: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0, jnp.result_type(float))
+
+    def coerce(self, value: Any) -> Any:
+        if isinstance(self.value, str):
+            return jnp.zeros(np.shape(value), jnp.int32)
+        return jnp.broadcast_to(self._value(jnp.result_type(float)), np.shape(value))
+
+    def check(self, value: Any, name: str) -> None:
+        shown = self.value
+        if isinstance(shown, str):
+            same = value == shown if isinstance(value, str) else np.array_equal(value, 0)
+        else:
+            given = as_numbers(value, name)
+            same = given.shape == np.shape(shown) and np.array_equal(
+                given.astype(np.float32), np.asarray(shown, np.float32)
+            )
+        if not same:
+            raise ValueError(f"{name} is a constant, {shown!r}; got {value!r}")
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return ()
+
+    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+        return {}
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+        return self._value(jnp.result_type(float))
+
+    def _value(self, real: Any) -> Any:
+        if isinstance(self.value, str):
+            return jnp.asarray(0, jnp.int32)
+        kind = np.asarray(self.value).dtype.kind
+        return jnp.asarray(self.value, {"b": bool, "i": jnp.int32}.get(kind, real))
+
+    def __repr__(self) -> str:
+        return f"Constant({short(self.value)})"

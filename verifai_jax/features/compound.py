@@ -1,0 +1,202 @@
+"""Domains made of domains: several under names (`Struct`), several of one kind (`Array`)."""
+
+import operator
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.errors import check_names
+from verifai_jax.features.box import Box
+from verifai_jax.features.domain import Domain, indexed
+
+
+@dataclass(frozen=True, init=False, repr=False)
+class Struct(Domain):
+    """Domains under names, in the order written: `Struct({"x": Box(0, 50), "v": Box(0, 20)})`.
+
+    A value is a dictionary with these names.
+
+    **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a
+    field that is no domain.
+    """
+
+    fields: tuple[tuple[str, Domain], ...]
+
+    def __init__(self, fields: Mapping[str, Domain]) -> None:
+        if not isinstance(fields, Mapping):
+            raise TypeError(f"fields are given as a dictionary of domains; got {fields!r}")
+        if not fields:
+            raise ValueError("at least one field is needed; got none")
+        for name, domain in fields.items():
+            if not isinstance(name, str) or not name.strip():
+                raise ValueError(f"the name of a field must be a text; got {name!r}")
+            if isinstance(domain, Mapping):
+                raise TypeError(f"{name} must be a domain; a dictionary of them goes into Struct")
+            if not isinstance(domain, Domain):
+                raise TypeError(f"{name} must be a domain, such as Box(0, 1); got {domain!r}")
+        object.__setattr__(self, "fields", tuple(fields.items()))
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        return tuple(level for _, domain in self.fields for level in domain.levels)
+
+    def __getitem__(self, name: str) -> Domain:
+        check_names("feature", [name], self.names)
+        return dict(self.fields)[name]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the fields, in the order written."""
+        return tuple(name for name, _ in self.fields)
+
+    def from_unit(self, u: Float[jax.Array, " size"]) -> dict[str, Any]:
+        value, start = {}, 0
+        for names, domain in self._runs:
+            part = domain.from_unit(u[start : start + domain.size])
+            value.update([(names[0], part)] if len(names) == 1 else zip(names, part, strict=True))
+            start += domain.size
+        return value
+
+    def to_unit(self, value: Mapping[str, Any]) -> Float[jax.Array, " size"]:
+        parts = [
+            domain.to_unit(
+                value[names[0]] if len(names) == 1 else jnp.stack([value[name] for name in names])
+            )
+            for names, domain in self._runs
+        ]
+        return jnp.concatenate(parts)
+
+    def coerce(self, value: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: domain.coerce(value[name]) for name, domain in self.fields}
+
+    def check(self, value: Any, name: str) -> None:
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{name or 'features'} must be a dictionary; got {value!r}")
+        check_names("feature", [_dotted(name, field) for field in value], self._dotted_names(name))
+        for field, domain in self.fields:
+            if field not in value:
+                raise ValueError(f"{_dotted(name, field)} is missing; got {', '.join(value)}")
+            domain.check(value[field], _dotted(name, field))
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            column
+            for field, domain in self.fields
+            for column in domain.columns(_dotted(name, field))
+        )
+
+    def to_columns(self, values: Mapping[str, Any], name: str) -> dict[str, np.ndarray]:
+        columns: dict[str, np.ndarray] = {}
+        for field, domain in self.fields:
+            columns |= domain.to_columns(values[field], _dotted(name, field))
+        return columns
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> dict[str, Any]:
+        return {
+            field: domain.from_columns(row, _dotted(name, field)) for field, domain in self.fields
+        }
+
+    @cached_property
+    def _runs(self) -> tuple[tuple[tuple[str, ...], Domain], ...]:
+        """The fields, neighbouring scalar boxes merged into a vector: 200 cost one operation."""
+        runs: list[tuple[tuple[str, ...], Domain]] = []
+        for scalar, group in groupby(self.fields, lambda field: _is_scalar_box(field[1])):
+            names, domains = zip(*group, strict=True)
+            if scalar and len(names) > 1:
+                box = Box([domain.low for domain in domains], [domain.high for domain in domains])
+                runs.append((names, box))
+            else:
+                runs += [((name,), domain) for name, domain in zip(names, domains, strict=True)]
+        return tuple(runs)
+
+    def _dotted_names(self, name: str) -> list[str]:
+        return [_dotted(name, field) for field, _ in self.fields]
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{name!r}: {domain!r}" for name, domain in self.fields)
+        return f"Struct({{{fields}}})"
+
+
+@dataclass(frozen=True, repr=False)
+class Array(Domain):
+    """`length` independent values of one domain: `Array(Box(0, 1), length=3)`.
+
+    A value is stacked along a leading axis: an array `[length]` of a `Box`, a dictionary of such
+    arrays of a `Struct`.
+
+    **Raises:** `ValueError` for a length that is not a positive integer; `TypeError` for something
+    that is no domain.
+    """
+
+    domain: Domain
+    length: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.domain, Domain):
+            raise TypeError(f"an Array needs a domain, such as Box(0, 1); got {self.domain!r}")
+        length = self.length
+        if isinstance(length, bool) or not isinstance(length, int | np.integer) or length < 1:
+            raise ValueError(f"the length of an Array must be a positive integer; got {length!r}")
+        object.__setattr__(self, "length", int(length))
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        return self.domain.levels * self.length
+
+    def from_unit(self, u: Float[jax.Array, " size"]) -> Any:
+        return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
+
+    def to_unit(self, value: Any) -> Float[jax.Array, " size"]:
+        return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
+
+    def coerce(self, value: Any) -> Any:
+        return self.domain.coerce(value)
+
+    def check(self, value: Any, name: str) -> None:
+        for i in range(self.length):
+            self.domain.check(_element(value, i, self.length, name), f"{name}[{i}]")
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            column for item in indexed(name, self.length) for column in self.domain.columns(item)
+        )
+
+    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+        columns: dict[str, np.ndarray] = {}
+        for i, item in enumerate(indexed(name, self.length)):
+            element = jax.tree.map(operator.itemgetter((slice(None), i)), values)
+            columns |= self.domain.to_columns(element, item)
+        return columns
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+        items = [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+
+    def __repr__(self) -> str:
+        return f"Array({self.domain!r}, length={self.length})"
+
+
+def _is_scalar_box(domain: Domain) -> bool:
+    return isinstance(domain, Box) and np.ndim(domain.low) == 0
+
+
+def _dotted(name: str, field: str) -> str:
+    return f"{name}.{field}" if name else field
+
+
+def _element(value: Any, i: int, length: int, name: str) -> Any:
+    """Element `i` of a stacked value."""
+    if isinstance(value, Mapping):
+        return {
+            field: _element(leaf, i, length, _dotted(name, field)) for field, leaf in value.items()
+        }
+    if np.ndim(np.asarray(value, dtype=object)) == 0 or len(value) != length:
+        raise ValueError(f"{name} must have {length} entries; got {value!r}")
+    return value[i]
