@@ -43,7 +43,7 @@ def test_falsify_and_replay(call, tmp_path):
         "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300, "--seed", 2
     )
     assert "simulations violate the property" in output
-    assert "always[0, 1] (x <= 1" in output or "always[0, 1] x <= 1" in output
+    assert "always[0,1] (x <= 1)" in output
     assert "95 % interval" in output
     folder = tmp_path / "runs" / "ramp-1"
     for picture in ("features.png", "robustness.png", "worst.png"):

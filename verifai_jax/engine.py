@@ -171,6 +171,8 @@ class Engine:
                 mesh=Mesh(np.array(self.devices), ("batch",)),
                 in_specs=(split, split, whole, whole),
                 out_specs=split,
+                # A user's scan need not say that its carry differs between devices.
+                check_vma=False,
             )
 
         def program(u: Array, key: Array, first: Array, temperature: Array) -> Any:
@@ -219,10 +221,11 @@ def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"],
 
 
 def _pad(u: Float[Array, "n d"], rows: int) -> Float[Array, "rows d"]:
-    missing = rows - len(u)
-    if missing == 0:
+    if len(u) == rows:
         return u
-    return jnp.concatenate([u, jnp.broadcast_to(u[-1:], (missing, u.shape[1]))])
+    # In NumPy: JAX would compile a program for each number of missing rows.
+    u = np.asarray(u)
+    return np.concatenate([u, np.broadcast_to(u[-1:], (rows - len(u), u.shape[1]))])
 
 
 def engine_for(problem: Problem, batch: int, gradient: bool = False) -> Engine:
