@@ -91,6 +91,8 @@ def until(
         u = pairwise(row[1], -pairwise(-row[0], -u, tau), tau)
         return u, u
 
+    if g.shape[0] == 1:
+        return g
     last = g[-1] if reverse else g[0]
     rows = (f[:-1], g[:-1]) if reverse else (f[1:], g[1:])
     out = lax.scan(step, last, rows, reverse=reverse)[1]
