@@ -1,0 +1,133 @@
+"""The Halton sequence: points that fill the cube more evenly than random ones.
+
+Coordinate j of point i is the radical inverse of i in the j-th prime base: the digits of i,
+mirrored at the point (Halton 1960, Algorithm 247). In large bases neighbouring coordinates run in
+step for many points (in base 47 the first 46 points climb a line), so in many dimensions digits
+are permuted at random (Owen, A randomized Halton algorithm in R, 2017), here by affine maps modulo
+the base.
+"""
+
+from dataclasses import dataclass
+from itertools import groupby
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt32
+
+from verifai_jax.search.base import Cube, Evaluated
+
+BITS = 32  # of the index
+PLAIN_UP_TO = 8  # coordinates; beyond, the bases are so large that lines are visible
+
+
+class HaltonState(NamedTuple):
+    key: Key[Array, ""]
+    index: UInt32[Array, ""]
+
+
+@dataclass(frozen=True)
+class Halton:
+    """Halton points, the first one with index 1; the same for any batch size.
+
+    **Arguments:**
+
+    - `scramble`: permute digits at random (from the key). `False` is the plain sequence, which
+      does not depend on the key. By default plain up to 8 coordinates and scrambled above.
+
+    **Raises:** `ValueError` for a `scramble` other than True, False and None.
+    """
+
+    scramble: bool | None = None
+    wants_gradient: ClassVar[bool] = False
+    samples_prior: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if self.scramble is not None and not isinstance(self.scramble, bool):
+            raise ValueError(f"scramble must be True, False or None; got {self.scramble!r}")
+
+    def check(self, cube: Cube) -> None:
+        """Works on every cube."""
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> HaltonState:
+        return HaltonState(key, jnp.uint32(1))
+
+    def ask(
+        self, state: HaltonState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], HaltonState]:
+        scramble = cube.dim > PLAIN_UP_TO if self.scramble is None else self.scramble
+        index = state.index + jnp.arange(batch, dtype=jnp.uint32)
+        u = halton_points(index, cube.dim, state.key if scramble else None)
+        return u, state._replace(index=state.index + batch)
+
+    def tell(self, state: HaltonState, cube: Cube, evaluated: Evaluated) -> HaltonState:
+        return state
+
+
+def halton_points(
+    index: UInt32[Array, " n"], dim: int, key: Key[Array, ""] | None = None
+) -> Float[Array, "n dim"]:
+    """Points number `index` of the Halton sequence, in `[0, 1)`; scrambled if there is a key."""
+    blocks = [jnp.zeros((len(index), 0), jnp.float32)]
+    # Bases whose indices have equally many digits go together: one loop for all large ones.
+    for number, (digits, group) in enumerate(groupby(primes(dim), _digits)):
+        bases = np.array(list(group), np.uint32)
+        maps = None
+        if key is not None:
+            maps = _digit_maps(jax.random.fold_in(key, number), bases, digits)
+        blocks.append(_radical_inverse(index, bases, digits, maps))
+    return jnp.concatenate(blocks, axis=1)
+
+
+def primes(count: int) -> list[int]:
+    """The first `count` primes."""
+    # The n-th prime is below n (log n + log log n) for n >= 6.
+    limit = 13 if count < 6 else int(count * (np.log(count) + np.log(np.log(count)))) + 1
+    sieve = np.ones(limit + 1, bool)
+    sieve[:2] = False
+    for p in range(2, int(limit**0.5) + 1):
+        if sieve[p]:
+            sieve[p * p :: p] = False
+    return np.flatnonzero(sieve)[:count].tolist()
+
+
+def _digits(base: int) -> int:
+    """How many digits an index may have in this base."""
+    digits = 1
+    while base**digits < 2**BITS:
+        digits += 1
+    return digits
+
+
+def _radical_inverse(
+    index: UInt32[Array, " n"],
+    bases: UInt32[np.ndarray, " d"],
+    digits: int,
+    maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
+) -> Float[Array, "n d"]:
+    rest = jnp.broadcast_to(index[:, None], (len(index), len(bases)))
+    figures = []
+    for k in range(digits):
+        quotient = rest // bases
+        figure = rest - quotient * bases
+        if maps is not None:
+            figure = (maps[0][k] * figure + maps[1][k]) % bases
+        figures.append(figure)
+        rest = quotient
+    # From the least digit on (Horner): every rounding error is divided by the base at once.
+    inverse = jnp.zeros(rest.shape, jnp.float32)
+    for figure in reversed(figures):
+        inverse = (inverse + figure.astype(jnp.float32)) / bases.astype(np.float32)
+    return jnp.minimum(inverse, np.float32(1 - 2**-24))
+
+
+def _digit_maps(
+    key: Key[Array, ""], bases: UInt32[np.ndarray, " d"], digits: int
+) -> tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]]:
+    """Random factors in `[1, base)` and shifts in `[0, base)` for every digit of every base."""
+    factor, shift = jax.random.uniform(key, (2, digits, len(bases)), jnp.float32)
+    return (
+        1 + (factor * (bases - 1)).astype(jnp.uint32),
+        (shift * bases).astype(jnp.uint32),
+    )

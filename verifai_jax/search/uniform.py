@@ -1,0 +1,46 @@
+"""Uniform sampling: independent draws from the prior, the only search that gives failure rates."""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, UInt32
+
+from verifai_jax.search.base import Cube, Evaluated
+
+
+class UniformState(NamedTuple):
+    key: Key[Array, ""]
+    index: UInt32[Array, ""]
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Independent uniform points; point `i` depends on the key and `i` alone, not on the batch."""
+
+    wants_gradient: ClassVar[bool] = False
+    samples_prior: ClassVar[bool] = True
+
+    def check(self, cube: Cube) -> None:
+        """Works on every cube."""
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> UniformState:
+        return UniformState(key, jnp.uint32(0))
+
+    def ask(
+        self, state: UniformState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], UniformState]:
+        index = state.index + jnp.arange(batch, dtype=jnp.uint32)
+        return uniform_points(state.key, index, cube.dim), state._replace(index=state.index + batch)
+
+    def tell(self, state: UniformState, cube: Cube, evaluated: Evaluated) -> UniformState:
+        return state
+
+
+def uniform_points(
+    key: Key[Array, ""], index: UInt32[Array, " n"], dim: int
+) -> Float[Array, "n dim"]:
+    """Points number `index` of the random sequence that `key` starts."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
+    return jax.vmap(lambda key: jax.random.uniform(key, (dim,), jnp.float32))(keys)
