@@ -76,12 +76,3 @@ def test_import_is_light():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 
-
-def test_rooms_have_room():
-    # A file that outgrows a room hides a second concept.
-    long = {
-        str(file.relative_to(ROOT)): n
-        for file in [*PACKAGE.rglob("*.py"), *(ROOT / "envs").rglob("*.py")]
-        if (n := len(file.read_text().splitlines())) > 450
-    }
-    assert not long

@@ -37,6 +37,15 @@ def test_a_batch_of_traces_is_a_trace_of_batches():
     assert batch.dt == 1.0
 
 
+def test_signals_keep_the_order_written():
+    trace = Trace({"x": np.zeros(2), "a": np.ones(2), "m": np.ones((2, 3))}, dt=1.0)
+    again = jax.jit(lambda t: t)(trace)
+    assert list(again.signals) == ["x", "a", "m"]
+    assert again.signals["m"].shape == (2, 3)
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(trace)]
+    assert names == ["['x']", "['a']", "['m']"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

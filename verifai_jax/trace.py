@@ -113,21 +113,26 @@ class Trace:
         return self.signals[name]
 
 
-_CHILDREN = ("signals", "times", "valid", "status")
+_CHILDREN = ("times", "valid", "status")
 
 
-def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], tuple[float | None, bool]]:
-    keys = [(jax.tree_util.GetAttrKey(name), getattr(trace, name)) for name in _CHILDREN]
-    return keys, (trace.dt, trace.held)
+def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], Any]:
+    # The names are static and in the order written; JAX would sort a dictionary's.
+    names = tuple(trace.signals)
+    keys = [(jax.tree_util.DictKey(name), trace.signals[name]) for name in names]
+    keys += [(jax.tree_util.GetAttrKey(name), getattr(trace, name)) for name in _CHILDREN]
+    return keys, (names, trace.dt, trace.held)
 
 
-def _unflatten(static: tuple[float | None, bool], children: Any) -> Trace:
+def _unflatten(static: Any, children: Any) -> Trace:
     # JAX unflattens with placeholders (and with batched leaves), which the checks would refuse.
     trace = object.__new__(Trace)
-    for name, value in zip(_CHILDREN, children, strict=True):
+    names, dt, held = static
+    values = tuple(children)
+    fields = {"signals": dict(zip(names, values, strict=False)), "dt": dt, "held": held}
+    fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
+    for name, value in fields.items():
         object.__setattr__(trace, name, value)
-    object.__setattr__(trace, "dt", static[0])
-    object.__setattr__(trace, "held", static[1])
     return trace
 
 

@@ -54,7 +54,7 @@ def _one(axes: Any, run: "Run") -> None:
     _mark_first(axes, rho, FAILING)
     failures = int(np.sum(rho < 0))
     axes.set_title(f"{run.name}: {failures:,} of {len(rho):,} simulations violate the property")
-    axes.legend(frameon=False, loc="lower left")
+    axes.legend(frameon=False, loc="upper right")
 
 
 def _mark_first(axes: Any, rho: np.ndarray, color: str) -> None:
@@ -65,9 +65,10 @@ def _mark_first(axes: Any, rho: np.ndarray, color: str) -> None:
             f"first counterexample: simulation {first + 1:,}",
             (first + 1, rho[first]),
             textcoords="offset points",
-            xytext=(14, -16),
+            xytext=(24, 48),
             fontsize=8,
             color=color,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
             arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.8},
         )
 

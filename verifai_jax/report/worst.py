@@ -143,6 +143,7 @@ def _mark(axes: Any, trace: Trace, signal: str, sample: int) -> None:
         ha="right" if right else "left",
         fontsize=8,
         color=FAILING,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
     )
 
 
