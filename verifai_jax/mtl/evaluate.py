@@ -208,13 +208,7 @@ class Evaluator:
     # Joining values
 
     def _greatest(self, values: list[Array]) -> Array:
-        if self.kind != "smooth":
-            result = values[0]
-            for value in values[1:]:
-                result = jnp.maximum(result, value)
-            return result
-        shape = jnp.broadcast_shapes(*(v.shape for v in values))
-        return windows.maximum(jnp.stack([jnp.broadcast_to(v, shape) for v in values]), self.tau)
+        return windows.greatest(values, self.tau if self.kind == "smooth" else None)
 
     @property
     def _nothing(self) -> float:
@@ -315,7 +309,10 @@ class Evaluator:
         left = self.value(f, begin, end)
         right = self._cut(self.value(g, begin, end), begin)
         left, right = jnp.broadcast_arrays(left, right)
-        value = windows.until(left, right, self._tau(right))[:count]
+        if count == 1:
+            value = windows.until_first(left, right, self._tau(right))[None]
+        else:
+            value = windows.until(left, right, self._tau(right))[:count]
         terms = []
         if math.isfinite(b):
             terms.append(self._extended(self._future(g, 1, a, b, first, first + count - 1), count))

@@ -12,7 +12,6 @@ is written; their meaning lives in `robustness.py`, their text in `printing.py`.
 
 import math
 import re
-from abc import ABC
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
@@ -23,7 +22,7 @@ COMPARISONS = (">=", ">", "<=", "<", "==", "!=")
 FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
 
 
-class Expression(ABC):
+class Expression:
     """A number at every instant: arithmetic over signals. Comparing one gives a `Formula`.
 
     `==` compares expressions as trees; the predicate "equal" is `x.equals(3)`, "unequal"
@@ -218,7 +217,7 @@ class Interval:
 EVERYTHING = Interval()
 
 
-class Formula(ABC):
+class Formula:
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
     children: ClassVar[tuple[str, ...]] = ()

@@ -7,6 +7,7 @@ with the parentheses that would settle them.
 """
 
 import functools
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
@@ -322,9 +323,7 @@ class _Builder:
 
     def _chained(self, parts: list[_Part], words: list[Any], side: str) -> FormulaSyntaxError:
         a, b, c = map(self._source, parts[:3])
-        between = [
-            self.text[p.end : q.start].strip() for p, q in zip(parts, parts[1:], strict=False)
-        ]
+        between = [self.text[p.end : q.start].strip() for p, q in itertools.pairwise(parts)]
         first, second = between[0], between[1]
         word = str(words[1])
         return self._fail(

@@ -1,0 +1,324 @@
+"""Running maxima by scans over time with all lanes side by side: the form for a CPU.
+
+The windows follow van Herk and Gil-Werman: cut time into blocks of the window's length; then every
+window is the end of one block and the beginning of the next, so one scan each way suffices.
+Smooth maxima are carried as pairs `(m, s)`, the greatest value and the sum of `exp((x - m) / tau)`.
+
+Reverse-mode rules are written by hand: differentiating through the scans costs ten times the value.
+Each is again one or two scans.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+NEVER = 1e30  # Stands for infinity in smooth arithmetic, where inf - inf would be NaN.
+
+Series = Float[Array, "time *lanes"]
+
+
+def _starts(n: int, length: int, reverse: bool) -> np.ndarray:
+    """Where the blocks begin, in the order of the scan that runs against `reverse`.
+
+    Blocks are aligned so that no window that is cut at the end of the array spans two of them.
+    """
+    k = np.arange(length)
+    return (length - k) % n == 0 if reverse else (k + 1) % n == 0
+
+
+def _ends(n: int, length: int, reverse: bool) -> np.ndarray:
+    """Where the blocks end, seen the same way."""
+    k = np.arange(length)
+    return (length - 1 - k) % n == 0 if reverse else k % n == 0
+
+
+def _shift(x: Series, by: int, reverse: bool, fill: float) -> Series:
+    """`x` from `by` samples later (earlier, if not `reverse`), `fill` beyond the array."""
+    lanes = ((0, 0, 0),) * (x.ndim - 1)
+    low, high = (-by, by) if reverse else (by, -by)
+    return lax.pad(x, jnp.asarray(fill, x.dtype), ((low, high, 0), *lanes))
+
+
+# Hard windows
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def windowed(n: int, reverse: bool, x: Series) -> Series:
+    """Maximum of the `n` samples from each instant on (up to it, if not `reverse`)."""
+    return _windowed(n, reverse, x, keep=False)[0]
+
+
+def _windowed(n: int, reverse: bool, x: Series, keep: bool) -> tuple[Series, Any]:
+    length = x.shape[0]
+    lowest = jnp.full(x.shape[1:], -jnp.inf, x.dtype)
+    if n >= length:
+
+        def running(m: Array, row: Array) -> tuple[Array, Array]:
+            m = jnp.maximum(m, row)
+            return m, m
+
+        y = lax.scan(running, lowest, x, reverse=reverse)[1]
+        return y, (x, y, y, None)
+
+    def begin(m: Array, row: Any) -> tuple[Array, Array]:
+        value, start = row
+        m = jnp.where(start, value, jnp.maximum(m, value))
+        return m, m
+
+    ahead = lax.scan(begin, lowest, (x, _starts(n, length, reverse)), reverse=not reverse)[1]
+    far = _shift(ahead, n - 1, reverse, -np.inf)
+
+    def finish(m: Array, row: Any) -> tuple[Array, Any]:
+        value, end, other = row
+        m = jnp.where(end, value, jnp.maximum(m, value))
+        return m, (jnp.maximum(m, other), m) if keep else jnp.maximum(m, other)
+
+    rows = (x, _ends(n, length, reverse), far)
+    out = lax.scan(finish, lowest, rows, reverse=reverse)[1]
+    return (out[0], (x, *out, ahead)) if keep else (out, None)
+
+
+def _windowed_forward(n: int, reverse: bool, x: Series) -> tuple[Series, Any]:
+    return _windowed(n, reverse, x, keep=True)
+
+
+def _windowed_backward(n: int, reverse: bool, residuals: Any, g: Series) -> tuple[Series]:
+    # Towards the greatest sample: what reaches a running maximum goes to its newest sample where
+    # that one is the greatest, and on to the maximum before it where not.
+    x, y, near, ahead = residuals
+    length = x.shape[0]
+    nothing = jnp.zeros(x.shape[1:], g.dtype)
+
+    def back_near(carry: Array, row: Any) -> tuple[Array, Array]:
+        g, value, m, y, start = row
+        carry = jnp.where(start, 0.0, carry) + jnp.where(m >= y, g, 0.0)
+        here = value >= m
+        return jnp.where(here, 0.0, carry), jnp.where(here, carry, 0.0)
+
+    starts = np.zeros(length, bool) if ahead is None else _starts(n, length, reverse)
+    rows = (g, x, near, y, starts)
+    first = lax.scan(back_near, nothing, rows, reverse=not reverse)[1]
+    if ahead is None:
+        return (first,)
+    g_far = _shift(jnp.where(near >= y, 0.0, g), n - 1, not reverse, 0.0)
+
+    def back_ahead(carry: Array, row: Any) -> tuple[Array, Array]:
+        g, value, m, end, other = row
+        carry = jnp.where(end, 0.0, carry) + g
+        here = value >= m
+        return jnp.where(here, 0.0, carry), other + jnp.where(here, carry, 0.0)
+
+    rows = (g_far, x, ahead, _ends(n, length, reverse), first)
+    return (lax.scan(back_ahead, nothing, rows, reverse=reverse)[1],)
+
+
+windowed.defvjp(_windowed_forward, _windowed_backward)
+
+
+# Smooth windows
+
+
+def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Array]:
+    """The pair with one more value, of a `weight`; one exponential instead of two."""
+    top = jnp.maximum(m, x)
+    fade = jnp.exp((jnp.minimum(m, x) - top) / tau)
+    grows = x > m
+    return top, jnp.where(grows, s * fade + weight, s + weight * fade)
+
+
+def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
+    """Pairs `(m, s)` over the windows of `weight * exp(x / tau)`, each given to `finish`.
+
+    `finish(m, s, row)` gets the matching rows of `x`'s own time.
+    """
+    length = x.shape[0]
+    nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))
+    given = weight is not None
+
+    def begin(pair: Any, row: Any) -> Any:
+        value, start, weight = row
+        m, s = pair
+        m, s = jnp.where(start, -NEVER, m), jnp.where(start, 0.0, s)
+        m, s = _add(m, s, value, weight if given else 1.0, tau)
+        return (m, s), (m, s)
+
+    if n < length:
+        rows = (x, _starts(n, length, reverse), weight)
+        ahead = lax.scan(begin, nothing, rows, reverse=not reverse)[1]
+        # A window that is exactly one block would be counted twice.
+        alone = _starts(n, length, reverse)
+        far = (
+            _shift(ahead[0], n - 1, reverse, -NEVER),
+            _shift(ahead[1], n - 1, reverse, 0.0),
+        )
+    else:
+        far, alone = None, np.zeros(length, bool)
+
+    def complete(pair: Any, row: Any) -> Any:
+        value, end, weight, far, alone, extra = row
+        m, s = pair
+        m, s = jnp.where(end, -NEVER, m), jnp.where(end, 0.0, s)
+        m, s = _add(m, s, value, weight if given else 1.0, tau)
+        if far is None:
+            return (m, s), finish(m, s, extra)
+        total = _add(m, s, far[0], jnp.where(alone, 0.0, far[1]), tau)
+        return (m, s), finish(*total, extra)
+
+    ends = np.zeros(length, bool) if far is None else _ends(n, length, reverse)
+    return lax.scan(complete, nothing, (x, ends, weight, far, alone, x), reverse=reverse)[1]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def windowed_smooth(n: int, reverse: bool, x: Series, tau: Array) -> Series:
+    """`tau log sum exp(x / tau)` of the `n` samples from each instant on (up to it)."""
+    return _pairs(n, reverse, x, None, tau, lambda m, s, _: m + tau * jnp.log(s))
+
+
+def _windowed_smooth_forward(n: int, reverse: bool, x: Series, tau: Array) -> tuple[Series, Any]:
+    y = windowed_smooth(n, reverse, x, tau)
+    return y, (x, y, tau)
+
+
+def _windowed_smooth_backward(n: int, reverse: bool, residuals: Any, g: Series) -> Any:
+    # dx[s] = sum over the windows t that contain s of g[t] exp((x[s] - y[t]) / tau): a window the
+    # other way over -y with weights g. No exponent is positive, because y is an upper bound of x.
+    x, y, tau = residuals
+    m, s = _pairs(n, not reverse, -y, g, tau, lambda m, s, _: (m, s))
+    return jnp.exp(jnp.minimum(x + m, 0.0) / tau) * s, jnp.zeros_like(tau)
+
+
+windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
+
+
+# Until, and since the other way round
+
+
+def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: bool) -> tuple[Array, Any]:
+    """The last value of the recursion, and all values if `keep`."""
+
+    def step(u: Array, row: Any) -> Any:
+        f, g = row
+        u = _greater(g, -_greater(-f, -u, tau), tau)
+        return u, u if keep else None
+
+    last = -1 if reverse else 0
+    rows = (f[:-1], g[:-1]) if reverse else (f[1:], g[1:])
+    first, rest = lax.scan(step, g[last], rows, reverse=reverse)
+    if keep:
+        parts = [rest, g[-1:]] if reverse else [g[:1], rest]
+        return first, jnp.concatenate(parts)
+    return first, None
+
+
+def _greater(a: Array, b: Array, tau: Any) -> Array:
+    m = jnp.maximum(a, b)
+    return m if tau is None else m + tau * jnp.log1p(jnp.exp((jnp.minimum(a, b) - m) / tau))
+
+
+def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, Series]:
+    """`pull` is the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
+    f, g, u, tau = residuals
+    whole = pull.ndim == g.ndim
+    before, after = (
+        (slice(None, -1), slice(1, None)) if reverse else (slice(1, None), slice(None, -1))
+    )
+    edge = 0 if reverse else -1
+
+    def step(carry: Array, row: Any) -> Any:
+        pull, f, g, following = row
+        carry = carry + pull if whole else carry
+        if tau is None:
+            inner = jnp.minimum(f, following)
+            to_g, to_f = g >= inner, f <= following
+            down = jnp.where(to_g, 0.0, carry)
+            return jnp.where(to_f, 0.0, down), (
+                jnp.where(to_f, down, 0.0),
+                jnp.where(to_g, carry, 0.0),
+            )
+        inner = -_greater(-f, -following, tau)
+        share = jax.nn.sigmoid((g - inner) / tau)
+        down = carry - carry * share
+        to_f = jax.nn.sigmoid((following - f) / tau) * down
+        return down - to_f, (to_f, carry * share)
+
+    start = jnp.zeros_like(g[edge]) if whole else pull
+    rows = (pull[before] if whole else None, f[before], g[before], u[after])
+    carry, (df, dg) = lax.scan(step, start, rows, reverse=not reverse)
+    last = carry + pull[-1 if reverse else 0] if whole else carry
+    nothing = jnp.zeros_like(last)[None]
+    if reverse:
+        return jnp.concatenate([df, nothing]), jnp.concatenate([dg, last[None]])
+    return jnp.concatenate([nothing, df]), jnp.concatenate([last[None], dg])
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def until(reverse: bool, f: Series, g: Series) -> Series:
+    """`u[t] = max(g[t], min(f[t], u[t+1]))` (`u[t-1]`, if not `reverse`)."""
+    return _until(reverse, f, g, None, True)[1]
+
+
+def _until_forward(reverse: bool, f: Series, g: Series) -> tuple[Series, Any]:
+    u = until(reverse, f, g)
+    return u, (f, g, u, None)
+
+
+until.defvjp(_until_forward, _until_backward)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
+    """The same with smooth maxima and minima."""
+    return _until(reverse, f, g, tau, True)[1]
+
+
+def _until_smooth_forward(reverse: bool, f: Series, g: Series, tau: Array) -> tuple[Series, Any]:
+    u = until_smooth(reverse, f, g, tau)
+    return u, (f, g, u, tau)
+
+
+def _until_smooth_backward(reverse: bool, residuals: Any, pull: Series) -> Any:
+    return *_until_backward(reverse, residuals, pull), jnp.zeros_like(residuals[3])
+
+
+until_smooth.defvjp(_until_smooth_forward, _until_smooth_backward)
+
+
+@jax.custom_vjp
+def until_first(f: Series, g: Series) -> Array:
+    """The first value of `until`, without storing the others."""
+    return _until(True, f, g, None, False)[0]
+
+
+def _until_first_forward(f: Series, g: Series) -> tuple[Array, Any]:
+    u = _until(True, f, g, None, True)[1]
+    return u[0], (f, g, u, None)
+
+
+def _until_first_backward(residuals: Any, pull: Array) -> tuple[Series, Series]:
+    return _until_backward(True, residuals, pull)
+
+
+until_first.defvjp(_until_first_forward, _until_first_backward)
+
+
+@jax.custom_vjp
+def until_first_smooth(f: Series, g: Series, tau: Array) -> Array:
+    """The first value of `until_smooth`, without storing the others."""
+    return _until(True, f, g, tau, False)[0]
+
+
+def _until_first_smooth_forward(f: Series, g: Series, tau: Array) -> tuple[Array, Any]:
+    u = _until(True, f, g, tau, True)[1]
+    return u[0], (f, g, u, tau)
+
+
+def _until_first_smooth_backward(residuals: Any, pull: Array) -> Any:
+    return *_until_backward(True, residuals, pull), jnp.zeros_like(residuals[3])
+
+
+until_first_smooth.defvjp(_until_first_smooth_forward, _until_first_smooth_backward)
