@@ -15,12 +15,18 @@ position in m and angle in rad), `x_dot0`, `theta_dot0` (m/s, rad/s), `masscart`
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from verifai_jax.errors import unknown_name
+from verifai_jax.rl import Discrete, Policy, load_policy
 from verifai_jax.systems import Ode, ode, sin_cos
+from verifai_jax.systems.integrators import euler
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]
@@ -31,6 +37,9 @@ GRAVITY = 9.8
 X_LIMIT = 2.4
 THETA_LIMIT = 12 * 2 * math.pi / 360
 PUSH_SECONDS = 0.1
+
+# Trained by `python -m envs.train_cartpole`.
+POLICY_FILE = Path(__file__).with_name("cartpole_policy.npz")
 
 # Discrete-time LQR of the nominal plant at 50 Hz with unit weights on state and force.
 LQR_GAINS = (0.91, 2.13, 30.6, 7.84)
@@ -119,6 +128,86 @@ def linear(gains: Sequence[float] = LQR_GAINS) -> Controller:
         return jnp.clip(force, -largest, largest)
 
     return control
+
+
+def neural(
+    policy: Policy | str | Path = POLICY_FILE,
+    action: str = "argmax",
+    straight_through: bool = True,
+) -> Controller:
+    """A trained network with two actions, push left and push right, at the features' `force_mag`.
+
+    - `policy`: a `Policy` or the file of one; the one that is shipped when left out.
+    - `action`: `"argmax"` pushes with full force in the likelier direction, as CartPole-v1 does.
+      `"expected"` applies the mean force of the network's two probabilities, a smooth controller.
+    - `straight_through`: give `"argmax"` the derivative of `"expected"`; its own is zero almost
+      everywhere. The force itself is the same. Source: Bengio, Leonard and Courville (2013),
+      section 4 (straight-through estimator).
+    """
+    if action not in ("argmax", "expected"):
+        raise unknown_name("action", action, ["argmax", "expected"])
+    policy = policy if isinstance(policy, Policy) else load_policy(policy)
+    if policy.action != Discrete(2) or policy.layers[0][0].shape[0] != 4:
+        raise ValueError(
+            "a cart-pole policy sees 4 numbers and has 2 discrete actions; "
+            f"got {policy.layers[0][0].shape[0]} and {policy.action}"
+        )
+
+    def control(time: Scalar, state: State, features: Features) -> Scalar:
+        logits = policy(jnp.stack(state))
+        preference = logits[1] - logits[0]
+        largest = feature(features, "force_mag")
+        if action == "expected":
+            return largest * jnp.tanh(preference / 2)
+        return largest * (sign if straight_through else _sign)(preference)
+
+    return control
+
+
+def _sign(preference: Scalar) -> Scalar:
+    # A tie goes to the left, as NumPy's argmax sends it.
+    return jnp.where(preference > 0, 1.0, -1.0).astype(preference.dtype)
+
+
+@jax.custom_jvp
+def sign(preference: Scalar) -> Scalar:
+    """1 where positive, else -1, with the derivative of `tanh(preference / 2)`."""
+    return _sign(preference)
+
+
+@sign.defjvp
+def _sign_jvp(primals: Any, tangents: Any) -> Any:
+    smooth = jnp.tanh(primals[0] / 2)
+    return sign(*primals), (1 - smooth * smooth) / 2 * tangents[0]
+
+
+@dataclass(frozen=True)
+class CartPoleTask:
+    """CartPole-v1 to train on: nominal features, reward 1 a step, cut off after 500 steps."""
+
+    time_limit: int = 500
+
+    @property
+    def action(self) -> Discrete:
+        """0 pushes to the left, 1 to the right."""
+        return Discrete(2)
+
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Each part of the state uniform in +-0.05."""
+        return State(*jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05))
+
+    def step(
+        self, key: Key[Array, ""], state: State, action: Int[Array, ""]
+    ) -> tuple[State, Scalar, Bool[Array, ""]]:
+        """One step of 0.02 s."""
+        force = jnp.where(action == 1, 1.0, -1.0) * NOMINAL["force_mag"]
+        time = jnp.zeros(())
+        state = euler(lambda t, s: dynamics(t, s, force, {}), time, state, DT)
+        return state, jnp.ones(()), terminated(state, {})
+
+    def observe(self, state: State) -> Float[Array, "4"]:
+        """The state itself."""
+        return jnp.stack(state)
 
 
 def cartpole(

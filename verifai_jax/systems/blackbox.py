@@ -1,7 +1,9 @@
 """Any Python function as a system: a simulator that JAX cannot see into.
 
-blackbox(simulate)                       # simulate(features) -> Trace
-blackbox(simulate, seeded=True)          # simulate(features, seed) -> Trace
+    blackbox(simulate)                       # simulate(features) -> Trace
+    blackbox(simulate, seeded=True)          # simulate(features, seed) -> Trace
+
+Exceptions are for the caller to record; one simulation that raises must not end the run.
 """
 
 from collections.abc import Callable

@@ -1,0 +1,14 @@
+"""Training of the policies whose closed loops are then tested."""
+
+from verifai_jax.rl.policy import Policy as Policy
+from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
+from verifai_jax.rl.policy import load_policy as load_policy
+from verifai_jax.rl.policy import policy_notes as policy_notes
+from verifai_jax.rl.policy import save_policy as save_policy
+from verifai_jax.rl.ppo import PPO as PPO
+from verifai_jax.rl.task import Continuous as Continuous
+from verifai_jax.rl.task import Discrete as Discrete
+from verifai_jax.rl.task import Task as Task
+from verifai_jax.rl.train import Trained as Trained
+from verifai_jax.rl.train import evaluate as evaluate
+from verifai_jax.rl.train import train as train

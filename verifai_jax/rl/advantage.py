@@ -1,0 +1,46 @@
+"""Generalised advantage estimation over a stretch of experience.
+
+An episode can end in two ways. *Terminated*: nothing comes after, its value is zero. *Truncated*
+by the time limit: the last state still has a value, which the critic supplies.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class Ends(NamedTuple):
+    """How the step at each time ended: for good, or (also) cut off."""
+
+    terminated: Bool[Array, " time"]
+    truncated: Bool[Array, " time"]
+
+
+def advantages(
+    reward: Float[Array, " time"],
+    value: Float[Array, " time"],
+    next_value: Float[Array, " time"],
+    ends: Ends,
+    discount: Float[Array, ""] | float,
+    gae_lambda: Float[Array, ""] | float,
+) -> Float[Array, " time"]:
+    """Advantage of each action taken; advantage plus `value` is the critic's target.
+
+    - `value`: of the state in which the action was taken.
+    - `next_value`: of the state it led to, *before* any reset.
+
+    Source: Schulman et al., High-dimensional continuous control using generalized advantage
+    estimation (2016), eqs. 10 and 16.
+    """
+    goes_on = 1.0 - ends.terminated
+    delta = reward + discount * goes_on * next_value - value
+    same_episode = 1.0 - (ends.terminated | ends.truncated)
+
+    def backwards(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta, same_episode = step
+        advantage = delta + discount * gae_lambda * same_episode * later
+        return advantage, advantage
+
+    return jax.lax.scan(backwards, jnp.zeros(()), (delta, same_episode), reverse=True)[1]

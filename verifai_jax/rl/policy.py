@@ -1,0 +1,153 @@
+"""A trained policy: a small network from observations to actions, and its file.
+
+    policy = load_policy("policy.npz")
+    policy(observation)                       # logits `[n]`, or the unit action `[size]`
+    policy.act(observation)                   # the likeliest action
+    save_policy(policy, "policy.npz", seed=0, steps=200_000)
+
+The file holds numbers and text, never code.
+"""
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.rl.task import Action, Continuous, Discrete
+
+Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+
+_KINDS: dict[str, type[Discrete] | type[Continuous]] = {
+    "discrete": Discrete,
+    "continuous": Continuous,
+}
+
+
+class PolicyFileError(ValueError):
+    """A file that holds no policy of ours."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A tanh network, what it sees, and what its outputs mean.
+
+    - `layers`: weights `[inputs, outputs]` and biases `[outputs]`, first layer first.
+    - `mean`, `scale`: `[k]`; the network sees `(observation - mean) / scale`. None: as it is.
+    - `log_std`: `[size]`, of the Gaussian that explores; None for discrete actions.
+    """
+
+    layers: Layers
+    mean: Float[Array, " k"] | None
+    scale: Float[Array, " k"] | None
+    log_std: Float[Array, " size"] | None
+    action: Action = dataclasses.field(metadata={"static": True})
+
+    def __call__(self, observation: Float[Array, " k"]) -> Float[Array, " outputs"]:
+        """Logits of the `n` actions, or the mean action in units of half its range."""
+        if self.mean is not None and self.scale is not None:
+            observation = (observation - self.mean) / self.scale
+        return network(self.layers, observation)
+
+    def act(self, observation: Float[Array, " k"]) -> Int[Array, ""] | Float[Array, " size"]:
+        """The likeliest action: an index, or a vector within its range."""
+        return likeliest(self.action, self(observation))
+
+
+def network(layers: Layers, x: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+    """A multilayer perceptron with tanh between its layers."""
+    for weight, bias in layers[:-1]:
+        x = jnp.tanh(x @ weight + bias)
+    weight, bias = layers[-1]
+    return x @ weight + bias
+
+
+def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers:
+    """Orthogonal weights and zero biases; `gain` scales the last layer, sqrt(2) the others.
+
+    Source: Saxe, McClelland and Ganguli (2014), section 3.
+    """
+    layers = []
+    for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        scale = gain if i == len(sizes) - 2 else 2**0.5
+        draw = jax.nn.initializers.orthogonal(scale)
+        weight = draw(jax.random.fold_in(key, i), (inputs, outputs), jnp.float32)
+        layers.append((weight, jnp.zeros(outputs)))
+    return tuple(layers)
+
+
+def likeliest(action: Action, outputs: Float[Array, " outputs"]) -> Array:
+    """The mode of the distribution over actions that a network's outputs describe."""
+    if isinstance(action, Discrete):
+        return jnp.argmax(outputs).astype(jnp.int32)
+    return in_range(action, outputs)
+
+
+def in_range(action: Continuous, unit: Float[Array, " size"]) -> Float[Array, " size"]:
+    """From units of half the range around its middle to the action itself, clipped."""
+    middle, half = (action.high + action.low) / 2, (action.high - action.low) / 2
+    return jnp.clip(middle + half * unit, action.low, action.high)
+
+
+def save_policy(policy: Policy, path: str | Path, **notes: Any) -> None:
+    """Write a policy as a compressed `.npz` of float32 arrays, with `notes` (JSON) beside them."""
+    kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
+    about = {"action": {"kind": kind, **dataclasses.asdict(policy.action)}, "notes": notes}
+    arrays: dict[str, Any] = {"about": np.array(json.dumps(about))}
+    for i, (weight, bias) in enumerate(policy.layers):
+        arrays[f"weight{i}"], arrays[f"bias{i}"] = np.float32(weight), np.float32(bias)
+    for name in ("mean", "scale", "log_std"):
+        if (value := getattr(policy, name)) is not None:
+            arrays[name] = np.float32(value)
+    np.savez_compressed(path, **arrays)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy that `save_policy` wrote. The file can hold numbers and text only.
+
+    **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
+    """
+    arrays, about = _read(path)
+    try:
+        action = dict(about["action"])
+        kind = _KINDS[action.pop("kind")](**action)
+        count = sum(name.startswith("weight") for name in arrays)
+        layers = tuple(
+            (jnp.asarray(arrays[f"weight{i}"]), jnp.asarray(arrays[f"bias{i}"]))
+            for i in range(count)
+        )
+        shapes = [weight.shape for weight, _ in layers]
+        chained = all(a[1] == b[0] for a, b in itertools.pairwise(shapes))
+        if not layers or not chained:
+            raise KeyError(f"layers of shapes {shapes}")
+    except (KeyError, TypeError, ValueError) as error:
+        raise PolicyFileError(f"{path} holds no policy: {error}") from error
+    optional = {
+        name: jnp.asarray(arrays[name]) if name in arrays else None
+        for name in ("mean", "scale", "log_std")
+    }
+    return Policy(layers=layers, action=kind, **optional)
+
+
+def policy_notes(path: str | Path) -> dict[str, Any]:
+    """The notes that were saved with a policy: how it was trained, how well it did."""
+    return _read(path)[1].get("notes", {})
+
+
+def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        return arrays, json.loads(str(arrays.pop("about")))
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise PolicyFileError(f"{path} holds no policy: {error}") from error

@@ -1,0 +1,351 @@
+"""Proximal policy optimisation: experience of many environments, a few clipped passes over it.
+
+    ppo = PPO(learning_rate=1e-3, hidden=(32, 32))
+    training = init(ppo, task, key, updates=200)
+    training, progress = update(ppo, task, training)
+
+Source: Schulman et al., Proximal policy optimization algorithms (2017). Hyper-parameters that
+change no shape are leaves of a pytree, so one compiled program serves all their values.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.rl.advantage import Ends, advantages
+from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
+from verifai_jax.rl.task import Action, Continuous, Discrete, Task
+
+Number = Float[Array, ""] | float
+
+
+def _shape(default: Any) -> Any:
+    """A field that decides shapes or structure: static under `jit`."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PPO:
+    """Hyper-parameters.
+
+    - `learning_rate`: of Adam; falls linearly to 0 over the training if `anneal`.
+    - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
+    - `clip`: how far the ratio of new to old probability may leave 1.
+    - `entropy`, `value_weight`: weights in the loss.
+    - `max_gradient`: norm to which gradients are cut.
+    - `environments`, `horizon`: steps of experience in an update, wide and long.
+    - `epochs`, `minibatches`: passes over them, and parts in a pass.
+    - `hidden`, `value_hidden`: widths of the policy's and the critic's hidden layers.
+    - `normalise`: observations by their running mean and deviation.
+    """
+
+    learning_rate: Number = 2.5e-4
+    discount: Number = 0.99
+    gae_lambda: Number = 0.95
+    clip: Number = 0.2
+    entropy: Number = 0.01
+    value_weight: Number = 0.5
+    max_gradient: Number = 0.5
+    environments: int = _shape(8)
+    horizon: int = _shape(128)
+    epochs: int = _shape(4)
+    minibatches: int = _shape(4)
+    hidden: tuple[int, ...] = _shape((64, 64))
+    value_hidden: tuple[int, ...] = _shape((64, 64))
+    normalise: bool = _shape(False)
+    anneal: bool = _shape(True)
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of one update."""
+        return self.environments * self.horizon
+
+    def check(self) -> None:
+        """Refuse values that cannot train.
+
+        **Raises:** `ValueError`, naming the hyper-parameter and its value.
+        """
+        for name in ("learning_rate", "clip", "max_gradient"):
+            _require(float(getattr(self, name)) > 0, name, "positive", getattr(self, name))
+        for name in ("discount", "gae_lambda"):
+            value = getattr(self, name)
+            _require(0 <= float(value) <= 1, name, "between 0 and 1", value)
+        for name in ("entropy", "value_weight"):
+            _require(float(getattr(self, name)) >= 0, name, "at least 0", getattr(self, name))
+        for name in ("environments", "horizon", "epochs", "minibatches"):
+            _require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
+        _require(
+            self.steps_per_update % self.minibatches == 0,
+            "minibatches",
+            f"a divisor of environments * horizon = {self.steps_per_update}",
+            self.minibatches,
+        )
+        for name in ("hidden", "value_hidden"):
+            widths = getattr(self, name)
+            _require(all(w >= 1 for w in widths), name, "positive widths", widths)
+
+
+def _require(holds: bool, name: str, wanted: str, got: Any) -> None:
+    if not holds:
+        raise ValueError(f"PPO's {name} must be {wanted}; got {got}")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """What is learnt: the policy's layers, the critic's, and the width of exploration."""
+
+    policy: Layers
+    critic: Layers
+    log_std: Float[Array, " size"] | None
+
+
+class Seen(NamedTuple):
+    """Running statistics of the observations."""
+
+    count: Float[Array, ""]
+    mean: Float[Array, " k"]
+    variance: Float[Array, " k"]
+
+
+class Episodes(NamedTuple):
+    """Where each environment stands."""
+
+    state: Any
+    age: Int[Array, " environments"]
+    total: Float[Array, " environments"]
+
+
+class Training(NamedTuple):
+    """Everything that goes from one update to the next."""
+
+    weights: Weights
+    moments: Any
+    seen: Seen
+    episodes: Episodes
+    key: Key[Array, ""]
+    done: Int[Array, ""]
+    updates: Int[Array, ""]
+
+
+class Progress(NamedTuple):
+    """Of one update: mean return of the episodes that ended in it (NaN: none), and their number."""
+
+    mean_return: Float[Array, ""]
+    episodes: Int[Array, ""]
+
+
+class Experience(NamedTuple):
+    """One step of one environment."""
+
+    observation: Float[Array, " k"]
+    action: Array
+    log_probability: Float[Array, ""]
+    reward: Float[Array, ""]
+    next_observation: Float[Array, " k"]
+    ends: Ends
+    finished_return: Float[Array, ""]
+
+
+def init(ppo: PPO, task: Task, key: Key[Array, ""], updates: int) -> Training:
+    """The state before the first of `updates` updates."""
+    policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
+    state = jax.vmap(task.reset)(jax.random.split(reset_key, ppo.environments))
+    size = jax.eval_shape(jax.vmap(task.observe), state).shape[-1]
+    discrete = isinstance(task.action, Discrete)
+    outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
+    weights = Weights(
+        # A nearly uniform first policy, and a critic that starts at unit scale.
+        policy=new_layers(policy_key, (size, *ppo.hidden, outputs), gain=0.01),
+        critic=new_layers(critic_key, (size, *ppo.value_hidden, 1), gain=1.0),
+        log_std=None if discrete else jnp.zeros(outputs),
+    )
+    return Training(
+        weights=weights,
+        moments=_optimizer(ppo).init(weights),
+        seen=Seen(jnp.zeros(()), jnp.zeros(size), jnp.ones(size)),
+        episodes=Episodes(
+            state, jnp.zeros(ppo.environments, jnp.int32), jnp.zeros(ppo.environments)
+        ),
+        key=key,
+        done=jnp.int32(0),
+        updates=jnp.int32(updates),
+    )
+
+
+def update(ppo: PPO, task: Task, training: Training) -> tuple[Training, Progress]:
+    """Collect `horizon` steps of each environment and learn from them."""
+    collect_key, learn_key, key = jax.random.split(training.key, 3)
+    episodes, experience = _collect(ppo, task, training, collect_key)
+    seen = _watch(training.seen, experience.observation) if ppo.normalise else training.seen
+    weights, moments = _learn(ppo, task, training, experience, learn_key)
+    over = experience.ends.terminated | experience.ends.truncated
+    count = jnp.sum(over)
+    total = jnp.sum(jnp.where(over, experience.finished_return, 0.0))
+    progress = Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)
+    done = training.done + 1
+    return Training(weights, moments, seen, episodes, key, done, training.updates), progress
+
+
+def policy_of(ppo: PPO, task: Task, training: Training) -> Policy:
+    """The policy as learnt so far."""
+    mean, scale = _normaliser(training.seen) if ppo.normalise else (None, None)
+    return Policy(training.weights.policy, mean, scale, training.weights.log_std, task.action)
+
+
+def _collect(
+    ppo: PPO, task: Task, training: Training, key: Key[Array, ""]
+) -> tuple[Episodes, Experience]:
+    """Experience `[environments, horizon]` under the present policy, resetting as episodes end."""
+
+    def step(carry: Any, key: Key[Array, ""]) -> Any:
+        state, age, total = carry
+        action_key, step_key, reset_key = jax.random.split(key, 3)
+        observation = task.observe(state)
+        outputs = network(training.weights.policy, _look(ppo, training.seen, observation))
+        action = _draw(task.action, outputs, training.weights.log_std, action_key)
+        taken = action if isinstance(task.action, Discrete) else in_range(task.action, action)
+        after, reward, terminated = task.step(step_key, state, taken)
+        age, total = age + 1, total + reward
+        ends = Ends(terminated, age >= task.time_limit)
+        over = ends.terminated | ends.truncated
+        seen = Experience(
+            observation=observation,
+            action=action,
+            log_probability=_log_probability(
+                task.action, outputs, training.weights.log_std, action
+            ),
+            reward=jnp.asarray(reward, jnp.float32),
+            next_observation=task.observe(after),
+            ends=ends,
+            finished_return=total,
+        )
+        fresh = (task.reset(reset_key), jnp.int32(0), jnp.zeros(()))
+        return jax.tree.map(
+            lambda new, old: jnp.where(over, new, old), fresh, (after, age, total)
+        ), seen
+
+    def one(episode: Any, key: Key[Array, ""]) -> Any:
+        return jax.lax.scan(step, episode, jax.random.split(key, ppo.horizon))
+
+    keys = jax.random.split(key, ppo.environments)
+    episodes, experience = jax.vmap(one)(tuple(training.episodes), keys)
+    return Episodes(*episodes), experience
+
+
+def _learn(
+    ppo: PPO, task: Task, training: Training, experience: Experience, key: Key[Array, ""]
+) -> tuple[Weights, Any]:
+    """A few epochs of clipped policy and value steps on one stretch of experience."""
+    look = jax.vmap(jax.vmap(lambda o: _look(ppo, training.seen, o)))
+    observation, next_observation = look(experience.observation), look(experience.next_observation)
+    critic = jax.vmap(jax.vmap(lambda o: network(training.weights.critic, o)[0]))
+    value = critic(observation)
+    estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
+    advantage = estimate(
+        experience.reward,
+        value,
+        critic(next_observation),
+        experience.ends,
+        ppo.discount,
+        ppo.gae_lambda,
+    )
+    batch = (
+        observation,
+        experience.action,
+        experience.log_probability,
+        advantage,
+        advantage + value,
+    )
+    batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
+    optimizer = _optimizer(ppo)
+    left = 1.0 - training.done / training.updates if ppo.anneal else 1.0
+    rate = ppo.learning_rate * left
+
+    def minibatch(carry: Any, rows: Int[Array, " rows"]) -> Any:
+        weights, moments = carry
+        part = jax.tree.map(lambda leaf: leaf[rows], batch)
+        gradient = jax.grad(_loss)(weights, ppo, task.action, part)
+        direction, moments = optimizer.update(gradient, moments)
+        weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
+        return (weights, moments), None
+
+    def shuffled(key: Key[Array, ""]) -> Int[Array, "minibatches rows"]:
+        return jax.random.permutation(key, ppo.steps_per_update).reshape(ppo.minibatches, -1)
+
+    orders = jax.vmap(shuffled)(jax.random.split(key, ppo.epochs))
+    order = orders.reshape(ppo.epochs * ppo.minibatches, -1)
+    return jax.lax.scan(minibatch, (training.weights, training.moments), order)[0]
+
+
+def _loss(weights: Weights, ppo: PPO, action: Action, part: Any) -> Float[Array, ""]:
+    observation, taken, old_log_probability, advantage, target = part
+    outputs = jax.vmap(lambda o: network(weights.policy, o))(observation)
+    value = jax.vmap(lambda o: network(weights.critic, o)[0])(observation)
+    log_probability = jax.vmap(lambda o, a: _log_probability(action, o, weights.log_std, a))(
+        outputs, taken
+    )
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    ratio = jnp.exp(log_probability - old_log_probability)
+    clipped = jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip)
+    surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))  # eq. 7
+    value_error = jnp.mean(jnp.square(value - target)) / 2
+    entropy = jnp.mean(jax.vmap(lambda o: _entropy(action, o, weights.log_std))(outputs))
+    return -surrogate + ppo.value_weight * value_error - ppo.entropy * entropy  # eq. 9
+
+
+def _optimizer(ppo: PPO) -> Any:
+    import optax
+
+    return optax.chain(
+        optax.clip_by_global_norm(ppo.max_gradient),  # pyright: ignore[reportArgumentType]
+        optax.scale_by_adam(eps=1e-5),
+    )
+
+
+def _draw(action: Action, outputs: Array, log_std: Any, key: Key[Array, ""]) -> Array:
+    if isinstance(action, Discrete):
+        return jax.random.categorical(key, outputs).astype(jnp.int32)
+    return outputs + jnp.exp(log_std) * jax.random.normal(key, outputs.shape)
+
+
+def _log_probability(action: Action, outputs: Array, log_std: Any, taken: Array) -> Array:
+    if isinstance(action, Discrete):
+        return jax.nn.log_softmax(outputs)[taken]
+    standard = (taken - outputs) / jnp.exp(log_std)
+    return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2)
+
+
+def _entropy(action: Action, outputs: Array, log_std: Any) -> Array:
+    if isinstance(action, Continuous):
+        return jnp.sum(log_std + (jnp.log(2 * jnp.pi) + 1) / 2)
+    log_probability = jax.nn.log_softmax(outputs)
+    return -jnp.sum(jnp.exp(log_probability) * log_probability)
+
+
+def _look(ppo: PPO, seen: Seen, observation: Array) -> Array:
+    if not ppo.normalise:
+        return observation
+    mean, scale = _normaliser(seen)
+    return (observation - mean) / scale
+
+
+def _normaliser(seen: Seen) -> tuple[Array, Array]:
+    return seen.mean, jnp.sqrt(seen.variance + 1e-8)
+
+
+def _watch(seen: Seen, observation: Float[Array, "environments horizon k"]) -> Seen:
+    """Merge the statistics of a batch: Chan, Golub and LeVeque (1979), eqs. 2.1."""
+    rows = observation.reshape(-1, observation.shape[-1])
+    count = jnp.float32(rows.shape[0])
+    mean, variance = jnp.mean(rows, axis=0), jnp.var(rows, axis=0)
+    total = seen.count + count
+    shift = mean - seen.mean
+    squares = seen.variance * seen.count + variance * count
+    squares = squares + shift**2 * seen.count * count / total
+    return Seen(total, seen.mean + shift * count / total, squares / total)
