@@ -123,7 +123,7 @@ def _draw_bounds(
         color=FAILING, alpha=0.13, linewidth=0, step="mid",
     )
     axes.annotate(
-        str(predicate), (1.0, 1.0), xycoords="axes fraction", ha="right", va="bottom",
+        str(predicate), (0.0, 1.0), xycoords="axes fraction", ha="left", va="bottom",
         fontsize=7, color=SAFE if (margin >= 0).all() else FAILING,
     )
 
@@ -135,11 +135,12 @@ def _mark(axes: Any, trace: Trace, signal: str, sample: int) -> None:
         value = value[int(np.argmax(np.abs(value)))]
     axes.plot([time], [value], "o", color=FAILING, markersize=6)
     right = sample > trace.length / 2
+    low, high = axes.get_ylim()
     axes.annotate(
         f"{signal} = {value:.4g} at {time:.4g} s",
         (time, value),
         textcoords="offset points",
-        xytext=(-10 if right else 10, 8),
+        xytext=(-12 if right else 12, -12 if value > (low + high) / 2 else 8),
         ha="right" if right else "left",
         fontsize=8,
         color=FAILING,
