@@ -37,11 +37,15 @@ def _ends(n: int, length: int, reverse: bool) -> np.ndarray:
     return (length - 1 - k) % n == 0 if reverse else k % n == 0
 
 
-def _shift(x: Series, by: int, reverse: bool, fill: float) -> Series:
-    """`x` from `by` samples later (earlier, if not `reverse`), `fill` beyond the array."""
-    lanes = ((0, 0, 0),) * (x.ndim - 1)
-    low, high = (-by, by) if reverse else (by, -by)
-    return lax.pad(x, jnp.asarray(fill, x.dtype), ((low, high, 0), *lanes))
+def _far(by: int, length: int, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The instants `by` samples later (earlier, if not `reverse`), and whether they exist."""
+    k = np.arange(length, dtype=np.int32) + (by if reverse else -by)
+    return np.clip(k, 0, length - 1), (k >= 0) & (k < length)
+
+
+def _row(x: Series, k: Array) -> Array:
+    # Reading a row within the scan saves the copy that a shifted array would be.
+    return lax.dynamic_index_in_dim(x, k, keepdims=False)
 
 
 # Hard windows
@@ -71,14 +75,14 @@ def _windowed(n: int, reverse: bool, x: Series, keep: bool) -> tuple[Series, Any
         return m, m
 
     ahead = lax.scan(begin, lowest, (x, _starts(n, length, reverse)), reverse=not reverse)[1]
-    far = _shift(ahead, n - 1, reverse, -np.inf)
 
     def finish(m: Array, row: Any) -> tuple[Array, Any]:
-        value, end, other = row
+        value, end, (far, inside) = row
         m = jnp.where(end, value, jnp.maximum(m, value))
-        return m, (jnp.maximum(m, other), m) if keep else jnp.maximum(m, other)
+        y = jnp.where(inside, jnp.maximum(m, _row(ahead, far)), m)
+        return m, (y, m) if keep else y
 
-    rows = (x, _ends(n, length, reverse), far)
+    rows = (x, _ends(n, length, reverse), _far(n - 1, length, reverse))
     out = lax.scan(finish, lowest, rows, reverse=reverse)[1]
     return (out[0], (x, *out, ahead)) if keep else (out, None)
 
@@ -105,15 +109,16 @@ def _windowed_backward(n: int, reverse: bool, residuals: Any, g: Series) -> tupl
     first = lax.scan(back_near, nothing, rows, reverse=not reverse)[1]
     if ahead is None:
         return (first,)
-    g_far = _shift(jnp.where(near >= y, 0.0, g), n - 1, not reverse, 0.0)
 
     def back_ahead(carry: Array, row: Any) -> tuple[Array, Array]:
-        g, value, m, end, other = row
-        carry = jnp.where(end, 0.0, carry) + g
+        value, m, end, other, (far, inside) = row
+        taken = _row(near, far) >= _row(y, far)
+        carry = jnp.where(end, 0.0, carry)
+        carry = carry + jnp.where(inside & ~taken, _row(g, far), 0.0)
         here = value >= m
         return jnp.where(here, 0.0, carry), other + jnp.where(here, carry, 0.0)
 
-    rows = (g_far, x, ahead, _ends(n, length, reverse), first)
+    rows = (x, ahead, _ends(n, length, reverse), first, _far(n - 1, length, not reverse))
     return (lax.scan(back_ahead, nothing, rows, reverse=reverse)[1],)
 
 
@@ -132,10 +137,7 @@ def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Ar
 
 
 def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
-    """Pairs `(m, s)` over the windows of `weight * exp(x / tau)`, each given to `finish`.
-
-    `finish(m, s, row)` gets the matching rows of `x`'s own time.
-    """
+    """`finish(m, s, x)` of the pairs over the windows of `weight * exp(x / tau)`."""
     length = x.shape[0]
     nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))
     given = weight is not None
@@ -150,27 +152,26 @@ def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any)
     if n < length:
         rows = (x, _starts(n, length, reverse), weight)
         ahead = lax.scan(begin, nothing, rows, reverse=not reverse)[1]
+        far, inside = _far(n - 1, length, reverse)
         # A window that is exactly one block would be counted twice.
-        alone = _starts(n, length, reverse)
-        far = (
-            _shift(ahead[0], n - 1, reverse, -NEVER),
-            _shift(ahead[1], n - 1, reverse, 0.0),
-        )
+        far = (far, inside & ~_starts(n, length, reverse))
     else:
-        far, alone = None, np.zeros(length, bool)
+        ahead = far = None
 
     def complete(pair: Any, row: Any) -> Any:
-        value, end, weight, far, alone, extra = row
+        value, end, weight, far = row
         m, s = pair
         m, s = jnp.where(end, -NEVER, m), jnp.where(end, 0.0, s)
         m, s = _add(m, s, value, weight if given else 1.0, tau)
         if far is None:
-            return (m, s), finish(m, s, extra)
-        total = _add(m, s, far[0], jnp.where(alone, 0.0, far[1]), tau)
-        return (m, s), finish(*total, extra)
+            return (m, s), finish(m, s, value)
+        more, other = (_row(a, far[0]) for a in ahead)
+        both = _add(m, s, more, other, tau)
+        total = (jnp.where(far[1], a, b) for a, b in zip(both, (m, s), strict=True))
+        return (m, s), finish(*total, value)
 
     ends = np.zeros(length, bool) if far is None else _ends(n, length, reverse)
-    return lax.scan(complete, nothing, (x, ends, weight, far, alone, x), reverse=reverse)[1]
+    return lax.scan(complete, nothing, (x, ends, weight, far), reverse=reverse)[1]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -198,21 +199,20 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 # Until, and since the other way round
 
 
-def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: bool) -> tuple[Array, Any]:
-    """The last value of the recursion, and all values if `keep`."""
+def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: str) -> tuple[Array, Any]:
+    """The last value of the recursion, and what to `keep` of each step.
+
+    `"u"` keeps the values, `"v"` the smaller of `f` and the value before, for the way back.
+    """
 
     def step(u: Array, row: Any) -> Any:
         f, g = row
-        u = _greater(g, -_greater(-f, -u, tau), tau)
-        return u, u if keep else None
+        v = jnp.minimum(f, u) if tau is None else -_greater(-f, -u, tau)
+        u = _greater(g, v, tau)
+        return u, {"u": u, "v": v, "uv": (u, v), "": None}[keep]
 
-    last = -1 if reverse else 0
-    rows = (f[:-1], g[:-1]) if reverse else (f[1:], g[1:])
-    first, rest = lax.scan(step, g[last], rows, reverse=reverse)
-    if keep:
-        parts = [rest, g[-1:]] if reverse else [g[:1], rest]
-        return first, jnp.concatenate(parts)
-    return first, None
+    nothing = jnp.full(g.shape[1:], -jnp.inf if tau is None else -NEVER, g.dtype)
+    return lax.scan(step, nothing, (f, g), reverse=reverse)
 
 
 def _greater(a: Array, b: Array, tau: Any) -> Array:
@@ -222,49 +222,38 @@ def _greater(a: Array, b: Array, tau: Any) -> Array:
 
 def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, Series]:
     """`pull` is the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
-    f, g, u, tau = residuals
+    f, g, v, tau = residuals
     whole = pull.ndim == g.ndim
-    before, after = (
-        (slice(None, -1), slice(1, None)) if reverse else (slice(1, None), slice(None, -1))
-    )
-    edge = 0 if reverse else -1
 
     def step(carry: Array, row: Any) -> Any:
-        pull, f, g, following = row
+        pull, f, g, v = row
         carry = carry + pull if whole else carry
         if tau is None:
-            inner = jnp.minimum(f, following)
-            to_g, to_f = g >= inner, f <= following
+            to_g, to_f = g >= v, f <= v
             down = jnp.where(to_g, 0.0, carry)
             return jnp.where(to_f, 0.0, down), (
                 jnp.where(to_f, down, 0.0),
                 jnp.where(to_g, carry, 0.0),
             )
-        inner = -_greater(-f, -following, tau)
-        share = jax.nn.sigmoid((g - inner) / tau)
-        down = carry - carry * share
-        to_f = jax.nn.sigmoid((following - f) / tau) * down
-        return down - to_f, (to_f, carry * share)
+        to_g = jax.nn.sigmoid((g - v) / tau) * carry
+        down = carry - to_g
+        to_f = jnp.exp(jnp.minimum(v - f, 0.0) / tau) * down
+        return down - to_f, (to_f, to_g)
 
-    start = jnp.zeros_like(g[edge]) if whole else pull
-    rows = (pull[before] if whole else None, f[before], g[before], u[after])
-    carry, (df, dg) = lax.scan(step, start, rows, reverse=not reverse)
-    last = carry + pull[-1 if reverse else 0] if whole else carry
-    nothing = jnp.zeros_like(last)[None]
-    if reverse:
-        return jnp.concatenate([df, nothing]), jnp.concatenate([dg, last[None]])
-    return jnp.concatenate([nothing, df]), jnp.concatenate([last[None], dg])
+    start = jnp.zeros_like(g[0]) if whole else pull
+    rows = (pull if whole else None, f, g, v)
+    return lax.scan(step, start, rows, reverse=not reverse)[1]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def until(reverse: bool, f: Series, g: Series) -> Series:
     """`u[t] = max(g[t], min(f[t], u[t+1]))` (`u[t-1]`, if not `reverse`)."""
-    return _until(reverse, f, g, None, True)[1]
+    return _until(reverse, f, g, None, "u")[1]
 
 
 def _until_forward(reverse: bool, f: Series, g: Series) -> tuple[Series, Any]:
-    u = until(reverse, f, g)
-    return u, (f, g, u, None)
+    u, v = _until(reverse, f, g, None, "uv")[1]
+    return u, (f, g, v, None)
 
 
 until.defvjp(_until_forward, _until_backward)
@@ -273,12 +262,12 @@ until.defvjp(_until_forward, _until_backward)
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
     """The same with smooth maxima and minima."""
-    return _until(reverse, f, g, tau, True)[1]
+    return _until(reverse, f, g, tau, "u")[1]
 
 
 def _until_smooth_forward(reverse: bool, f: Series, g: Series, tau: Array) -> tuple[Series, Any]:
-    u = until_smooth(reverse, f, g, tau)
-    return u, (f, g, u, tau)
+    u, v = _until(reverse, f, g, tau, "uv")[1]
+    return u, (f, g, v, tau)
 
 
 def _until_smooth_backward(reverse: bool, residuals: Any, pull: Series) -> Any:
@@ -291,12 +280,12 @@ until_smooth.defvjp(_until_smooth_forward, _until_smooth_backward)
 @jax.custom_vjp
 def until_first(f: Series, g: Series) -> Array:
     """The first value of `until`, without storing the others."""
-    return _until(True, f, g, None, False)[0]
+    return _until(True, f, g, None, "")[0]
 
 
 def _until_first_forward(f: Series, g: Series) -> tuple[Array, Any]:
-    u = _until(True, f, g, None, True)[1]
-    return u[0], (f, g, u, None)
+    u, v = _until(True, f, g, None, "v")
+    return u, (f, g, v, None)
 
 
 def _until_first_backward(residuals: Any, pull: Array) -> tuple[Series, Series]:
@@ -309,12 +298,12 @@ until_first.defvjp(_until_first_forward, _until_first_backward)
 @jax.custom_vjp
 def until_first_smooth(f: Series, g: Series, tau: Array) -> Array:
     """The first value of `until_smooth`, without storing the others."""
-    return _until(True, f, g, tau, False)[0]
+    return _until(True, f, g, tau, "")[0]
 
 
 def _until_first_smooth_forward(f: Series, g: Series, tau: Array) -> tuple[Array, Any]:
-    u = _until(True, f, g, tau, True)[1]
-    return u[0], (f, g, u, tau)
+    u, v = _until(True, f, g, tau, "v")
+    return u, (f, g, v, tau)
 
 
 def _until_first_smooth_backward(residuals: Any, pull: Array) -> Any:
