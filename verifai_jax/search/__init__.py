@@ -1,6 +1,10 @@
-"""Searches of the unit cube: `named("cross_entropy", elite=0.2)` or `CrossEntropy(elite=0.2)`."""
+"""Searches over the unit cube, by class or by name.
 
-import dataclasses
+CrossEntropy(elite=0.2)
+named("cross_entropy", elite=0.2)
+"""
+
+from dataclasses import fields
 from typing import Any
 
 from verifai_jax.errors import check_names, unknown_name
@@ -21,18 +25,17 @@ _SEARCHES: dict[str, Any] = {
 
 
 def names() -> tuple[str, ...]:
-    """Names of the searches."""
+    """The names that `named` knows."""
     return tuple(_SEARCHES)
 
 
 def named(name: str, **options: Any) -> Search:
-    """The search of this name with these options.
+    """The search of that name, with its hyper-parameters.
 
-    **Raises:** `UnknownNameError` for a name or an option that does not exist; `ValueError` for an
-    option out of range.
+    **Raises:** `ValueError` for an unknown name or option, or a value out of range.
     """
     if name not in _SEARCHES:
         raise unknown_name("search", name, _SEARCHES)
-    kind = _SEARCHES[name]
-    check_names(f"option of {name}", options, [field.name for field in dataclasses.fields(kind)])
-    return kind(**options)
+    known = [field.name for field in fields(_SEARCHES[name])]
+    check_names(f"option of search {name}", options, known)
+    return _SEARCHES[name](**options)

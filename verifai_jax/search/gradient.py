@@ -1,187 +1,171 @@
-"""Multi-start gradient descent on annealed smooth robustness, projected to the cube.
+"""Gradient descent on the smooth robustness, from many starts at once.
 
-Each row of a batch is a descent of its own. The steps are Adam's (Kingma and Ba, Adam: a method for
-stochastic optimization, ICLR 2015, algorithm 1), whose first is the sign of the gradient: with a
-large first step a descent jumps towards the corner where the failures of many systems are, and then
-settles down.
+Each row of the batch is a descent of its own: Adam (Kingma, Ba, 2015, algorithm 1) with large,
+shrinking steps, projected to the cube. Its first steps are the sign of the gradient, which takes
+a descent to a corner in a few simulations. A descent that has failed the system, has converged or
+has no usable gradient starts again at the next low-discrepancy point.
 """
 
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated
+from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction
 from verifai_jax.search.halton import halton_points
 
-BETA_1, BETA_2, EPSILON = 0.7, 0.9, 1e-12
-USELESS = 1e-9  # A gradient smaller than this part of the robustness' spread leads nowhere.
+BETA1, BETA2, EPSILON = 0.5, 0.9, 1e-12
 
 
 class GradientState(NamedTuple):
-    """Where each descent is, Adam's moments, and its age and progress."""
-
     key: Key[Array, ""]
-    u: Float[Array, "n d"]
-    momentum: Float[Array, "n d"]
-    second: Float[Array, "n d"]
-    age: Int[Array, " n"]
-    least: Float[Array, " n"]
-    stale: Int[Array, " n"]
-    started: Int[Array, ""]
-    rounds: Int[Array, ""]
-    spread: Float[Array, ""]
+    u: Float[Array, "batch d"]
+    first: Float[Array, "batch d"]  # moments of the gradient
+    second: Float[Array, "batch d"]
+    best: Float[Array, " batch"]  # least robustness since the start
+    step: Int[Array, " batch"]  # since the start
+    stale: Int[Array, " batch"]  # steps without progress
+    starts: UInt32[Array, ""]  # how many starts were made
+    round: Int[Array, ""]
+    scale: Float[Array, ""]  # of the robustness
 
 
 @dataclass(frozen=True)
 class Gradient:
-    """Descents from low-discrepancy starts; one that has ended starts elsewhere.
+    """Multi-start Adam on the smooth robustness; discrete coordinates keep their start's value.
 
-    Discrete coordinates are drawn at each start and stay. A descent ends when it has found a
-    failure, has made `steps` steps or `patience` without progress, or its gradient is of no use
-    (zero or not finite).
+    **Arguments:**
 
-    - `step`, `last_step`: lengths of the first and the last step in widths of the cube; geometric
-      in between.
-    - `steps`: of one descent.
-    - `patience`: steps without progress before a descent gives up.
-    - `warm`, `cold`: temperatures at the first and last step, relative to the spread of the
-      robustness seen so far.
+    - `learning_rate`: length of the first step in each unit coordinate.
+    - `decay`: factor on the step length from step to step.
+    - `least_rate`: step length below which it does not shrink.
+    - `hot`, `cold`: temperature of the smooth robustness at first and at last, in units of the
+      robustness' spread over the first batch.
+    - `cooling`: rounds from `hot` to `cold`, geometrically.
+    - `patience`: steps without progress after which a descent starts again elsewhere.
 
-    **Raises:** `ValueError` for values out of range; `check` for a cube without a continuous
-    coordinate.
+    **Raises:** `ValueError` for values out of range.
     """
 
-    step: float = 0.25
-    last_step: float = 0.02
-    steps: int = 16
-    patience: int = 5
-    warm: float = 0.3
+    learning_rate: float = 0.25
+    decay: float = 0.8
+    least_rate: float = 0.01
+    hot: float = 0.3
     cold: float = 0.02
+    cooling: int = 10
+    patience: int = 4
     wants_gradient: ClassVar[bool] = True
     samples_prior: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        for first, last in (("step", "last_step"), ("warm", "cold")):
-            a, b = getattr(self, first), getattr(self, last)
-            if not 0 < b <= a:
-                raise ValueError(f"need 0 < {last} <= {first}; got ({first}={a}, {last}={b})")
-        for name in ("steps", "patience"):
+        for name in ("learning_rate", "decay", "least_rate"):
+            check_fraction(name, getattr(self, name))
+        for name in ("hot", "cold"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be an integer of at least 1; got {value!r}")
+            if not (isinstance(value, int | float) and 0 < value < float("inf")):
+                raise ValueError(f"{name} must be positive; got {value!r}")
+        check_count("cooling", self.cooling)
+        check_count("patience", self.patience)
 
     def check(self, cube: Cube) -> None:
-        """Refuse a cube without a continuous coordinate."""
-        if not cube.continuous.any():
+        """Raise `ValueError` unless there is a continuous coordinate to move in."""
+        if cube.dim and len(cube.continuous) == 0:
             raise ValueError(
-                "search 'gradient' needs a continuous feature, and this space has only discrete "
-                "ones; use 'cross_entropy' or 'uniform'"
+                f"search gradient needs at least one continuous feature; all {cube.dim} unit "
+                "coordinates of this space are discrete. Use 'cross_entropy'"
             )
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GradientState:
-        """One descent a row."""
-        zeros = jnp.zeros((batch, cube.dim))
+        zeros = jnp.zeros((batch, cube.dim), jnp.float32)
+        starts = jnp.arange(1, batch + 1, dtype=jnp.uint32)
         return GradientState(
             key=key,
-            u=halton_points(1 + jnp.arange(batch), cube.dim, key),
-            momentum=zeros,
+            u=halton_points(starts, cube.dim, key),
+            first=zeros,
             second=zeros,
-            age=jnp.zeros(batch, jnp.int32),
-            least=jnp.full(batch, np.inf),
+            best=jnp.full(batch, jnp.inf, jnp.float32),
+            step=jnp.zeros(batch, jnp.int32),
             stale=jnp.zeros(batch, jnp.int32),
-            started=jnp.int32(batch),
-            rounds=jnp.int32(0),
-            spread=jnp.asarray(0.0),
+            starts=jnp.uint32(batch),
+            round=jnp.int32(0),
+            scale=jnp.float32(1),
         )
 
     def ask(
         self, state: GradientState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], GradientState]:
-        """Where the descents are now."""
         return state.u, state
 
     def temperature(self, state: GradientState) -> Float[Array, ""]:
-        """Of the smooth robustness to differentiate: falls over the rounds of a descent."""
-        part = jnp.mean(state.age) / max(self.steps - 1, 1)
-        relative = self.warm * (self.cold / self.warm) ** jnp.clip(part, 0, 1)
-        return jnp.where(state.spread > 0, relative * state.spread, self.warm)
+        """Geometric from `hot` to `cold`, relative to the spread of the robustness."""
+        progress = jnp.minimum(state.round / self.cooling, 1.0).astype(jnp.float32)
+        return state.scale * self.hot * (self.cold / self.hot) ** progress
 
     def tell(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
-        """Step down, or start anew."""
-        assert evaluated.gradient is not None
+        assert evaluated.gradient is not None, "the gradient search needs gradients"
+        free = np.array(cube.levels) == 0
         usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        gradient = jnp.where(jnp.asarray(cube.continuous), evaluated.gradient, 0.0)
-        rho = jnp.where(usable, evaluated.rho, np.inf)
-        spread = _spread(state, rho, usable)
-        size = jnp.max(jnp.abs(gradient), axis=1, initial=0.0)
-        leads = usable & jnp.isfinite(size) & (size > USELESS * spread)
+        rho = jnp.where(usable, evaluated.rho, jnp.inf)
+        usable &= jnp.all(jnp.isfinite(evaluated.gradient), axis=1)
+        gradient = jnp.where(usable[:, None] & free, evaluated.gradient, 0.0)
+        # Divided by its length, so that squares neither overflow nor vanish.
+        length = jnp.max(jnp.abs(gradient), axis=1, keepdims=True, initial=0.0)
+        gradient = gradient / jnp.where(length > 0, length, 1.0)
 
-        gradient = jnp.where(leads[:, None], gradient, 0.0)
-        momentum = BETA_1 * state.momentum + (1 - BETA_1) * gradient
-        second = BETA_2 * state.second + (1 - BETA_2) * gradient**2
-        step = self._moves(momentum, second, state.age)
-        moved = jnp.clip(state.u - step, 0.0, 1.0)
+        step = state.step + 1
+        first = BETA1 * state.first + (1 - BETA1) * gradient
+        second = BETA2 * state.second + (1 - BETA2) * gradient**2
+        count = step[:, None].astype(jnp.float32)
+        mean = first / (1 - BETA1**count)
+        root = jnp.sqrt(second / (1 - BETA2**count)) + EPSILON
+        rate = jnp.maximum(self.learning_rate * self.decay ** (count - 1), self.least_rate)
+        moved = jnp.clip(evaluated.u - rate * mean / root, 0.0, 1.0)
+        moved = jnp.where(free, moved, evaluated.u)
 
-        better = rho < state.least - 0.01 * spread
+        better = rho < state.best - 0.01 * jnp.abs(state.best)
+        better |= jnp.isinf(state.best) & jnp.isfinite(rho)
         stale = jnp.where(better, 0, state.stale + 1)
-        ended = (
-            ~leads
-            | (rho < 0)
-            | (state.age + 1 >= self.steps)
-            | (stale >= self.patience)
-            | (jnp.max(jnp.abs(moved - state.u), axis=1, initial=0.0) == 0)
-        )
-        return self._restart(
+        stuck = jnp.all(moved == evaluated.u, axis=1)
+        again = ~usable | stuck | (rho < 0) | (stale >= self.patience)
+        return self._restarted(
             state._replace(
                 u=moved,
-                momentum=momentum,
+                first=first,
                 second=second,
-                age=state.age + 1,
-                least=jnp.minimum(state.least, rho),
-                stale=stale,
-                rounds=state.rounds + 1,
-                spread=spread,
+                best=jnp.minimum(state.best, rho),
+                step=step,
+                stale=stale.astype(jnp.int32),
+                round=state.round + 1,
+                scale=jnp.where(state.round == 0, _spread(rho), state.scale),
             ),
             cube,
-            ended,
+            again,
         )
 
-    def _moves(
-        self, momentum: Float[Array, "n d"], second: Float[Array, "n d"], age: Int[Array, " n"]
-    ) -> Float[Array, "n d"]:
-        """Adam's steps with bias correction, shrinking with the age of the descent."""
-        count = (age + 1)[:, None]
-        mean = momentum / (1 - BETA_1**count)
-        scale = jnp.sqrt(second / (1 - BETA_2**count))
-        # Coordinates that hardly matter must not move as far as those that do.
-        scale = jnp.maximum(scale, 0.1 * jnp.max(scale, axis=1, keepdims=True))
-        shrink = (self.last_step / self.step) ** (age / max(self.steps - 1, 1))
-        return self.step * shrink[:, None] * mean / (scale + EPSILON)
-
-    def _restart(self, state: GradientState, cube: Cube, ended: Bool[Array, " n"]) -> GradientState:
-        number = state.started + jnp.cumsum(ended.astype(jnp.int32))
-        fresh = halton_points(number, cube.dim, state.key)
+    def _restarted(
+        self, state: GradientState, cube: Cube, again: Bool[Array, " batch"]
+    ) -> GradientState:
+        """Rows marked `again` take the next starts, in order."""
+        index = state.starts + jnp.cumsum(again).astype(jnp.uint32)
+        fresh = halton_points(index, cube.dim, state.key)
+        row = again[:, None]
         return state._replace(
-            u=jnp.where(ended[:, None], fresh, state.u),
-            momentum=jnp.where(ended[:, None], 0.0, state.momentum),
-            second=jnp.where(ended[:, None], 0.0, state.second),
-            age=jnp.where(ended, 0, state.age),
-            least=jnp.where(ended, np.inf, state.least),
-            stale=jnp.where(ended, 0, state.stale),
-            started=state.started + jnp.sum(ended.astype(jnp.int32)),
+            u=jnp.where(row, fresh, state.u),
+            first=jnp.where(row, 0.0, state.first),
+            second=jnp.where(row, 0.0, state.second),
+            best=jnp.where(again, jnp.inf, state.best),
+            step=jnp.where(again, 0, state.step),
+            stale=jnp.where(again, 0, state.stale),
+            starts=index[-1],
         )
 
 
-def _spread(
-    state: GradientState, rho: Float[Array, " n"], usable: Bool[Array, " n"]
-) -> Float[Array, ""]:
-    """Standard deviation of the robustness at the first starts; later rounds would shrink it."""
-    count = jnp.maximum(jnp.sum(usable), 1)
-    mean = jnp.sum(jnp.where(usable, rho, 0.0)) / count
-    deviation = jnp.sqrt(jnp.sum(jnp.where(usable, (rho - mean) ** 2, 0.0)) / count)
-    deviation = jnp.where(deviation > 0, deviation, jnp.abs(mean))
-    return jnp.where(state.spread > 0, state.spread, deviation)
+def _spread(rho: Float[Array, " n"]) -> Float[Array, ""]:
+    """Standard deviation of the finite entries; 1 where there is none."""
+    finite = jnp.isfinite(rho)
+    count = jnp.maximum(jnp.sum(finite), 1)
+    mean = jnp.sum(jnp.where(finite, rho, 0.0)) / count
+    std = jnp.sqrt(jnp.sum(jnp.where(finite, (rho - mean) ** 2, 0.0)) / count)
+    return jnp.where(std > 0, std, 1.0).astype(jnp.float32)
