@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -5,6 +7,8 @@ import numpy as np
 import pytest
 
 from envs import cartpole as cp
+from verifai_jax.errors import UnknownNameError
+from verifai_jax.rl import Discrete, evaluate, load_policy
 from verifai_jax.trace import Status
 
 KEY = jax.random.key(0)
@@ -112,3 +116,73 @@ def test_finer_step_converges():
     coarse = cp.cartpole(cp.linear())({"theta0": 0.1}, KEY)
     fine = cp.cartpole(cp.linear(), method="rk4", dt=0.005)({"theta0": 0.1}, KEY)
     np.testing.assert_allclose(coarse["theta"], fine["theta"][::4], atol=0.02)
+
+
+def test_shipped_network_balances_cartpole_v1():
+    returns = evaluate(cp.CartPoleTask(), load_policy(cp.POLICY_FILE), seed=5, episodes=300)
+    assert returns.mean() >= 475
+
+
+def test_shipped_network_balances_in_gymnasium_itself():
+    policy = load_policy(cp.POLICY_FILE)
+    act = jax.jit(policy.act)
+    env = gymnasium.make("CartPole-v1")
+    observation, _ = env.reset(seed=11)
+    total, over = 0.0, False
+    while not over:
+        observation, reward, terminated, truncated, _ = env.step(int(act(observation)))
+        total, over = total + float(reward), terminated or truncated
+    assert total >= 475
+
+
+def test_shipped_network_fails_off_nominal():
+    # What the whole toolkit is shown on: a controller of full return that breaks.
+    system = cp.cartpole(cp.neural(), terminate=True)
+    long = system({"x0": 0.9, "theta0": 0.1, "masspole": 0.3, "length": 1.2}, KEY)
+    assert int(long.valid) < 201
+    assert int(system({}, KEY).valid) == 201
+
+
+def test_task_steps_like_gymnasium():
+    env = gymnasium.make("CartPole-v1").unwrapped
+    env.reset(seed=0)
+    task = cp.CartPoleTask()
+    state = cp.State(*(jnp.float32(v) for v in env.state))
+    step = jax.jit(task.step)
+    for action in [1, 0, 0] + [1] * 20:
+        observed, reward, over, _, _ = env.step(action)
+        state, our_reward, terminated = step(KEY, state, action)
+        np.testing.assert_allclose(task.observe(state), observed, atol=1e-5)
+        assert float(our_reward) == reward
+        assert bool(terminated) == over
+        if over:
+            break
+    assert over
+
+
+def test_argmax_pushes_with_full_force_and_has_the_derivative_of_the_mean_force():
+    hard, smooth = cp.neural(), cp.neural(action="expected")
+    blind = cp.neural(straight_through=False)
+    features = {"force_mag": 7.0}
+    rng = np.random.default_rng(0)
+    for point in rng.uniform(-0.2, 0.2, (20, 4)).astype(np.float32):
+        at = [jnp.float32(v) for v in point]
+
+        def force(controller, theta, at=at):
+            return controller(0.0, cp.State(at[0], at[1], theta, at[3]), features)
+
+        assert abs(float(force(hard, at[2]))) == 7.0
+        assert float(force(hard, at[2])) * float(force(smooth, at[2])) > 0
+        expected = jax.grad(lambda t, f=force: f(smooth, t))(at[2])
+        np.testing.assert_allclose(
+            jax.grad(lambda t, f=force: f(hard, t))(at[2]), expected, rtol=1e-4, atol=1e-6
+        )
+        assert float(jax.grad(lambda t, f=force: f(blind, t))(at[2])) == 0
+
+
+def test_neural_refuses_what_it_cannot_use():
+    with pytest.raises(UnknownNameError, match="unknown action 'argmin'; did you mean 'argmax'"):
+        cp.neural(action="argmin")
+    policy = load_policy(cp.POLICY_FILE)
+    with pytest.raises(ValueError, match="has 2 discrete actions; got 4 and Discrete"):
+        cp.neural(replace(policy, action=Discrete(3)))

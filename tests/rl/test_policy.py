@@ -1,0 +1,105 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.rl import (
+    Continuous,
+    Discrete,
+    Policy,
+    PolicyFileError,
+    load_policy,
+    policy_notes,
+    save_policy,
+)
+from verifai_jax.rl.policy import new_layers
+
+LAYERS = (
+    (jnp.array([[1.0, -1.0], [0.5, 2.0]]), jnp.array([0.1, -0.2])),
+    (jnp.array([[1.0, 0.0], [0.0, 3.0]]), jnp.array([0.0, 1.0])),
+)
+SEEN = jnp.array([0.3, -0.4])
+
+
+def by_hand(x):
+    (w0, b0), (w1, b1) = [(np.asarray(w), np.asarray(b)) for w, b in LAYERS]
+    return np.tanh(np.asarray(x) @ w0 + b0) @ w1 + b1
+
+
+def test_network_by_hand():
+    policy = Policy(LAYERS, None, None, None, Discrete(2))
+    np.testing.assert_allclose(policy(SEEN), by_hand(SEEN), rtol=1e-6)
+    assert int(policy.act(SEEN)) == int(np.argmax(by_hand(SEEN)))
+
+
+def test_observations_are_normalised():
+    policy = Policy(LAYERS, jnp.array([1.0, 2.0]), jnp.array([2.0, 4.0]), None, Discrete(2))
+    np.testing.assert_allclose(policy(SEEN), by_hand([-0.35, -0.6]), rtol=1e-6)
+
+
+def test_continuous_actions_stay_in_their_range():
+    policy = Policy(LAYERS, None, None, jnp.zeros(2), Continuous(-1.0, 3.0, size=2))
+    expected = np.clip(1.0 + 2.0 * by_hand(SEEN), -1.0, 3.0)
+    np.testing.assert_allclose(policy.act(SEEN), expected, rtol=1e-6)
+    assert expected.min() == -1.0
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        Policy(LAYERS, None, None, None, Discrete(2)),
+        Policy(LAYERS, jnp.ones(2), jnp.ones(2) * 2, jnp.zeros(2), Continuous(-1.0, 3.0, size=2)),
+    ],
+)
+def test_file_gives_back_what_went_in(tmp_path, policy):
+    path = tmp_path / "policy.npz"
+    save_policy(policy, path, seed=3, task="hold")
+    loaded = load_policy(path)
+    assert loaded.action == policy.action
+    assert jax.tree.structure(loaded) == jax.tree.structure(policy)
+    for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(policy), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert policy_notes(path) == {"seed": 3, "task": "hold"}
+
+
+def test_files_of_another_kind_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_policy(tmp_path / "none.npz")
+    other = tmp_path / "other.npz"
+    np.savez(other, weight0=np.zeros((2, 2)))
+    with pytest.raises(PolicyFileError, match=r"other\.npz holds no policy"):
+        load_policy(other)
+    text = tmp_path / "text.npz"
+    text.write_text("hello")
+    with pytest.raises(PolicyFileError, match=r"text\.npz holds no policy"):
+        load_policy(text)
+    code = tmp_path / "code.npz"
+    np.savez(code, about=np.array({"action": print}, dtype=object))
+    with pytest.raises(PolicyFileError, match=r"code\.npz holds no policy"):
+        load_policy(code)
+    torn = tmp_path / "torn.npz"
+    layers = (LAYERS[0], (jnp.zeros((3, 2)), jnp.zeros(2)))
+    save_policy(Policy(layers, None, None, None, Discrete(2)), torn)
+    with pytest.raises(PolicyFileError, match=r"layers of shapes \[\(2, 2\), \(3, 2\)\]"):
+        load_policy(torn)
+
+
+def test_new_layers_are_orthogonal_with_their_gains():
+    layers = new_layers(jax.random.key(0), (4, 16, 2), gain=0.01)
+    first, last = np.asarray(layers[0][0]), np.asarray(layers[1][0])
+    np.testing.assert_allclose(first @ first.T, 2 * np.eye(4), atol=1e-5)
+    np.testing.assert_allclose(last.T @ last, 1e-4 * np.eye(2), atol=1e-7)
+    assert all(np.all(np.asarray(bias) == 0) for _, bias in layers)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Discrete(1), r"at least 2 choices; got \(n=1\)"),
+        (lambda: Continuous(1.0, 1.0), r"needs low < high.*got \(low=1.0, high=1.0, size=1\)"),
+        (lambda: Continuous(0.0, 1.0, size=0), r"size=0"),
+    ],
+)
+def test_actions_that_make_no_sense_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
