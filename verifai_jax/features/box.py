@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.features.domain import (
     MOST_LEVELS,
+    MOST_REAL,
     Domain,
     as_number,
     as_numbers,
@@ -37,7 +38,10 @@ class Box(Domain):
 
     def __post_init__(self) -> None:
         shown = f"got (low={self.low!r}, high={self.high!r})"
-        vector = [isinstance(end, Sequence | np.ndarray) for end in (self.low, self.high)]
+        vector = [
+            isinstance(end, Sequence | np.ndarray) and not isinstance(end, str)
+            for end in (self.low, self.high)
+        ]
         if vector[0] != vector[1]:
             raise ValueError(f"both ends of a Box are numbers, or both are sequences; {shown}")
         if not vector[0]:
@@ -61,7 +65,7 @@ class Box(Domain):
                 )
             if low > high:
                 raise ValueError(f"low must be below high in a Box; {shown}")
-            if max(high - low, abs(low), abs(high)) > np.finfo(np.float32).max:
+            if max(high - low, abs(low), abs(high)) > MOST_REAL:
                 raise ValueError(f"a Box must fit into float32; {shown}")
 
     @property
@@ -187,7 +191,7 @@ class DiscreteBox(Domain):
 
     def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
         number = as_numbers(row[name], name).item()
-        if number != math.floor(number):
+        if not math.isfinite(number) or number != int(number):
             raise ValueError(f"{name} must be an integer; got {number!r}")
         return jnp.asarray(int(number), jnp.int32)
 

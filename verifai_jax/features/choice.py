@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.features.domain import (
     MOST_LEVELS,
+    MOST_REAL,
     Domain,
     as_numbers,
     as_real,
@@ -50,7 +51,7 @@ class Categorical(Domain):
         for choice in self.choices:
             keys: set[Any] = {str(choice)}  # All that the table shows of most objects.
             if isinstance(choice, int | float):
-                most = 2**31 - 1 if isinstance(choice, int) else np.finfo(np.float32).max
+                most = 2**31 - 1 if isinstance(choice, int) else MOST_REAL
                 if not abs(choice) <= most:
                     raise ValueError(
                         "choices that are numbers must be finite, integers must fit into 32 bits; "

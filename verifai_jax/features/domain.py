@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 # Cells narrower than this could not be told apart in a float32 coordinate.
 MOST_LEVELS = 2**20
+MOST_REAL = float(np.finfo(np.float32).max)
 
 
 class Domain(abc.ABC):

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.errors import unknown_name
+from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.domain import Domain, as_real
 
@@ -76,7 +77,7 @@ class FeatureSpace:
 
         Pure JAX on what `unflatten` gives; takes plain Python values too. Nothing is checked.
         """
-        return self.root.to_unit(self.root.coerce(features))
+        return self.root.to_unit(self.root.coerce(self._completed(features)))
 
     def coerce(self, features: Mapping[str, Any]) -> dict[str, Any]:
         """Features that a person wrote (numbers, lists, choices), checked, as a system sees them.
@@ -84,15 +85,15 @@ class FeatureSpace:
         **Raises:** as `check`.
         """
         self.check(features)
-        return self.root.coerce(features)
+        return self.root.coerce(self._completed(features))
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features.
+        """Check concrete features, of which constant ones may be left out.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain.
         """
-        self.root.check(features, "")
+        self.root.check(self._completed(features), "")
 
     def rows(self, features: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
@@ -120,6 +121,12 @@ class FeatureSpace:
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
         )
+
+    def _completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
+        if not isinstance(features, Mapping):
+            return features
+        constants = {n: d.value for n, d in self.root.fields if isinstance(d, Constant)}
+        return {**constants, **features}
 
     def __getitem__(self, name: str) -> Domain:
         return self.root[name]

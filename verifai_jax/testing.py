@@ -1,0 +1,186 @@
+"""Contract suites: run them on domains and searches of your own.
+
+    check_domain(MyDomain(...))                          # round trips, shapes, table columns
+    check_search(MySearch(...), Cube((0, 0, 4)))         # init / ask / tell
+
+Each raises `AssertionError` that says which law is broken.
+"""
+
+import operator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.features import Domain, FeatureSpace
+from verifai_jax.search import Cube, Evaluated, Search
+
+
+def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
+    """Check the laws of a domain on `samples` random points and on the corners of its cube.
+
+    **Raises:** `AssertionError` naming the broken law.
+    """
+    size, levels = domain.size, np.array(domain.levels, int)
+    assert size == len(levels), "size must be the number of levels"
+    assert np.all(levels >= 0), f"levels must not be negative; got {levels.tolist()}"
+    u = jax.random.uniform(jax.random.key(seed), (samples, size), jnp.float32)
+    u = jnp.concatenate([u, jnp.zeros((1, size)), jnp.ones((1, size))])
+
+    values = jax.jit(jax.vmap(domain.from_unit))(u)
+    one_by_one = [domain.from_unit(row) for row in u]
+    _same(
+        values,
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *one_by_one),
+        "from_unit must give the same under jit and vmap",
+    )
+    back = jax.jit(jax.vmap(domain.to_unit))(values)
+    assert back.shape == u.shape, f"to_unit must give shape [{size}]; got {back.shape[1:]}"
+    assert bool(jnp.all((back >= 0) & (back <= 1))), "to_unit must stay in [0, 1]"
+    again = jax.vmap(domain.from_unit)(back)
+    _same(values, again, "from_unit(to_unit(value)) must be the value")
+    discrete = levels > 0
+    cells = np.clip(np.floor(np.asarray(u) * levels), 0, np.maximum(levels - 1, 0))
+    centres = (cells + 0.5) / np.maximum(levels, 1)
+    np.testing.assert_allclose(
+        np.asarray(back)[:, discrete],
+        centres[:, discrete],
+        atol=1e-6,
+        err_msg="to_unit(from_unit(u)) must be the middle of the cell of u",
+    )
+
+    space = FeatureSpace({"value": domain})
+    columns = domain.columns("value")
+    rows = domain.to_columns(jax.tree.map(np.asarray, values), "value")
+    assert tuple(rows) == columns, f"to_columns must give {columns}; got {tuple(rows)}"
+    for name, column in rows.items():
+        assert column.shape == (len(u),), f"column {name} must have shape [{len(u)}]"
+    for i in range(8):
+        value = jax.tree.map(operator.itemgetter(i), values)
+        row = {name: column[i] for name, column in rows.items()}
+        stored = domain.from_columns(row, "value")
+        _same(
+            value, stored, "from_columns must give back exactly what to_columns stored", exact=True
+        )
+        domain.check(value, "value")
+        _same(value, domain.coerce(value), "coerce must keep what from_unit gives", exact=True)
+        _same(space.unflatten(u[i])["value"], value, "a space must hold the domain's value")
+
+
+def check_search(
+    search: Search, cube: Cube, *, batch: int = 16, rounds: int = 4, seed: int = 0
+) -> None:
+    """Check the contract of a search on one cube, on a quadratic robustness with failures.
+
+    **Raises:** `AssertionError` naming the broken law.
+    """
+    search.check(cube)
+    hash(search)
+    init = jax.jit(search.init, static_argnums=(1, 2))
+    ask = jax.jit(search.ask, static_argnums=(1, 2))
+    tell = jax.jit(search.tell, static_argnums=1)
+    key = jax.random.key(seed)
+    odd = np.arange(batch) % 3 == 1
+
+    def run(state: Any, first: int, last: int, spoil: float | None = None) -> tuple[Any, list]:
+        seen = []
+        for _ in range(first, last):
+            u, asked = ask(state, cube, batch)
+            assert u.shape == (batch, cube.dim), (
+                f"ask must give shape {[batch, cube.dim]}; got {list(u.shape)}"
+            )
+            assert u.dtype == jnp.float32, f"ask must give float32; got {u.dtype}"
+            assert bool(jnp.all((u >= 0) & (u <= 1))), "points must stay in [0, 1]"
+            if search.wants_gradient:
+                tau = search.temperature(asked)
+                assert tau.shape == (), f"temperature must be a scalar; got shape {tau.shape}"
+                assert bool(tau > 0), f"temperature must be positive; got {tau}"
+            told = _evaluate(u, search.wants_gradient)
+            if spoil is not None:
+                told = _spoiled(told, odd, spoil)
+            state = tell(asked, cube, told)
+            _same_type(asked, state)
+            seen.append(np.asarray(u))
+        return state, seen
+
+    state = init(key, cube, batch)
+    middle, before = run(state, 0, rounds // 2)
+    _, after = run(middle, rounds // 2, rounds)
+    whole = before + after
+
+    _, again = run(init(key, cube, batch), 0, rounds)
+    _same(whole, again, "the same key must give the same points", exact=True)
+    _, resumed = run(_saved(middle), rounds // 2, rounds)
+    _same(after, resumed, "a resumed state must go on as the saved one", exact=True)
+
+    spoiled = [run(state, 0, rounds, value)[1] for value in (-1e9, np.nan)]
+    _same(*spoiled, "rows that are not counted must not influence the search", exact=True)
+    for points in spoiled[0]:
+        assert np.all(np.isfinite(points)), "points must be finite"
+
+
+def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) -> None:
+    """Check that a passive search gives the same points whatever the batch size is.
+
+    **Raises:** `AssertionError` if it does not.
+    """
+    seen = []
+    for batch in (points, points // 3, 5):
+        state, parts = search.init(jax.random.key(1), cube, batch), []
+        while sum(map(len, parts)) < points:
+            u, state = search.ask(state, cube, batch)
+            state = search.tell(state, cube, _evaluate(u, search.wants_gradient))
+            parts.append(np.asarray(u))
+        seen.append(np.concatenate(parts)[:points])
+    for other in seen[1:]:
+        _same(seen[0], other, "points must not depend on the batch size", exact=True)
+
+
+def _evaluate(u: Any, gradient: bool) -> Evaluated:
+    """A bowl with its bottom, and failures, off the middle."""
+    offset = u - 0.3
+    rho = jnp.sum(offset**2, axis=1) - 0.01
+    return Evaluated(u, rho, jnp.ones(len(u), bool), 2 * offset if gradient else None)
+
+
+def _spoiled(told: Evaluated, rows: Any, value: float) -> Evaluated:
+    gradient = told.gradient
+    if gradient is not None:
+        gradient = jnp.where(rows[:, None], value, gradient)
+    return told._replace(
+        rho=jnp.where(rows, value, told.rho), counted=jnp.asarray(~rows), gradient=gradient
+    )
+
+
+def _saved(state: Any) -> Any:
+    """The state after a detour through plain NumPy arrays."""
+
+    def detour(leaf: Any) -> Any:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            data = np.array(jax.random.key_data(leaf))
+            return jax.random.wrap_key_data(jnp.asarray(data), impl=jax.random.key_impl(leaf))
+        return jnp.asarray(np.array(leaf))
+
+    return jax.tree.map(detour, state)
+
+
+def _same_type(before: Any, after: Any) -> None:
+    assert jax.tree.structure(before) == jax.tree.structure(after), (
+        "tell must keep the state's form"
+    )
+    for one, two in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        assert (one.shape, one.dtype, one.weak_type) == (two.shape, two.dtype, two.weak_type), (
+            f"tell must keep the types of the state; {one.aval} became {two.aval}"
+        )
+
+
+def _same(one: Any, two: Any, law: str, exact: bool = False) -> None:
+    assert jax.tree.structure(one) == jax.tree.structure(two), f"{law}; the forms differ"
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
+        assert a.dtype == b.dtype, f"{law}; dtypes are {a.dtype} and {b.dtype}"
+        # Rounding happens at the scale of the domain, which its values show.
+        scale = 0.0 if exact else 1e-6 * float(np.max(np.abs(a), initial=0.0))
+        close = np.array_equal(a, b) if a.dtype.kind not in "f" else np.allclose(a, b, 0, scale)
+        assert close, f"{law}; got {a} and {b}"
