@@ -53,16 +53,13 @@ def test_windows(form, reverse, tau, n, lanes):
     expected = np.stack([total(lanes[s], tau) for s in slices(n, reverse)])
     weights = np.random.default_rng(n).normal(size=lanes.shape)
     value, (gradient,) = value_and_pullback(
-        lambda x: windows.windowed(x, n, tau, reverse, form), weights, lanes
+        lambda x: windows.windowed(x, n, 1, tau, reverse, form), weights, lanes
     )
     np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)
     pulled = np.zeros_like(lanes)
     for i, s in enumerate(slices(n, reverse)):
-        if tau is None:
-            share = lanes[s] == expected[i]
-        else:
-            share = np.exp((lanes[s] - expected[i]) / tau)
-        pulled[s] += weights[i] * share
+        above = lanes[s] - expected[i]
+        pulled[s] += weights[i] * (above == 0 if tau is None else np.exp(above / tau))
     np.testing.assert_allclose(gradient, pulled, rtol=1e-9, atol=1e-12)
 
 
@@ -117,7 +114,7 @@ def test_until_at_the_root_alone(tau, lanes):
 def test_a_tie_gives_its_gradient_away_once(reverse, tau):
     flat = jnp.zeros((LENGTH, 1))
     for function in (
-        lambda x: windows.windowed(x, 4, tau, reverse, sequential),
+        lambda x: windows.windowed(x, 4, 1, tau, reverse, sequential),
         lambda x: windows.until(x, x, tau, reverse, sequential),
     ):
         gradient = jax.grad(lambda x, function=function: function(x).sum())(flat)
@@ -128,7 +125,7 @@ def test_a_tie_gives_its_gradient_away_once(reverse, tau):
 @TAUS
 def test_not_a_number_goes_through(form, tau, lanes):
     lanes[5, 0] = np.nan
-    value = windows.windowed(jnp.asarray(lanes), 4, tau, True, form)
+    value = windows.windowed(jnp.asarray(lanes), 4, 1, tau, True, form)
     np.testing.assert_array_equal(np.isnan(value[:, 0]), np.isin(np.arange(LENGTH), range(2, 6)))
     assert not np.isnan(value[:, 1]).any()
     value = windows.until(jnp.asarray(lanes), jnp.asarray(lanes), tau, True, form)
@@ -146,7 +143,7 @@ def test_single_precision_stays_finite(form, reverse, scale, tau):
     ones = np.ones_like(x)
     tau32 = jnp.float32(tau)
     value, (gradient,) = value_and_pullback(
-        lambda x: windows.windowed(x, 4, tau32, reverse, form), ones, x
+        lambda x: windows.windowed(x, 4, 1, tau32, reverse, form), ones, x
     )
     assert value.dtype == jnp.float32
     assert np.isfinite(value).all()

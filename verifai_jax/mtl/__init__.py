@@ -1,7 +1,10 @@
 """Metric temporal logic: formulas, their text, their robustness on traces."""
 
 from verifai_jax.mtl.certificate import Certificate as Certificate
+from verifai_jax.mtl.evaluate import End as End
 from verifai_jax.mtl.evaluate import IntervalError as IntervalError
+from verifai_jax.mtl.explain import Explanation as Explanation
+from verifai_jax.mtl.explain import explain as explain
 from verifai_jax.mtl.formula import FALSE as FALSE
 from verifai_jax.mtl.formula import TRUE as TRUE
 from verifai_jax.mtl.formula import Expression as Expression
@@ -17,6 +20,7 @@ from verifai_jax.mtl.formula import since as since
 from verifai_jax.mtl.formula import until as until
 from verifai_jax.mtl.parse import FormulaSyntaxError as FormulaSyntaxError
 from verifai_jax.mtl.parse import parse as parse
+from verifai_jax.mtl.picture import draw as draw
 from verifai_jax.mtl.printing import latex as latex
 from verifai_jax.mtl.recording import read as read
 from verifai_jax.mtl.recording import resample as resample

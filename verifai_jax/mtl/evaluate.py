@@ -56,6 +56,8 @@ class Evaluator:
     valid: Any = None
     open_right: bool = False
     lanes: int = 0
+    #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
+    nudges: Mapping[Formula, Float[Array, "time *lanes"]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
 
     @property
@@ -111,22 +113,22 @@ class Evaluator:
             case ast.Not(operand):
                 return -self.value(operand, first, last)
             case ast.And(parts):
-                return -self._greatest([-self.value(p, first, last) for p in parts])
+                return self._join([self.value(p, first, last) for p in parts], -1)
             case ast.Or(parts):
-                return self._greatest([self.value(p, first, last) for p in parts])
+                return self._join([self.value(p, first, last) for p in parts], 1)
             case ast.Eventually(operand, interval):
                 return self._future(operand, 1, *self.span(interval), first, last)
             case ast.Always(operand, interval):
-                return -self._future(operand, -1, *self.span(interval), first, last)
+                return self._future(operand, -1, *self.span(interval), first, last)
             case ast.Next(operand):
                 return self._next(operand, first, last)
             case ast.Once(operand, interval):
                 return self._past(operand, 1, *self.span(interval), first, last)
             case ast.Historically(operand, interval):
-                return -self._past(operand, -1, *self.span(interval), first, last)
+                return self._past(operand, -1, *self.span(interval), first, last)
             case ast.Prev(operand, weak):
                 sign = -1 if weak else 1
-                return sign * self._past(operand, sign, 1, 1, first, last)
+                return self._past(operand, sign, 1, 1, first, last)
             case ast.Until(left, right, interval):
                 return self._until(left, right, *self.span(interval), first, last)
             case ast.Since(left, right, interval):
@@ -145,12 +147,14 @@ class Evaluator:
         start, stop = min(first, self._last), min(last, self._last)
         match f:
             case ast.Predicate(comparison, left, right):
-                a, b = (self._expression(e, start, stop) for e in (left, right))
+                a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = self._compared(comparison, a, b)
             case ast.Atom(e):
-                value = self._compared(">", self._expression(e, start, stop), 0.0)
+                value = self._compared(">", self.expression(e, start, stop), 0.0)
         if value.ndim == 0:  # A predicate over constants only.
             value = jnp.broadcast_to(value, (stop - start + 1,) + (1,) * self.lanes)
+        if f in self.nudges:
+            value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)
 
     def _compared(self, comparison: str, a: Any, b: Any) -> Array:
@@ -169,7 +173,8 @@ class Evaluator:
         verdict = jnp.where(holds, 1.0, -1.0).astype(margin.dtype)
         return jnp.where(jnp.isnan(margin), margin, verdict)
 
-    def _expression(self, e: Expression, start: int, stop: int) -> Any:
+    def expression(self, e: Expression, start: int, stop: int) -> Any:
+        """The expression's values at the samples `start` to `stop` (a float, if it is constant)."""
         match e:
             case ast.Number(value):
                 return value
@@ -192,7 +197,7 @@ class Evaluator:
                 safe = jnp.where(square == 0, 1.0, square)
                 return jnp.where(square == 0, square, jnp.sqrt(safe))
             case ast.Arithmetic(name, arguments):
-                return _apply(name, [self._expression(a, start, stop) for a in arguments])
+                return _apply(name, [self.expression(a, start, stop) for a in arguments])
         raise TypeError(f"not an expression: {e!r}")
 
     def _vector(self, name: str, text: str, index: int = 0) -> Array:
@@ -207,63 +212,65 @@ class Evaluator:
 
     # Joining values
 
-    def _greatest(self, values: list[Array]) -> Array:
-        return windows.greatest(values, self.tau if self.kind == "smooth" else None)
+    def _join(self, values: list[Array], sign: int) -> Array:
+        return windows.join(values, sign, self.tau if self.kind == "smooth" else None)
 
     @property
     def _nothing(self) -> float:
         """The value of a maximum over no sample."""
         return {"boolean": -1.0, "smooth": -windows.NEVER}.get(self.kind, -math.inf)
 
-    def _extended(self, x: Array, n: int) -> Array:
+    def _extended(self, x: Array, n: int, sign: int = 1) -> Array:
         """`x` with `n` instants: the last one repeated under `hold`, nothing otherwise."""
         if x.shape[0] >= n:
             return x
         shape = (n - x.shape[0], *x.shape[1:])
-        tail = jnp.broadcast_to(x[-1:], shape) if self._hold else jnp.full(shape, self._nothing)
+        tail = (
+            jnp.broadcast_to(x[-1:], shape) if self._hold else jnp.full(shape, sign * self._nothing)
+        )
         return jnp.concatenate([x, tail.astype(x.dtype)])
 
-    def _cut(self, x: Array, first: int) -> Array:
-        """Samples that do not count, replaced by nothing (for a maximum)."""
+    def _cut(self, x: Array, first: int, sign: int = 1) -> Array:
+        """Samples that do not count, replaced by nothing."""
         if self._hold or self.valid is None:
             return x
-        return jnp.where(self._index(first, x) < self.valid, x, self._nothing)
+        return jnp.where(self._index(first, x) < self.valid, x, sign * self._nothing)
 
-    # Temporal operators, as maxima of `sign * operand`
+    # Temporal operators: maxima for sign 1, minima for sign -1
 
     def _future(self, f: Formula, sign: int, a: int, b: float, first: int, last: int) -> Array:
         end = self.settles(f)
         begin = first + a
         if begin > end and not self._hold:
-            return self._blank(f, last - first + 1)
+            return self._blank(f, last - first + 1, sign)
         begin = min(begin, end)
         # Instants beyond this one see nothing but the settled value.
         count = max(1, min(last, end - a) - first + 1)
         stop = end if math.isinf(b) else min(first + count - 1 + int(b), end)
-        x = self._cut(sign * self.value(f, begin, stop), begin)
+        x = self._cut(self.value(f, begin, stop), begin, sign)
         if count == 1:
-            value = windows.maximum(x, self._tau(x))[None]
+            value = windows.extreme(x, sign, self._tau)[None]
         else:
             width = x.shape[0] if math.isinf(b) else int(b) - a + 1
-            value = self._window(x, width, reverse=True)[:count]
-        return self._extended(value, last - first + 1)
+            value = windows.windowed(x, width, sign, self._tau, reverse=True)[:count]
+        return self._extended(value, last - first + 1, sign)
 
     def _past(self, f: Formula, sign: int, a: int, b: float, first: int, last: int) -> Array:
         n = last - first + 1
         if last < a:
-            return self._blank(f, n)
+            return self._blank(f, n, sign)
         begin = 0 if math.isinf(b) else max(0, first - int(b))
-        x = sign * self.value(f, begin, last - a)
+        x = self.value(f, begin, last - a)
         count = last - max(first, a) + 1
         if count == 1:
             start = 0 if math.isinf(b) else max(0, last - int(b)) - begin
-            value = windows.maximum(x[start:], self._tau(x))[None]
+            value = windows.extreme(x[start:], sign, self._tau)[None]
         else:
             width = x.shape[0] if math.isinf(b) else int(b) - a + 1
-            value = self._window(x, width, reverse=False)[-count:]
+            value = windows.windowed(x, width, sign, self._tau, reverse=False)[-count:]
         if count == n:
             return value
-        blank = jnp.full((n - count, *value.shape[1:]), self._nothing, value.dtype)
+        blank = jnp.full((n - count, *value.shape[1:]), sign * self._nothing, value.dtype)
         return jnp.concatenate([blank, value])
 
     def _next(self, f: Formula, first: int, last: int) -> Array:
@@ -282,17 +289,13 @@ class Evaluator:
     def _index(self, first: int, x: Array) -> Array:
         return (first + jnp.arange(x.shape[0])).reshape((-1,) + (1,) * (x.ndim - 1))
 
-    def _tau(self, x: Array) -> Any:
+    @property
+    def _tau(self) -> Any:
         return self.tau if self.kind == "smooth" else None
 
-    def _window(self, x: Array, width: int, reverse: bool) -> Array:
-        if width <= 1:
-            return x
-        return windows.windowed(x, width, self._tau(x), reverse)
-
-    def _blank(self, f: Formula, n: int) -> Array:
+    def _blank(self, f: Formula, n: int, sign: int = 1) -> Array:
         like = self.value(f, 0, 0)
-        return jnp.full((n, *like.shape[1:]), self._nothing, like.dtype)
+        return jnp.full((n, *like.shape[1:]), sign * self._nothing, like.dtype)
 
     def _until(
         self, f: Formula, g: Formula, a: int, b: float, first: int, last: int
@@ -310,17 +313,17 @@ class Evaluator:
         right = self._cut(self.value(g, begin, end), begin)
         left, right = jnp.broadcast_arrays(left, right)
         if count == 1:
-            value = windows.until_first(left, right, self._tau(right))[None]
+            value = windows.until_first(left, right, self._tau)[None]
         else:
-            value = windows.until(left, right, self._tau(right))[:count]
+            value = windows.until(left, right, self._tau)[:count]
         terms = []
         if math.isfinite(b):
             terms.append(self._extended(self._future(g, 1, a, b, first, first + count - 1), count))
         value = self._extended(value, n)
         terms = [self._extended(term, n) for term in terms]
         if a > 0:
-            terms.append(-self._future(f, -1, 0, a - 1, first, last))
-        return -self._greatest([-value, *(-term for term in terms)]) if terms else value
+            terms.append(self._future(f, -1, 0, a - 1, first, last))
+        return self._join([value, *terms], -1) if terms else value
 
     def _since(
         self, f: Formula, g: Formula, a: int, b: float, first: int, last: int
@@ -331,14 +334,14 @@ class Evaluator:
         left, right = (self.value(h, 0, last - a) for h in (f, g))
         left, right = jnp.broadcast_arrays(left, right)
         count = last - max(first, a) + 1
-        value = windows.until(left, right, self._tau(right), reverse=False)[-count:]
+        value = windows.until(left, right, self._tau, reverse=False)[-count:]
         terms = [value]
         if math.isfinite(b):
             terms.append(self._past(g, 1, a, b, max(first, a), last))
         if a > 0:
-            terms.append(-self._past(f, -1, 0, a - 1, max(first, a), last))
+            terms.append(self._past(f, -1, 0, a - 1, max(first, a), last))
         if len(terms) > 1:
-            value = -self._greatest([-term for term in terms])
+            value = self._join(terms, -1)
         if count == n:
             return value
         blank = jnp.full((n - count, *value.shape[1:]), self._nothing, value.dtype)

@@ -22,22 +22,21 @@ def _shift(x: Series, by: int, reverse: bool, fill: float) -> Series:
     return jnp.concatenate([x[by:], pad] if reverse else [pad, x[: x.shape[0] - by]])
 
 
-def windowed(n: int, reverse: bool, x: Series) -> Series:
-    """Maximum of the `n` samples from each instant on (up to it, if not `reverse`)."""
-    size = 1
+def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
+    """Maximum (minimum, for `sign` -1) of the `n` samples from each instant on (up to it)."""
+    x, size = sign * x, 1
     while size < n:
         by = min(size, n - size)  # Windows may overlap: a maximum counts nothing twice.
         x = jnp.maximum(x, _shift(x, by, reverse, -jnp.inf))
         size += by
-    return x
+    return sign * x
 
 
-def windowed_smooth(n: int, reverse: bool, x: Series, tau: Array) -> Series:
-    """`tau log sum exp(x / tau)` of the `n` samples from each instant on (up to it)."""
-    # The greatest value of each window is known first, so that one sum of scaled terms would do,
-    # if the scale did not change along time: join (m, s) pairs instead, by the binary digits of n.
+def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> Series:
+    """The same with `tau log sum exp(x / tau)` for the maximum."""
+    # An overlap would count samples twice, so windows are joined by the binary digits of n.
     never = 1e30
-    pair = (x, jnp.ones_like(x))
+    pair = (sign * x, jnp.ones_like(x))
     total, offset, size, rest = None, 0, 1, n
     while True:
         if rest & 1:
@@ -51,7 +50,7 @@ def windowed_smooth(n: int, reverse: bool, x: Series, tau: Array) -> Series:
         pair = _join(pair, later, tau)
         size *= 2
     m, s = total if total is not None else pair
-    return m + tau * jnp.log(s)
+    return sign * (m + tau * jnp.log(s))
 
 
 def _join(a: Any, b: Any, tau: Array) -> tuple[Series, Series]:

@@ -2,7 +2,9 @@
 
 The windows follow van Herk and Gil-Werman: cut time into blocks of the window's length; then every
 window is the end of one block and the beginning of the next, so one scan each way suffices.
-Smooth maxima are carried as pairs `(m, s)`, the greatest value and the sum of `exp((x - m) / tau)`.
+A minimum is a maximum of negated samples; the `sign` (-1 for it) is applied within the scans,
+because negated copies cost memory. Smooth maxima are carried as pairs `(m, s)`: the greatest value
+and the sum of `exp((x - m) / tau)`.
 
 Reverse-mode rules are written by hand: differentiating through the scans costs ten times the value.
 Each is again one or two scans.
@@ -51,26 +53,27 @@ def _row(x: Series, k: Array) -> Array:
 # Hard windows
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def windowed(n: int, reverse: bool, x: Series) -> Series:
-    """Maximum of the `n` samples from each instant on (up to it, if not `reverse`)."""
-    return _windowed(n, reverse, x, keep=False)[0]
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
+    """Maximum (minimum, for `sign` -1) of the `n` samples from each instant on (up to it)."""
+    return _windowed(n, reverse, sign, x, keep=False)[0]
 
 
-def _windowed(n: int, reverse: bool, x: Series, keep: bool) -> tuple[Series, Any]:
+def _windowed(n: int, reverse: bool, sign: int, x: Series, keep: bool) -> tuple[Series, Any]:
     length = x.shape[0]
     lowest = jnp.full(x.shape[1:], -jnp.inf, x.dtype)
     if n >= length:
 
         def running(m: Array, row: Array) -> tuple[Array, Array]:
-            m = jnp.maximum(m, row)
-            return m, m
+            m = jnp.maximum(m, sign * row)
+            return m, sign * m
 
         y = lax.scan(running, lowest, x, reverse=reverse)[1]
-        return y, (x, y, y, None)
+        return y, (x, y, None, None)
 
     def begin(m: Array, row: Any) -> tuple[Array, Array]:
         value, start = row
+        value = sign * value
         m = jnp.where(start, value, jnp.maximum(m, value))
         return m, m
 
@@ -78,8 +81,9 @@ def _windowed(n: int, reverse: bool, x: Series, keep: bool) -> tuple[Series, Any
 
     def finish(m: Array, row: Any) -> tuple[Array, Any]:
         value, end, (far, inside) = row
+        value = sign * value
         m = jnp.where(end, value, jnp.maximum(m, value))
-        y = jnp.where(inside, jnp.maximum(m, _row(ahead, far)), m)
+        y = sign * jnp.where(inside, jnp.maximum(m, _row(ahead, far)), m)
         return m, (y, m) if keep else y
 
     rows = (x, _ends(n, length, reverse), _far(n - 1, length, reverse))
@@ -87,11 +91,13 @@ def _windowed(n: int, reverse: bool, x: Series, keep: bool) -> tuple[Series, Any
     return (out[0], (x, *out, ahead)) if keep else (out, None)
 
 
-def _windowed_forward(n: int, reverse: bool, x: Series) -> tuple[Series, Any]:
-    return _windowed(n, reverse, x, keep=True)
+def _windowed_forward(n: int, reverse: bool, sign: int, x: Series) -> tuple[Series, Any]:
+    return _windowed(n, reverse, sign, x, keep=True)
 
 
-def _windowed_backward(n: int, reverse: bool, residuals: Any, g: Series) -> tuple[Series]:
+def _windowed_backward(
+    n: int, reverse: bool, sign: int, residuals: Any, g: Series
+) -> tuple[Series]:
     # Towards the greatest sample: what reaches a running maximum goes to its newest sample where
     # that one is the greatest, and on to the maximum before it where not.
     x, y, near, ahead = residuals
@@ -100,8 +106,9 @@ def _windowed_backward(n: int, reverse: bool, residuals: Any, g: Series) -> tupl
 
     def back_near(carry: Array, row: Any) -> tuple[Array, Array]:
         g, value, m, y, start = row
-        carry = jnp.where(start, 0.0, carry) + jnp.where(m >= y, g, 0.0)
-        here = value >= m
+        m = sign * y if m is None else m
+        carry = jnp.where(start, 0.0, carry) + jnp.where(m >= sign * y, g, 0.0)
+        here = sign * value >= m
         return jnp.where(here, 0.0, carry), jnp.where(here, carry, 0.0)
 
     starts = np.zeros(length, bool) if ahead is None else _starts(n, length, reverse)
@@ -112,10 +119,10 @@ def _windowed_backward(n: int, reverse: bool, residuals: Any, g: Series) -> tupl
 
     def back_ahead(carry: Array, row: Any) -> tuple[Array, Array]:
         value, m, end, other, (far, inside) = row
-        taken = _row(near, far) >= _row(y, far)
+        taken = _row(near, far) >= sign * _row(y, far)
         carry = jnp.where(end, 0.0, carry)
         carry = carry + jnp.where(inside & ~taken, _row(g, far), 0.0)
-        here = value >= m
+        here = sign * value >= m
         return jnp.where(here, 0.0, carry), other + jnp.where(here, carry, 0.0)
 
     rows = (x, ahead, _ends(n, length, reverse), first, _far(n - 1, length, not reverse))
@@ -136,8 +143,8 @@ def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Ar
     return top, jnp.where(grows, s * fade + weight, s + weight * fade)
 
 
-def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
-    """`finish(m, s, x)` of the pairs over the windows of `weight * exp(x / tau)`."""
+def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
+    """`finish(m, s)` of the pairs over the windows of `weight * exp(sign * x / tau)`."""
     length = x.shape[0]
     nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))
     given = weight is not None
@@ -146,7 +153,7 @@ def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any)
         value, start, weight = row
         m, s = pair
         m, s = jnp.where(start, -NEVER, m), jnp.where(start, 0.0, s)
-        m, s = _add(m, s, value, weight if given else 1.0, tau)
+        m, s = _add(m, s, sign * value, weight if given else 1.0, tau)
         return (m, s), (m, s)
 
     if n < length:
@@ -162,35 +169,37 @@ def _pairs(n: int, reverse: bool, x: Series, weight: Any, tau: Any, finish: Any)
         value, end, weight, far = row
         m, s = pair
         m, s = jnp.where(end, -NEVER, m), jnp.where(end, 0.0, s)
-        m, s = _add(m, s, value, weight if given else 1.0, tau)
+        m, s = _add(m, s, sign * value, weight if given else 1.0, tau)
         if far is None:
-            return (m, s), finish(m, s, value)
+            return (m, s), finish(m, s)
         more, other = (_row(a, far[0]) for a in ahead)
         both = _add(m, s, more, other, tau)
         total = (jnp.where(far[1], a, b) for a, b in zip(both, (m, s), strict=True))
-        return (m, s), finish(*total, value)
+        return (m, s), finish(*total)
 
     ends = np.zeros(length, bool) if far is None else _ends(n, length, reverse)
     return lax.scan(complete, nothing, (x, ends, weight, far), reverse=reverse)[1]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def windowed_smooth(n: int, reverse: bool, x: Series, tau: Array) -> Series:
-    """`tau log sum exp(x / tau)` of the `n` samples from each instant on (up to it)."""
-    return _pairs(n, reverse, x, None, tau, lambda m, s, _: m + tau * jnp.log(s))
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
+def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> Series:
+    """The same with `tau log sum exp(x / tau)` for the maximum."""
+    return _pairs(n, reverse, sign, x, None, tau, lambda m, s: sign * (m + tau * jnp.log(s)))
 
 
-def _windowed_smooth_forward(n: int, reverse: bool, x: Series, tau: Array) -> tuple[Series, Any]:
-    y = windowed_smooth(n, reverse, x, tau)
+def _windowed_smooth_forward(
+    n: int, reverse: bool, sign: int, x: Series, tau: Array
+) -> tuple[Series, Any]:
+    y = windowed_smooth(n, reverse, sign, x, tau)
     return y, (x, y, tau)
 
 
-def _windowed_smooth_backward(n: int, reverse: bool, residuals: Any, g: Series) -> Any:
+def _windowed_smooth_backward(n: int, reverse: bool, sign: int, residuals: Any, g: Series) -> Any:
     # dx[s] = sum over the windows t that contain s of g[t] exp((x[s] - y[t]) / tau): a window the
     # other way over -y with weights g. No exponent is positive, because y is an upper bound of x.
     x, y, tau = residuals
-    m, s = _pairs(n, not reverse, -y, g, tau, lambda m, s, _: (m, s))
-    return jnp.exp(jnp.minimum(x + m, 0.0) / tau) * s, jnp.zeros_like(tau)
+    m, s = _pairs(n, not reverse, -sign, y, g, tau, lambda m, s: (m, s))
+    return jnp.exp(jnp.minimum(sign * x + m, 0.0) / tau) * s, jnp.zeros_like(tau)
 
 
 windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)

@@ -1,11 +1,11 @@
 """Running maxima along time, hard and smooth, in a time that does not depend on the window.
 
-    maximum(x)                                        # over everything
+    extreme(x)                                        # over everything
     windowed(x, n, tau=0.1)                           # over the n samples from each instant on
     until(f, g)                                       # max over j of min(g[j], f before j)
 
-Arrays are time-major `[time, *lanes]`; a minimum is `-maximum(-x)`. With a temperature `tau` a
-maximum is `tau log sum exp(x / tau)`. Two forms of everything: `sequential` scans, which a CPU
+Arrays are time-major `[time, *lanes]`; a minimum is asked for by sign -1. With a temperature `tau`
+a maximum is `tau log sum exp(x / tau)`. Two forms of everything: `sequential` scans, which a CPU
 likes best, and `parallel` ones for a GPU, where depth is what costs.
 """
 
@@ -26,36 +26,40 @@ def _form() -> Any:
     return sequential if jax.default_backend() == "cpu" else parallel
 
 
-def maximum(x: Float[Array, "time *lanes"], tau: Tau = None) -> Float[Array, " *lanes"]:
-    """Greatest value along time; its log-sum-exp at temperature `tau` if given."""
-    m = jnp.max(x, axis=0)
+def extreme(
+    x: Float[Array, "time *lanes"], sign: int = 1, tau: Tau = None
+) -> Float[Array, " *lanes"]:
+    """Greatest value along time (least, for sign -1); smooth at temperature `tau` if given."""
+    m = jnp.max(x, axis=0) if sign > 0 else jnp.min(x, axis=0)
     if tau is None or x.shape[0] == 1:
         return m
     fixed = lax.stop_gradient(m)
-    return fixed + tau * jnp.log(jnp.sum(jnp.exp((x - fixed) / tau), axis=0))
+    return fixed + sign * tau * jnp.log(jnp.sum(jnp.exp(sign * (x - fixed) / tau), axis=0))
 
 
-def greatest(values: list[Array], tau: Tau = None) -> Array:
-    """The greatest of several arrays, element by element; smooth at `tau` if given."""
+def join(values: list[Array], sign: int = 1, tau: Tau = None) -> Array:
+    """The greatest of several arrays (the least, for sign -1), element by element."""
     m = values[0]
     for value in values[1:]:
-        m = jnp.maximum(m, value)
+        m = jnp.maximum(m, value) if sign > 0 else jnp.minimum(m, value)
     if tau is None or len(values) == 1:
         return m
     fixed = lax.stop_gradient(m)
-    return fixed + tau * jnp.log(sum(jnp.exp((value - fixed) / tau) for value in values))
+    total = sum(jnp.exp(sign * (value - fixed) / tau) for value in values)
+    return fixed + sign * tau * jnp.log(total)
 
 
 def windowed(
     x: Float[Array, "time *lanes"],
     n: int,
+    sign: int = 1,
     tau: Tau = None,
     reverse: bool = True,
     form: Any = None,
 ) -> Float[Array, "time *lanes"]:
     """Maximum of the `n` samples that begin at each instant; that end there, if not `reverse`.
 
-    Windows are cut at the ends of the array. Time `O(time)` on a CPU.
+    The minimum, for sign -1. Windows are cut at the ends of the array. Time `O(time)` on a CPU.
 
     Source: M. van Herk, Pattern Recognition Letters 13 (1992); J. Gil, M. Werman, IEEE PAMI 15
     (1993).
@@ -64,11 +68,9 @@ def windowed(
     n = min(n, x.shape[0])
     if n <= 1:
         return x
-    return (
-        form.windowed_smooth(n, reverse, x, tau)
-        if tau is not None
-        else form.windowed(n, reverse, x)
-    )
+    if tau is None:
+        return form.windowed(n, reverse, sign, x)
+    return form.windowed_smooth(n, reverse, sign, x, tau)
 
 
 def until(
