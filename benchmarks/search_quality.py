@@ -39,8 +39,10 @@ def main():
     problem = load_target(f"specs/cartpole.py:{options.problem}")
     rate = vj.falsify(problem, "uniform", 200_000, batch=8192, seed=999, progress=False)
     print(f"{problem}\n  failure rate {rate.failure_rate}")
-    print(f"{'search':<15}{'batch':>6}{'found':>8}{'median':>9}{'quartiles':>16}"
-          f"{'uniform /':>11}{'gradient as 2':>15}{'seconds':>9}")
+    print(
+        f"{'search':<15}{'batch':>6}{'found':>8}{'median':>9}{'quartiles':>16}"
+        f"{'uniform /':>11}{'gradient as 2':>15}{'seconds':>9}"
+    )
     uniform = None
     for name in BATCH:
         started = time.perf_counter()
@@ -51,9 +53,11 @@ def main():
         uniform = uniform or median
         low, high = np.percentile(counts, [25, 75])
         doubled = f"{uniform / (2 * median):.1f}x" if name == "gradient" else ""
-        print(f"{name:<15}{BATCH[name]:>6}{sum(f for _, f in results):>5}/{options.seeds}"
-              f"{median:>9.0f}{f'{low:.0f} - {high:.0f}':>16}{uniform / median:>10.1f}x"
-              f"{doubled:>15}{seconds:>9.1f}")
+        print(
+            f"{name:<15}{BATCH[name]:>6}{sum(f for _, f in results):>5}/{options.seeds}"
+            f"{median:>9.0f}{f'{low:.0f} - {high:.0f}':>16}{uniform / median:>10.1f}x"
+            f"{doubled:>15}{seconds:>9.1f}"
+        )
 
 
 if __name__ == "__main__":

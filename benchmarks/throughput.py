@@ -126,8 +126,10 @@ def main():
 
     device = jax.devices()[0]
     print(f"cart-pole, {STEPS} steps, 4 features, two-sided bounds; {n} simulations a round,")
-    print(f"{options.rounds} rounds; {len(jax.devices())} x {device.platform}, jax {jax.__version__}"
-          f", numpy {np.__version__}; failing {np.mean(rho < 0):.1%}")
+    print(
+        f"{options.rounds} rounds; {len(jax.devices())} x {device.platform}, jax {jax.__version__}"
+        f", numpy {np.__version__}; failing {np.mean(rho < 0):.1%}"
+    )
     for name, values in seconds.items():
         extra = "".join(f"  batch {b}" for d, b in batches.items() if name.endswith(d.__name__))
         if name in ("engine", "falsify(uniform)"):
@@ -135,13 +137,15 @@ def main():
         print(f"  {name:<18}{n / statistics.median(values):>12,.0f} simulations/s{extra}")
     for side in ("engine", "falsify(uniform)"):
         for dtype in ("float64", "float32"):
-            ratios = [
-                b / a for a, b in zip(seconds[side], seconds[f"numpy {dtype}"], strict=True)
-            ]
-            print(f"  {side} / numpy {dtype}: {statistics.median(ratios):.1f}x "
-                  f"(min {min(ratios):.1f}, max {max(ratios):.1f})")
-    print(f"  engine / VerifAI's 10 simulations/s: "
-          f"{n / statistics.median(seconds['engine']) / 10:,.0f}x")
+            ratios = [b / a for a, b in zip(seconds[side], seconds[f"numpy {dtype}"], strict=True)]
+            print(
+                f"  {side} / numpy {dtype}: {statistics.median(ratios):.1f}x "
+                f"(min {min(ratios):.1f}, max {max(ratios):.1f})"
+            )
+    print(
+        f"  engine / VerifAI's 10 simulations/s: "
+        f"{n / statistics.median(seconds['engine']) / 10:,.0f}x"
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Execute the notebooks and fail when a cell does; `--write` keeps the outputs.
 
-    python notebooks/execute.py                         # all, as CI does
-    python notebooks/execute.py --write 01_falsify_cartpole.ipynb
+python notebooks/execute.py                         # all, as CI does
+python notebooks/execute.py --write 01_falsify_cartpole.ipynb
 """
 
 import argparse

@@ -27,7 +27,15 @@ ALLOWED = {
     "host": {"engine", "problem", "mtl", "trace"},
     "run": {"engine", "problem", "rates", "table", "trace", "report"},
     "falsify": {
-        "engine", "errors", "host", "problem", "progress", "run", "search", "table", "trace",
+        "engine",
+        "errors",
+        "host",
+        "problem",
+        "progress",
+        "run",
+        "search",
+        "table",
+        "trace",
     },
     "rl": {"errors", "systems", "trace"},
     "targets": {"errors", "problem"},
@@ -69,10 +77,6 @@ def test_library_does_not_know_its_content():
 
 def test_import_is_light():
     heavy = "pandas sklearn brax mujoco gymnax matplotlib pyarrow optax lark rich scipy.stats"
-    code = (
-        "import sys, verifai_jax\n"
-        f"print(*[m for m in {heavy.split()} if m in sys.modules])"
-    )
+    code = f"import sys, verifai_jax\nprint(*[m for m in {heavy.split()} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
-

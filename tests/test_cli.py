@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from verifai_jax.cli import main
 
 ROOT = Path(__file__).parent.parent
-PROBLEM = '''
+PROBLEM = """
 import jax.numpy as jnp
 import verifai_jax as vj
 
@@ -21,7 +21,7 @@ ramp = vj.Problem(
     description="a ramp that should stay below one",
 )
 flat = vj.Problem("flat", ramp.space, ramp.system, "eventually x > 0.5")
-'''
+"""
 
 
 @pytest.fixture
@@ -60,8 +60,17 @@ def test_falsify_and_replay(call, tmp_path):
 
 def test_options_of_a_search(call, tmp_path):
     output = call(
-        "falsify", "specs/ramp.py:ramp", "--set", "elite=0.3", "--budget", 64, "--batch", 32,
-        "--out", "here", "--no-pictures",
+        "falsify",
+        "specs/ramp.py:ramp",
+        "--set",
+        "elite=0.3",
+        "--budget",
+        64,
+        "--batch",
+        32,
+        "--out",
+        "here",
+        "--no-pictures",
     )
     assert "0.3" in json.loads((tmp_path / "here" / "run.json").read_text())["search"]
     assert "here" in output
@@ -78,14 +87,20 @@ def test_list(call):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["falsify", "specs/ramp.py:rampe"], "unknown problem in specs/ramp.py 'rampe'; did you mean"),
+        (
+            ["falsify", "specs/ramp.py:rampe"],
+            "unknown problem in specs/ramp.py 'rampe'; did you mean",
+        ),
         (["falsify", "specs/ramp.py"], "has 2 problems; name one: specs/ramp.py:ramp"),
         (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
         (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
         (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
         (["falsify", "specs/ramp.py:ramp", "--set", "elit=1"], "did you mean 'elite"),
         (["falsify", "specs/ramp.py:ramp", "--set", "elite"], "--set needs NAME=VALUE"),
-        (["falsify", "specs/ramp.py:ramp", "--budget", "0"], "budget must be an integer of at least"),
+        (
+            ["falsify", "specs/ramp.py:ramp", "--budget", "0"],
+            "budget must be an integer of at least",
+        ),
         (["falsify", "specs/ramp.py:ramp", "--budgets", "3"], "--budget"),
         (["falsfy", "specs/ramp.py:ramp"], "did you mean 'falsify'"),
         (["replay", "runs/none"], "no run in runs/none"),

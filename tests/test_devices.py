@@ -18,7 +18,9 @@ def run(code, **environment):
 
 
 def test_one_device_per_core():
-    done = run("import verifai_jax, jax, os; print(len(jax.devices()), len(os.sched_getaffinity(0)))")
+    done = run(
+        "import verifai_jax, jax, os; print(len(jax.devices()), len(os.sched_getaffinity(0)))"
+    )
     devices, cores = done.stdout.split()
     assert devices == cores
 

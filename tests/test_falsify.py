@@ -14,7 +14,7 @@ T = 8
 
 
 def ramp(features, key):
-    """x = a + b t: violates x <= 1 where a + b > 1."""
+    """X = a + b t: violates x <= 1 where a + b > 1."""
     t = jnp.linspace(0.0, 1.0, T + 1)
     return vj.Trace({"x": features["a"] + features["b"] * t}, dt=1 / T)
 
@@ -149,8 +149,10 @@ def test_several_formulas_give_a_column_each():
 class TestBlackBox:
     def problem(self, function):
         return vj.Problem(
-            "box", space={"a": vj.Box(0, 1), "color": vj.Categorical("red", "blue")},
-            system=vj.blackbox(function), spec="always x < 0.8",
+            "box",
+            space={"a": vj.Box(0, 1), "color": vj.Categorical("red", "blue")},
+            system=vj.blackbox(function),
+            spec="always x < 0.8",
         )
 
     def test_a_row_that_raises_carries_its_message_and_the_run_goes_on(self):
@@ -252,7 +254,9 @@ def test_gradients_equal_finite_differences(dim):
         return vj.Trace({"x": jnp.sin(w @ jnp.cos(jnp.outer(jnp.arange(dim), t)))}, dt=1.0)
 
     problem = vj.Problem(
-        "wave", space={"w": vj.Array(vj.Box(-1, 1), length=dim)}, system=system,
+        "wave",
+        space={"w": vj.Array(vj.Box(-1, 1), length=dim)},
+        system=system,
         spec="always[0, 3] (x < 0.5 | eventually[0, 2] x < 0)",
     )
     u = np.random.default_rng(0).random((5, dim)).astype(np.float32)
@@ -261,6 +265,7 @@ def test_gradients_equal_finite_differences(dim):
     gradient = engine_module.engine_for(problem, 5, True).evaluate(u, key, 0, tau).gradient
 
     with jax.enable_x64():
+
         def value(u):
             trace = system(problem.space.unflatten(u), None)
             (formula,) = problem.formulas.values()
@@ -300,7 +305,7 @@ class TestRefusedBeforeAnythingCompiles:
     def test_a_misspelt_option_names_itself(self, problem):
         with pytest.raises(TypeError, match="max_second"):
             vj.falsify(problem, max_second=3)
-        with pytest.raises(ValueError, match="'elit'.*did you mean 'elite"):
+        with pytest.raises(ValueError, match=r"'elit'.*did you mean 'elite"):
             vj.search.named("cross_entropy", elit=0.1)
 
     def test_a_formula_over_a_signal_that_is_not_there(self):
@@ -310,8 +315,10 @@ class TestRefusedBeforeAnythingCompiles:
 
     def test_gradients_need_something_continuous(self):
         problem = vj.Problem(
-            "discrete", space={"n": vj.DiscreteBox(0, 3)},
-            system=lambda f, key: vj.Trace({"x": f["n"] * jnp.ones(2)}, dt=1.0), spec="always x < 2",
+            "discrete",
+            space={"n": vj.DiscreteBox(0, 3)},
+            system=lambda f, key: vj.Trace({"x": f["n"] * jnp.ones(2)}, dt=1.0),
+            spec="always x < 2",
         )
         with pytest.raises(ValueError, match="continuous"):
             vj.falsify(problem, "gradient", 10)

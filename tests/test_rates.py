@@ -18,7 +18,8 @@ def test_agrees_with_scipy(n, data, confidence):
 def test_covers_the_true_rate_at_least_as_often_as_promised():
     n, p = 200, 0.03
     covered = sum(
-        binom.pmf(k, n, p) for k in range(n + 1)
+        binom.pmf(k, n, p)
+        for k in range(n + 1)
         if clopper_pearson(k, n).low <= p <= clopper_pearson(k, n).high
     )
     assert covered >= 0.95

@@ -67,5 +67,8 @@ def test_bad_traces_are_refused(arguments, message):
 def test_status_codes_are_stable():
     # They are stored in tables on disk.
     assert [(s.name, s.value) for s in Status] == [
-        ("OK", 0), ("NONFINITE", 1), ("ERROR", 2), ("TIMEOUT", 3),
+        ("OK", 0),
+        ("NONFINITE", 1),
+        ("ERROR", 2),
+        ("TIMEOUT", 3),
     ]

@@ -1,8 +1,8 @@
 """The command line: each command is one call into the Python API.
 
-    verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
-    verifai-jax replay runs/balance-1 417
-    verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
+verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
+verifai-jax replay runs/balance-1 417
+verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
 """
 
 import json
@@ -147,8 +147,11 @@ def replay(
     stored = run.table.all.iloc[number]
     click.echo(f"{run.name}, row {number}, {precision}")
     for name in run.table.features:
-        click.echo(f"  {name:<12} {stored[name]:.6g}" if _is_number(stored[name]) else
-                   f"  {name:<12} {stored[name]}")
+        click.echo(
+            f"  {name:<12} {stored[name]:.6g}"
+            if _is_number(stored[name])
+            else f"  {name:<12} {stored[name]}"
+        )
     for name, rho in seen.rho.items():
         click.echo(f"  {run.formulas[name]}")
         click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")

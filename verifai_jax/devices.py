@@ -10,6 +10,7 @@ for compiled programs, or `off`).
 
 import os
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -21,15 +22,18 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
+def _setting(name: str) -> Any:
+    return getattr(jax.config, name)
+
+
 def claim_cores() -> None:
     """Give JAX one host device per core, unless its backend runs or the user chose a number."""
     wanted = os.environ.get("VERIFAI_JAX_CORES", "").strip()
     if wanted and (not wanted.isdigit() or int(wanted) < 1):
         raise ValueError(f"VERIFAI_JAX_CORES must be a positive integer; got {wanted!r}")
-    chosen_elsewhere = (
-        jax.config.jax_num_cpu_devices > 0
-        or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    )
+    chosen_elsewhere = _setting(
+        "jax_num_cpu_devices"
+    ) > 0 or "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if chosen_elsewhere:
         return
     try:
@@ -53,7 +57,7 @@ def cache_folder() -> Path | None:
 def enable_compile_cache() -> None:
     """Keep compiled programs on disk, unless the user has configured JAX's cache already."""
     folder = cache_folder()
-    if folder is None or jax.config.jax_compilation_cache_dir is not None:
+    if folder is None or _setting("jax_compilation_cache_dir") is not None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -124,9 +124,7 @@ class Engine:
             gradient=np.asarray(gradient)[:n] if self.gradient else None,
         )
 
-    def verdicts(
-        self, u: Float[Array, "n d"], key: Key[Array, ""], first: int
-    ) -> np.ndarray:
+    def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
         """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
         arguments = (_pad(u, self.padded), key, jnp.int32(first), jnp.float32(1.0))
         return np.asarray(self._executable("verdicts")(*arguments))[: len(u)]
@@ -220,7 +218,7 @@ def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"],
     return derivative, aux
 
 
-def _pad(u: Float[Array, "n d"], rows: int) -> Float[Array, "rows d"]:
+def _pad(u: Any, rows: int) -> Any:
     if len(u) == rows:
         return u
     # In NumPy: JAX would compile a program for each number of missing rows.

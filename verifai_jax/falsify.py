@@ -1,7 +1,7 @@
 """The falsification loop: rounds, budgets, stopping, progress, storing.
 
-    run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
-    run = falsify(problem, search=search.Gradient(learning_rate=0.2), stop_after=10)
+run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
+run = falsify(problem, search=search.Gradient(learning_rate=0.2), stop_after=10)
 """
 
 import time
@@ -217,13 +217,10 @@ def _search_program(search: Search, cube: Cube, batch: int) -> _SearchProgram:
     init = jax.jit(lambda key: search.init(key, cube, batch)).lower(key).compile()
     state = jax.eval_shape(lambda key: search.init(key, cube, batch), key)
     ask = jax.jit(lambda state: search.ask(state, cube, batch)).lower(state).compile()
-    points = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
-    evaluated = Evaluated(
-        u=points,
-        rho=jax.ShapeDtypeStruct((batch,), jnp.float32),
-        counted=jax.ShapeDtypeStruct((batch,), jnp.bool_),
-        gradient=points if search.wants_gradient else None,
-    )
+    points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
+    rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
+    counted: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
+    evaluated = Evaluated(points, rho, counted, points if search.wants_gradient else None)
     tell = jax.jit(lambda state, told: search.tell(state, cube, told))
     tell = tell.lower(state, evaluated).compile()
     temperature: Any = lambda state: 1.0  # noqa: E731
@@ -236,9 +233,7 @@ def _is_integer(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def _check_options(
-    budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any
-) -> None:
+def _check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
     for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
         if name == "stop_after" and value is None:
             continue

@@ -55,9 +55,7 @@ class HostEngine:
                 messages[i] = f"{type(error).__name__}: {error}"
         return Evaluation(rho=rho, status=status, features=features, messages=messages)
 
-    def verdicts(
-        self, u: Float[Array, "n d"], key: Key[Array, ""], first: int
-    ) -> np.ndarray:
+    def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
         """Boolean semantics `[n, formulas]`; see `engine.Engine`."""
         features = jax.tree.map(np.asarray, self._unflatten(u))
         verdicts = np.ones((len(u), len(self.problem.formulas)), bool)
@@ -65,7 +63,7 @@ class HostEngine:
             try:
                 trace = self._simulate(features, i, simulation_key(key, first + i))
                 verdicts[i] = np.asarray(self._verdict(pad_trace(trace)))
-            except Exception:  # noqa: S112 - evaluate has recorded it
+            except Exception:
                 continue
         return verdicts
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
+from verifai_jax.mtl.evaluate import End
 from verifai_jax.trace import Trace
 
 System = Callable[..., Trace]
@@ -53,7 +54,7 @@ class Problem:
     spec: Formula | str | Mapping[str, Formula | str]
     nominal: Mapping[str, Any] | None = None
     description: str = ""
-    end: str = "hold"
+    end: End = "hold"
     draw: Callable[..., None] | None = None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)

@@ -1,9 +1,9 @@
 """The result of a falsification: its table, its statistics, and how to see a row again.
 
-    run.summary()                      what failed, how often, the worst case
-    run.table.counterexamples          a DataFrame
-    run.replay(run.best)               the trace behind a row
-    run.save("runs/mine"); vj.load("runs/mine", problem)
+run.summary()                      what failed, how often, the worst case
+run.table.counterexamples          a DataFrame
+run.replay(run.best)               the trace behind a row
+run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
 import json
@@ -94,7 +94,7 @@ class Run:
         **Raises:** `ValueError` when no simulation ended properly.
         """
         table = self.table.all
-        proper = table[table["status"] == "ok"]
+        proper = table.loc[table["status"] == "ok"]
         if not len(proper):
             raise ValueError(
                 f"run of {self.name!r} has no simulation with a verdict: "
@@ -286,12 +286,14 @@ def _summary(run: Run) -> str:
     if failures + len(run.table.safe):
         best = run.best
         where = ", ".join(f"{name}={_short(best[name])}" for name in run.table.features)
-        lines.append(f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
-                     f"robustness {best['rho']:.4g} at {where}")
+        lines.append(
+            f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
+            f"robustness {best['rho']:.4g} at {where}"
+        )
     if len(failed):
         counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
         lines.append(f"  no verdict   {counts}")
-        if "message" in failed and len(raised := failed[failed["message"] != ""]):
+        if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
             number, message = raised.index[0], raised["message"].iloc[0]
             lines.append(f"               first in row {number}: {message}")
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")

@@ -90,19 +90,19 @@ class ErrorTable:
     def counterexamples(self) -> "pd.DataFrame":
         """Rows that ended properly and violate the property."""
         table = self.all
-        return table[(table["status"] == "ok") & table["violated"]]
+        return table.loc[(table["status"] == "ok") & table["violated"]]
 
     @property
     def safe(self) -> "pd.DataFrame":
         """Rows that ended properly and satisfy the property."""
         table = self.all
-        return table[(table["status"] == "ok") & ~table["violated"]]
+        return table.loc[(table["status"] == "ok") & ~table["violated"]]
 
     @property
     def failed(self) -> "pd.DataFrame":
         """Rows without a verdict: the simulation raised, timed out or went non-finite."""
         table = self.all
-        return table[table["status"] != "ok"]
+        return table.loc[table["status"] != "ok"]
 
     @classmethod
     def load(cls, folder: Path, features: tuple[str, ...]) -> "ErrorTable":

@@ -10,12 +10,14 @@ A trace is a pytree, so `jax.vmap` over a system gives a batch of traces.
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+Samples: TypeAlias = Float[Array | np.ndarray, "time *k"]
 
 
 class Status(enum.IntEnum):
@@ -46,9 +48,9 @@ class Trace:
     clock that is missing, given twice or not positive.
     """
 
-    signals: Mapping[str, Float[Array, "time *k"]]
+    signals: Mapping[str, Samples]
     dt: float | None = None
-    times: Float[Array, " time"] | None = None
+    times: Float[Array | np.ndarray, " time"] | None = None
     valid: Int[Array, ""] | int | None = None
     status: Int[Array, ""] | int | None = None
     held: bool = False
@@ -89,6 +91,7 @@ class Trace:
         """Sample times `[time]` in seconds."""
         if self.times is not None:
             return jnp.asarray(self.times)
+        assert self.dt is not None
         return jnp.arange(self.length) * self.dt
 
     def hold(self) -> "Trace":
@@ -109,7 +112,7 @@ class Trace:
             valid=None,
         )
 
-    def __getitem__(self, name: str) -> Float[Array, "time *k"]:
+    def __getitem__(self, name: str) -> Samples:
         return self.signals[name]
 
 

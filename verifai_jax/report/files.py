@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.report.animation import animate
-from verifai_jax.report.scatter import plot_features
 from verifai_jax.report.budget import plot_budget
+from verifai_jax.report.scatter import plot_features
 from verifai_jax.report.worst import plot_replay
 
 if TYPE_CHECKING:

@@ -55,18 +55,23 @@ def plot_features(
             (run.table.failed, WITHOUT_VERDICT, 8),
             (run.table.counterexamples, FAILING, 9),
         ):
-            shown = part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))] if len(
-                part
-            ) else part
+            shown = (
+                part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))]
+                if len(part)
+                else part
+            )
             axes.scatter(
                 _positions(table, shown, across),
                 _positions(table, shown, up),
-                c=color, s=size, alpha=0.55, linewidths=0,
+                c=color,
+                s=size,
+                alpha=0.55,
+                linewidths=0,
             )
         axes.set_xlabel(across)
         axes.set_ylabel("" if across == up else up)
         tidy(axes)
-    for axes in panels[len(pairs):]:
+    for axes in panels[len(pairs) :]:
         axes.set_visible(False)
     failing, safe = len(run.table.counterexamples), len(run.table.safe)
     rate = run.failure_rate
@@ -84,17 +89,16 @@ def telling_features(run: "Run") -> list[str]:
     The difference is the Kolmogorov-Smirnov distance; without failing rows, the correlation of
     ranks with the robustness.
     """
-    numeric = [
-        name for name in run.table.features
-        if np.issubdtype(run.table.all[name].to_numpy().dtype, np.number)
-        and run.table.all[name].nunique() > 1
-    ]
+    table = run.table.all
+    varying = [name for name in run.table.features if len(np.unique(table[name].to_numpy())) > 1]
+    numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe
     if len(failing) and len(safe):
+
         def score(name: str) -> float:
             return _distance(failing[name].to_numpy(), safe[name].to_numpy())
     else:
-        proper = run.table.all[run.table.all["status"] == "ok"]
+        proper = table.loc[table["status"] == "ok"]
         rho = proper["rho"].rank()
 
         def score(name: str) -> float:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from verifai_jax.mtl import Formula, robustness, robustness_signal
+from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal
 from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 from verifai_jax.trace import Trace
@@ -56,7 +57,7 @@ def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
     return show_or_save(figure, path)
 
 
-def decisive_instant(formula: Formula, trace: Trace, end: str = "hold") -> tuple[str, int] | None:
+def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
     """The signal and sample that set the robustness at time 0; None where nothing does.
 
     The gradient of the hard semantics is the diagnosis: it vanishes everywhere else.
@@ -110,7 +111,7 @@ def _draw_bounds(
     predicate: Predicate,
     limits: list[float],
     trace: Trace,
-    end: str,
+    end: End,
 ) -> None:
     reach = max(float(np.nanmax(np.abs(values))), 1e-9)
     for limit in limits:
@@ -119,12 +120,24 @@ def _draw_bounds(
             axes.axhline(limit, color=BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
     margin = np.asarray(robustness_signal(predicate, trace, end=end))
     axes.fill_between(
-        clock, 0, 1, where=margin < 0, transform=axes.get_xaxis_transform(),
-        color=FAILING, alpha=0.13, linewidth=0, step="mid",
+        clock,
+        0,
+        1,
+        where=margin < 0,
+        transform=axes.get_xaxis_transform(),
+        color=FAILING,
+        alpha=0.13,
+        linewidth=0,
+        step="mid",
     )
     axes.annotate(
-        str(predicate), (0.0, 1.0), xycoords="axes fraction", ha="left", va="bottom",
-        fontsize=7, color=SAFE if (margin >= 0).all() else FAILING,
+        str(predicate),
+        (0.0, 1.0),
+        xycoords="axes fraction",
+        ha="left",
+        va="bottom",
+        fontsize=7,
+        color=SAFE if (margin >= 0).all() else FAILING,
     )
 
 
