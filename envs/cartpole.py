@@ -21,10 +21,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
+from verifai_jax.rl.policy import Layers, network, written_out
 from verifai_jax.systems import Ode, ode, sin_cos
 from verifai_jax.systems.integrators import euler
 
@@ -153,15 +155,32 @@ def neural(
             f"got {policy.layers[0][0].shape[0]} and {policy.action}"
         )
 
+    layers = _preferring(policy)
+    small = sum(weight.size for weight, _ in layers) <= 600
+
     def control(time: Scalar, state: State, features: Features) -> Scalar:
-        logits = policy(jnp.stack(state))
-        preference = logits[1] - logits[0]
+        if small:
+            (preference,) = written_out(layers, state)
+        else:
+            (preference,) = network(layers, jnp.stack(state))
         largest = feature(features, "force_mag")
         if action == "expected":
             return largest * jnp.tanh(preference / 2)
         return largest * (sign if straight_through else _sign)(preference)
 
     return control
+
+
+def _preferring(policy: Policy) -> Layers:
+    """The network with one output, how much it prefers right to left; on raw observations."""
+    layers = [(np.asarray(weight), np.asarray(bias)) for weight, bias in policy.layers]
+    if policy.mean is not None and policy.scale is not None:
+        mean, (weight, bias) = np.asarray(policy.mean), layers[0]
+        weight = weight / np.asarray(policy.scale)[:, None]
+        layers[0] = (weight, bias - mean @ weight)
+    weight, bias = layers[-1]
+    layers[-1] = (weight[:, 1:] - weight[:, :1], bias[1:] - bias[:1])
+    return tuple((jnp.asarray(weight), jnp.asarray(bias)) for weight, bias in layers)
 
 
 def _sign(preference: Scalar) -> Scalar:

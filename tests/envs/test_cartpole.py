@@ -8,7 +8,8 @@ import pytest
 
 from envs import cartpole as cp
 from verifai_jax.errors import UnknownNameError
-from verifai_jax.rl import Discrete, evaluate, load_policy
+from verifai_jax.rl import Discrete, Policy, evaluate, load_policy
+from verifai_jax.rl.policy import new_layers
 from verifai_jax.trace import Status
 
 KEY = jax.random.key(0)
@@ -178,6 +179,22 @@ def test_argmax_pushes_with_full_force_and_has_the_derivative_of_the_mean_force(
             jax.grad(lambda t, f=force: f(hard, t))(at[2]), expected, rtol=1e-4, atol=1e-6
         )
         assert float(jax.grad(lambda t, f=force: f(blind, t))(at[2])) == 0
+
+
+@pytest.mark.parametrize("width", [16, 64])
+def test_force_is_that_of_the_policy_small_or_large_normalised_or_not(width):
+    layers = new_layers(jax.random.key(1), (4, width, width, 2), gain=1.0)
+    mean, scale = jnp.array([0.1, -0.2, 0.05, 0.3]), jnp.array([1.0, 2.0, 0.1, 0.7])
+    for policy in (
+        Policy(layers, None, None, None, Discrete(2)),
+        Policy(layers, mean, scale, None, Discrete(2)),
+    ):
+        state = jnp.array([0.3, -0.5, 0.1, 0.4])
+        logits = np.asarray(policy(state))
+        force = cp.neural(policy, action="expected")(0.0, cp.State(*state), {})
+        assert float(force) == pytest.approx(10 * np.tanh((logits[1] - logits[0]) / 2), rel=1e-4)
+        push = cp.neural(policy)(0.0, cp.State(*state), {})
+        assert float(push) == (10 if int(policy.act(state)) == 1 else -10)
 
 
 def test_neural_refuses_what_it_cannot_use():

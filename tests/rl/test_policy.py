@@ -12,7 +12,7 @@ from verifai_jax.rl import (
     policy_notes,
     save_policy,
 )
-from verifai_jax.rl.policy import new_layers
+from verifai_jax.rl.policy import new_layers, written_out
 
 LAYERS = (
     (jnp.array([[1.0, -1.0], [0.5, 2.0]]), jnp.array([0.1, -0.2])),
@@ -30,6 +30,7 @@ def test_network_by_hand():
     policy = Policy(LAYERS, None, None, None, Discrete(2))
     np.testing.assert_allclose(policy(SEEN), by_hand(SEEN), rtol=1e-6)
     assert int(policy.act(SEEN)) == int(np.argmax(by_hand(SEEN)))
+    np.testing.assert_allclose(written_out(LAYERS, list(SEEN)), by_hand(SEEN), rtol=1e-6)
 
 
 def test_observations_are_normalised():
