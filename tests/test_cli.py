@@ -131,3 +131,46 @@ def test_doctor(call):
     assert "jax " in output
     assert "devices" in output
     assert "cores" in output
+
+
+class TestMonitor:
+    @pytest.fixture(autouse=True)
+    def recording(self, call, tmp_path):
+        (tmp_path / "drive.csv").write_text(
+            "time,dist,speed\n0.0,5.0,1.0\n0.5,3.0,2.0\n1.0,1.5,4.0\n1.5,2.5,2.5\n"
+        )
+
+    def test_robustness_of_a_recording(self, call):
+        assert call("monitor", "always dist > 1", "drive.csv") == "holds with robustness 0.5\n"
+        assert call("monitor", "always[0, 1] dist >= 2", "drive.csv", "--fail", code=1) == (
+            "fails with robustness -0.5\n"
+        )
+        assert "robustness 0.5" in call(
+            "monitor", "G (dist < 2 -> F[0, 500ms] slow)", "drive.csv",
+            "--define", "slow=speed < limit", "--const", "limit=3",
+        )  # fmt: skip
+
+    def test_why(self, call, tmp_path):
+        output = call(
+            "monitor", "always[0, 1] dist >= 2", "drive.csv", "--explain", "--plot", "why.png"
+        )
+        assert "decided by  dist >= 2  at 1 s" in output
+        assert (tmp_path / "why.png").read_bytes().startswith(b"\x89PNG")
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["always dst > 1", "drive.csv"], "unknown signal 'dst'; did you mean 'dist'"),
+            (["always (dist > 1", "drive.csv"], "^"),
+            (["always[0, 0.3] dist > 1", "drive.csv"], "0.3"),
+            (["always dist > 1", "none.csv"], "no recording none.csv"),
+            (["always dist > 1", "drive.csv", "--time", "t"], "no column 't' of sample times"),
+            (["always dist > 1", "drive.csv", "--const", "a=b"], "--const a must be a number"),
+            (["always[0, 9] dist > 1", "drive.csv", "--end", "strict"], "9"),
+        ],
+    )
+    def test_mistakes(self, arguments, message):
+        result = CliRunner().invoke(main, ["monitor", *arguments])
+        assert result.exit_code != 0
+        assert message in result.output
+        assert "Traceback" not in result.output

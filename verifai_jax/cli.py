@@ -162,6 +162,66 @@ def replay(
 
 
 @main.command()
+@click.argument("formula")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
+@click.option("--time", default="time", show_default=True, help="Column of sample times.")
+@click.option("--resample", "period", type=float, help="Period in seconds to resample to.")
+@click.option("--method", type=click.Choice(["hold", "linear"]), help="How to resample.")
+@click.option(
+    "--end",
+    type=click.Choice(["hold", "truncate", "strict"]),
+    default="hold",
+    show_default=True,
+    help="What comes after the last sample.",
+)
+@click.option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
+@click.option("--const", "constants", multiple=True, metavar="NAME=NUMBER")
+@click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
+@click.option("--explain", "explained", is_flag=True, help="Say which predicate decides, and when.")
+@click.option("--plot", type=click.Path(path_type=Path), help="Draw the explanation into a PNG.")
+@click.option("--fail", is_flag=True, help="Exit with 1 if the formula fails.")
+def monitor(
+    formula: str,
+    recording: Path,
+    dt: float | None,
+    time: str,
+    period: float | None,
+    method: Any,
+    end: Any,
+    compat: str | None,
+    constants: tuple[str, ...],
+    definitions: tuple[str, ...],
+    explained: bool,
+    plot: Path | None,
+    fail: bool,
+) -> None:
+    """Robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet, in float64."""
+    import jax
+
+    from verifai_jax import mtl
+
+    numbers = {name: _number(name, value) for name, value in _pairs("--const", constants)}
+    parsed = mtl.parse(formula, numbers, dict(_pairs("--define", definitions)))
+    trace = mtl.read(recording, time=time, dt=dt, resample_to=period, method=method)
+    with jax.enable_x64(True):
+        holds = bool(mtl.satisfied(parsed, trace, end, compat))
+        rho = float(mtl.robustness(parsed, trace, end=end, compat=compat))
+        click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:.10g}")
+        if explained or plot is not None:
+            if compat is not None:
+                raise click.UsageError("--explain and --plot do not go with --compat")
+            why = mtl.explain(parsed, trace, end=end)
+            if explained:
+                click.echo(str(why))
+            if plot is not None:
+                mtl.draw(why, plot)
+                click.echo(f"picture {plot}")
+    if fail and not holds:
+        raise SystemExit(1)
+
+
+@main.command()
 def doctor() -> None:
     """Report versions, devices, cores and the compile cache."""
     from verifai_jax.doctor import report
@@ -171,15 +231,29 @@ def doctor() -> None:
 
 def _options(pairs: tuple[str, ...]) -> dict[str, Any]:
     options: dict[str, Any] = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not equals or not name:
-            raise click.UsageError(f"--set needs NAME=VALUE; got {pair!r}")
+    for name, value in _pairs("--set", pairs):
         try:
             options[name] = json.loads(value)
         except json.JSONDecodeError:
             options[name] = value
     return options
+
+
+def _pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
+    pairs = []
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise click.UsageError(f"{option} needs NAME=VALUE; got {text!r}")
+        pairs.append((name.strip(), value.strip()))
+    return pairs
+
+
+def _number(name: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None
 
 
 def _next_folder(name: str) -> Path:

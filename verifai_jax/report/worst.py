@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.mtl import Formula, robustness, robustness_signal
+from verifai_jax.mtl import Formula, explain, robustness_signal
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal
 from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -58,32 +58,18 @@ def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
 
 
 def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
-    """The signal and sample that set the robustness at time 0; None where nothing does.
+    """The signal and sample that decide the verdict; None where the verdict has no such.
 
-    The gradient of the hard semantics is the diagnosis: it vanishes everywhere else.
+    A predicate over several signals is marked on the first.
     """
-    import jax
-
-    real = {
-        name: np.asarray(values, float)
-        for name, values in trace.signals.items()
-        if name in formula.signals()
-    }
-    fixed = {name: values for name, values in trace.signals.items() if name not in real}
-
-    def value(signals: Any) -> Any:
-        whole = Trace({**fixed, **signals}, trace.dt, trace.times)
-        return robustness(formula, whole, end=end)
-
-    gradient = jax.grad(value)(real)
-    sizes = {
-        name: np.nan_to_num(np.abs(np.asarray(g))).reshape(trace.length, -1).sum(axis=1)
-        for name, g in gradient.items()
-    }
-    if not sizes or max(size.max() for size in sizes.values()) == 0:
+    if not all(np.all(np.isfinite(np.asarray(trace.signals[n]))) for n in formula.signals()):
         return None
-    name = max(sizes, key=lambda n: sizes[n].max())
-    return name, int(sizes[name].argmax())
+    why = explain(formula, trace, end=end)
+    named = why.predicate.signals()
+    if not named:
+        return None
+    clock = np.asarray(trace.clock())
+    return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
 def _bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
