@@ -81,10 +81,10 @@ settle = vj.Problem(
 
 recover = vj.Problem(
     "recover",
-    vj.FeatureSpace({"push": vj.Box(-15.0, 15.0), **poles}),
+    vj.FeatureSpace({"x0": vj.Box(-1.0, 1.0), "push": vj.Box(0.0, 15.0), **poles}),
     controlled,
-    "eventually[1.1, 2.1] always[0, 0.5] abs(theta) <= 0.05",
-    nominal={"push": 0.0, "masspole": 0.1, "length": 0.5},
+    "eventually[1.1, 2.1] always[0, 0.5] abs(theta) <= 0.1",
+    nominal={"x0": 0.0, "push": 0.0, "masspole": 0.1, "length": 0.5},
     description="within 1 s after a push from 1.0 s to 1.1 s, be calm for half a second",
     draw=draw,
 )

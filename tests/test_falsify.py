@@ -114,6 +114,25 @@ def test_infinite_signals_are_not_counterexamples():
         _ = run.best
 
 
+@pytest.mark.parametrize("signal", ["p", "inverse"])
+def test_a_loop_that_diverges_has_no_verdict(signal):
+    # p doubles its growth each step until float32 overflows; 1 / p is infinite at the start.
+    system = vj.ode(
+        lambda time, state, control, f: {"p": f["rate"] * state["p"] ** 2},
+        lambda f, key: {"p": f["p0"]},
+        dt=0.1,
+        steps=40,
+        method="euler",
+        signals=lambda time, state, control, f: {"p": state["p"], "inverse": 1 / state["p"]},
+    )
+    space = {"rate": vj.Constant(30.0), "p0": vj.Categorical(0.0, 1.0)}
+    problem = vj.Problem("diverges", space=space, system=system, spec=f"always {signal} < 5")
+    table = vj.falsify(problem, "uniform", 16, batch=16).table.all
+    assert set(table["p0"]) == {0.0, 1.0}
+    diverged = (table["p0"] == 1.0) if signal == "p" else (table["p0"] < 2)
+    assert (table["status"] == np.where(diverged, "nonfinite", "ok")).all()
+
+
 def test_samples_behind_the_end_do_not_count():
     def ends(features, key):
         x = jnp.array([0.0, 0.5, 99.0, jnp.nan])

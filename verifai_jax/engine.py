@@ -60,7 +60,7 @@ def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], In
     finite = jnp.array(True)
     for name in dict.fromkeys(n for f in problem.formulas.values() for n in f.signals()):
         signal = jnp.asarray(trace.signals[name])
-        if jnp.issubdtype(signal.dtype, jnp.inexact):
+        if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
             finite &= jnp.all(jnp.isfinite(signal))
     status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
     status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)

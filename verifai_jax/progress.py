@@ -1,8 +1,9 @@
 """The progress bar of a run: simulations per second, best robustness, counterexamples, time left.
 
-Drawn by rich on the error stream, on a terminal or in a notebook; nothing elsewhere.
+Drawn by rich on the error stream, on a terminal, or in a notebook that has ipywidgets; nothing elsewhere.
 """
 
+import importlib.util
 import sys
 from typing import Any
 
@@ -49,5 +50,5 @@ class Progress:
 def _watched() -> bool:
     if sys.stderr is not None and sys.stderr.isatty():
         return True
-    # ipykernel sets this module up in a notebook.
-    return "ipykernel" in sys.modules
+    # In a notebook rich draws through ipywidgets, and without it warns instead.
+    return "ipykernel" in sys.modules and importlib.util.find_spec("ipywidgets") is not None

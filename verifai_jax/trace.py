@@ -43,6 +43,8 @@ class Trace:
     - `status`: a `Status` code; `Status.OK` when left out.
     - `held`: a promise of the producer that every sample from `valid` on repeats the last valid
       one, which saves the monitor a pass over the signals.
+    - `finite`: names of signals that the producer vouches for: they are finite where the status
+      is OK, which saves another.
 
     **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, or a
     clock that is missing, given twice or not positive.
@@ -54,6 +56,7 @@ class Trace:
     valid: Int[Array, ""] | int | None = None
     status: Int[Array, ""] | int | None = None
     held: bool = False
+    finite: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.signals:
@@ -124,15 +127,16 @@ def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], Any]:
     names = tuple(trace.signals)
     keys = [(jax.tree_util.DictKey(name), trace.signals[name]) for name in names]
     keys += [(jax.tree_util.GetAttrKey(name), getattr(trace, name)) for name in _CHILDREN]
-    return keys, (names, trace.dt, trace.held)
+    return keys, (names, trace.dt, trace.held, trace.finite)
 
 
 def _unflatten(static: Any, children: Any) -> Trace:
     # JAX unflattens with placeholders (and with batched leaves), which the checks would refuse.
     trace = object.__new__(Trace)
-    names, dt, held = static
+    names, dt, held, finite = static
     values = tuple(children)
-    fields = {"signals": dict(zip(names, values, strict=False)), "dt": dt, "held": held}
+    fields = {"signals": dict(zip(names, values, strict=False))}
+    fields |= {"dt": dt, "held": held, "finite": finite}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

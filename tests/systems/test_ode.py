@@ -383,3 +383,20 @@ def test_names_that_clash_or_are_missing_are_refused():
     )
     with pytest.raises(ValueError, match="are called 'control'"):
         twice({}, KEY)
+
+
+def test_signals_that_are_the_state_are_vouched_for():
+    def signals(time, state, control, features):
+        return {"p": state["p"], "twice": 2 * state["p"], "inverse": 1 / state["p"]}
+
+    system = ode(
+        lambda time, state, control, features: {"p": features["rate"]},
+        lambda features, key: {"p": jnp.zeros(())},
+        dt=0.1,
+        steps=3,
+        signals=signals,
+    )
+    assert system({"rate": 1.0}).finite == ("p",)
+    # What is not part of the state may be infinite while the state is not.
+    assert not jnp.isfinite(system({"rate": 1.0}).signals["inverse"]).all()
+    assert system({"rate": 1.0}).status == Status.OK

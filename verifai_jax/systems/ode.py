@@ -66,7 +66,7 @@ class _Rollout:
     def trace(self, state: Any) -> Trace:
         loop = self.loop
         memory = jax.tree.map(jnp.asarray, loop.controller_memory)
-        self.check(state, memory)
+        vouched = self.check(state, memory)
         last, age, samples = self.run(state, memory)
         # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the
         # last state is finite, all were. A state frozen at its end is covered by the same check.
@@ -80,6 +80,7 @@ class _Rollout:
             valid=age + 1 if ends else None,
             status=jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
             held=ends,
+            finite=vouched,
         )
 
     def run(self, state: Any, memory: Any) -> tuple[Any, Any, Any]:
@@ -166,8 +167,11 @@ class _Rollout:
 
         return integrator(self.loop.method)(slope, time, state, self.loop.dt)
 
-    def check(self, state: Any, memory: Any) -> None:
-        """Refuse functions that do not fit together; abstract evaluation, nothing compiles."""
+    def check(self, state: Any, memory: Any) -> tuple[str, ...]:
+        """Refuse functions that do not fit together; abstract evaluation, nothing compiles.
+
+        Returns the signals that are parts of the state itself, whose finiteness is the state's.
+        """
         loop = self.loop
         time = jnp.zeros((), _dtype(state))
         if loop.method == "semi_implicit_euler" and not _is_pair(state):
@@ -190,11 +194,20 @@ class _Rollout:
             lambda control: loop.dynamics(time, state, control, self.features), control
         )
         check_like(slope, state, "dynamics", "the state's slope, in the form of the state")
-        check_signals(jax.eval_shape(lambda control: self.seen(time, state, control), control))
+        parts, vouched = jax.tree.leaves(state), []
+
+        def seen(control: Any) -> Any:
+            signals = self.seen(time, state, control)
+            if isinstance(signals, Mapping):
+                vouched.extend(n for n, v in signals.items() if any(v is part for part in parts))
+            return signals
+
+        check_signals(jax.eval_shape(seen, control))
         if loop.terminate is not None:
             ended = jax.eval_shape(loop.terminate, state, self.features)
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
                 raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
+        return tuple(vouched)
 
 
 def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
