@@ -18,6 +18,8 @@ from verifai_jax.mtl.formula import prev as prev
 from verifai_jax.mtl.formula import signal as signal
 from verifai_jax.mtl.formula import since as since
 from verifai_jax.mtl.formula import until as until
+from verifai_jax.mtl.online import Online as Online
+from verifai_jax.mtl.online import online as online
 from verifai_jax.mtl.parse import FormulaSyntaxError as FormulaSyntaxError
 from verifai_jax.mtl.parse import parse as parse
 from verifai_jax.mtl.picture import draw as draw
@@ -29,6 +31,8 @@ from verifai_jax.mtl.robustness import certificate as certificate
 from verifai_jax.mtl.robustness import robustness as robustness
 from verifai_jax.mtl.robustness import robustness_signal as robustness_signal
 from verifai_jax.mtl.robustness import satisfied as satisfied
+from verifai_jax.mtl.scales import anneal as anneal
+from verifai_jax.mtl.scales import normalised as normalised
 from verifai_jax.mtl.semantics import Semantics as Semantics
 from verifai_jax.mtl.semantics import boolean as boolean
 from verifai_jax.mtl.semantics import hard as hard

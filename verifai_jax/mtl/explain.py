@@ -23,7 +23,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.printing import sugared
-from verifai_jax.mtl.robustness import prepared, satisfied
+from verifai_jax.mtl.robustness import prepared, satisfied, seconds
 from verifai_jax.mtl.semantics import hard
 from verifai_jax.trace import Trace
 
@@ -134,7 +134,7 @@ def explain(
     - `formula`, `trace`, `end`: as for `robustness`; the trace is concrete, not under `jit`.
     - `k`: how many critical instants to report at most: the peaks, over time, of each predicate's
       influence.
-    - `tau`: temperature at which influence is measured; a hundredth of the predicates' spread when
+    - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
       left out.
 
     **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
@@ -148,12 +148,14 @@ def explain(
     )
     walk = _Walk(Evaluator(signals, setting.length, setting.dt, end=end), series, trace)
     tree = walk.node(formula, 0, True)
-    leaves = {f: series[f] for f in series if isinstance(f, ast.Predicate | ast.Atom)}
+    leaves: dict[Formula, np.ndarray] = {
+        f: series[f] for f in series if isinstance(f, ast.Predicate | ast.Atom)
+    }
     critical: tuple[Instant, ...] = ()
     if leaves:
         if tau is None:
             finite = np.concatenate([v[np.isfinite(v)] for v in leaves.values()])
-            tau = 0.01 * float(np.std(finite)) or 1e-3
+            tau = 0.1 * float(np.std(finite)) or 1e-3
         shares = [np.asarray(s) for s in _influence(setting, signals, tau)]
         critical = _critical(list(leaves), leaves, shares, walk, k)
     return Explanation(formula, holds, tree.robustness, tree, critical, trace)
@@ -203,7 +205,7 @@ class _Walk:
     ) -> None:
         self.evaluator = evaluator
         self.series = series
-        self.clock = np.asarray(trace.clock(), float)
+        self.clock = seconds(trace)
         self.last = evaluator.length - 1
 
     def time(self, i: int) -> float:
@@ -310,7 +312,7 @@ def _critical(
     for leaf, share in zip(leaves, shares, strict=True):
         share = np.abs(share) / total
         padded = np.concatenate([[-1.0], share, [-1.0]])
-        peaks = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (share > 1e-6)
-        for i in np.flatnonzero(peaks):
+        peaks = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (share > 1e-4)
+        for i in map(int, np.flatnonzero(peaks)):
             found.append(Instant(leaf, walk.time(i), float(values[leaf][i]), float(share[i])))
     return tuple(sorted(found, key=lambda instant: -instant.share)[:k])

@@ -481,8 +481,9 @@ def _joined(kind: type[And] | type[Or], word: str, parts: tuple[Formulaic, ...])
     if not rest:
         return first
     # `a & b & c` is one node, but an implication within `|` must stay readable as one.
-    chained = isinstance(first, kind) and sugared(first)[0] == word
-    return kind((*(first.parts if chained else (first,)), *rest))
+    if isinstance(first, And | Or) and isinstance(first, kind) and sugared(first)[0] == word:
+        return kind((*first.parts, *rest))
+    return kind((first, *rest))
 
 
 def always(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:

@@ -16,7 +16,7 @@ import numpy as np
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.explain import Explanation, Node, heading
-from verifai_jax.mtl.robustness import prepared
+from verifai_jax.mtl.robustness import prepared, seconds
 from verifai_jax.mtl.semantics import hard
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
@@ -59,7 +59,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Any:
     figure.text(
         0.02, 0.14 / size[1], "green: holds   red: fails   dashed: bound", fontsize=9, color=QUIET
     )
-    clock = np.asarray(explanation.trace.clock(), float)
+    clock = seconds(explanation.trace)
     marks = []
     axes = []
     for k, (depth, node) in enumerate(rows):

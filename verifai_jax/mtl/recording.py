@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from verifai_jax.errors import unknown_name
+from verifai_jax.mtl.robustness import seconds
 from verifai_jax.trace import Trace
 
 Method = Literal["hold", "linear"]
@@ -36,9 +37,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
     trace = trace.trim()
-    times = (
-        np.asarray(trace.clock(), float) if trace.dt is None else trace.dt * np.arange(trace.length)
-    )
+    times = seconds(trace)
     _check_increasing(times)
     count = int(np.floor((times[-1] - times[0]) / dt * (1 + 1e-9) + 1e-9)) + 1
     clock = times[0] + dt * np.arange(count)

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from verifai_jax.errors import unknown_name
@@ -100,7 +101,7 @@ def satisfied(
     **Raises:** as `robustness`, and `ValueError` for a NaN, naming signal and time.
     """
     verdict = robustness(formula, trace, boolean, end, compat)
-    if not isinstance(verdict, jax.core.Tracer) and bool(jnp.any(jnp.isnan(verdict))):
+    if not isinstance(verdict, Tracer) and bool(jnp.any(jnp.isnan(verdict))):
         raise ValueError(f"no verdict: {_first_nan(_formula(formula), trace)}")
     return verdict > 0
 
@@ -177,7 +178,7 @@ def period(trace: Trace) -> float:
     """
     if trace.dt is not None:
         return float(trace.dt)
-    if isinstance(trace.times, jax.core.Tracer):
+    if isinstance(trace.times, Tracer):
         raise ValueError(
             "the sample times of a trace must be known before compiling; give it a period dt"
         )
@@ -203,10 +204,17 @@ def period(trace: Trace) -> float:
     return float(f"{dt:.9g}")
 
 
+def seconds(trace: Trace) -> Float[np.ndarray, " time"]:
+    """Sample times in double precision, whatever JAX computes in."""
+    if trace.dt is not None:
+        return np.arange(trace.length) * float(trace.dt)
+    return np.asarray(trace.times, float)
+
+
 def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
     horizon = formula.horizon(dt)
     length = trace.length
-    if trace.valid is not None and not isinstance(trace.valid, jax.core.Tracer):
+    if trace.valid is not None and not isinstance(trace.valid, Tracer):
         length = int(np.min(np.asarray(trace.valid)))
     duration = (length - 1) * dt
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
@@ -218,7 +226,7 @@ def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
 
 
 def _first_nan(formula: Formula, trace: Trace) -> str:
-    clock = np.asarray(trace.clock())
+    clock = seconds(trace)
     for name in formula.signals():
         signal = np.asarray(trace.signals[name])
         bad = np.isnan(signal.reshape(signal.shape[0], -1)).any(axis=1)

@@ -163,7 +163,7 @@ def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, f
         # A window that is exactly one block would be counted twice.
         far = (far, inside & ~_starts(n, length, reverse))
     else:
-        ahead = far = None
+        ahead, far = (), None
 
     def complete(pair: Any, row: Any) -> Any:
         value, end, weight, far = row
@@ -190,7 +190,7 @@ def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> 
 def _windowed_smooth_forward(
     n: int, reverse: bool, sign: int, x: Series, tau: Array
 ) -> tuple[Series, Any]:
-    y = windowed_smooth(n, reverse, sign, x, tau)
+    y: Any = windowed_smooth(n, reverse, sign, x, tau)
     return y, (x, y, tau)
 
 

@@ -114,7 +114,7 @@ def simplify(f: Formula) -> Formula:
     `eventually eventually`, and operators over `[0,0]`. Windows cut at the end of a trace
     (`end="truncate"`) may tell the nested windows apart where one is empty.
     """
-    f = _rebuilt(f, tuple(simplify(part) for part in f.operands()))
+    f = rebuilt(f, tuple(simplify(part) for part in f.operands()))
     match f:
         case ast.Not(ast.Not(inner)):
             return inner
@@ -170,7 +170,7 @@ def _simplified_join(parts: tuple[Formula, ...], neutral: Formula, absorbing: Fo
     return kept[0] if len(kept) == 1 else kind(kept)
 
 
-def _rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
+def rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
     """The same operator over other operands."""
     match f:
         case ast.And():
@@ -178,7 +178,7 @@ def _rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
         case ast.Or():
             return ast.Or(operands)
         case ast.Until() | ast.Since():
-            return type(f)(*operands, f.interval)
+            return type(f)(operands[0], operands[1], f.interval)
         case ast.Always() | ast.Eventually() | ast.Historically() | ast.Once():
             return type(f)(operands[0], f.interval)
         case ast.Next():

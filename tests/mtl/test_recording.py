@@ -1,0 +1,89 @@
+"""Recorded traces: files, gaps, clocks, and what is refused."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from verifai_jax.errors import UnknownNameError
+from verifai_jax.mtl import read, resample, robustness
+from verifai_jax.trace import Trace
+
+
+@pytest.fixture
+def flight(tmp_path):
+    file = tmp_path / "flight.csv"
+    file.write_text(
+        "time,x,p[0],p[1],label,armed\n0.0,1.0,3,4,a,true\n0.1,2.0,0,0,b,false\n0.2,,1,1,c,true\n"
+    )
+    return file
+
+
+def test_csv(flight):
+    trace = read(flight)
+    assert set(trace.signals) == {"x", "p", "armed"}
+    assert trace["p"].shape == (3, 2)
+    assert np.isnan(trace["x"][2])
+    assert robustness("norm(p) > 4", trace) == 1.0
+    assert robustness("F[0,0.1] (x > 0)", trace) == 2.0
+    assert robustness("G[0,0.1] armed", trace) == -1.0
+    assert set(read(flight, columns=["x"]).signals) == {"x"}
+
+
+def test_parquet_and_a_given_period(tmp_path):
+    file = tmp_path / "flight.parquet"
+    parquet.write_table(pa.table({"x": [1.0, 2.0, 3.0]}), file)
+    trace = read(file, dt=0.5)
+    assert trace.dt == 0.5
+    assert robustness("X (x > 0)", trace) == 2.0
+
+
+def test_resampling():
+    trace = Trace({"x": np.array([0.0, 1.0, 3.0])}, times=np.array([1.0, 1.1, 1.4]))
+    held = resample(trace, 0.1, "hold")
+    assert held.dt == 0.1
+    np.testing.assert_array_equal(held["x"], [0, 1, 1, 1, 3])
+    linear = resample(trace, 0.1, "linear")
+    np.testing.assert_allclose(linear["x"], [0, 1, 5 / 3, 7 / 3, 3])
+    np.testing.assert_allclose(resample(trace, 0.15, "linear")["x"], [0, 4 / 3, 7 / 3])
+    even = Trace({"x": np.arange(5.0), "on": np.arange(5) > 1}, dt=0.1, valid=4)
+    half = resample(even, 0.2, "linear")
+    np.testing.assert_allclose(half["x"], [0, 2])
+    assert half["on"].dtype == bool
+    gap = Trace({"x": np.array([0.0, 1.0, np.nan])}, dt=1.0)
+    np.testing.assert_array_equal(resample(gap, 0.5, "linear")["x"], [0, 0.5, 1, np.nan, np.nan])
+
+
+def test_bad_recordings(tmp_path, flight):
+    def file(text, name="bad.csv"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    with pytest.raises(FileNotFoundError, match="there is no recording"):
+        read(tmp_path / "none.csv")
+    with pytest.raises(ValueError, match=r"a \.csv or a \.parquet file; got bad\.txt"):
+        read(file("x\n1\n", "bad.txt"))
+    with pytest.raises(ValueError, match="has no rows"):
+        read(file("time,x\n"))
+    with pytest.raises(ValueError, match=r"no column 'time' of sample times.*It has: t, x"):
+        read(file("t,x\n0,1\n"))
+    with pytest.raises(ValueError, match=r"row 2 has 0\.2 s and row 3 0\.1 s"):
+        read(file("time,x\n0,1\n0.2,1\n0.1,1\n"))
+    with pytest.raises(
+        ValueError, match=r"column 'label' of .* holds no numbers; it starts with 'a'"
+    ):
+        read(flight, columns=["label"])
+    with pytest.raises(UnknownNameError, match="unknown column 'xx'; did you mean 'x'"):
+        read(flight, columns=["xx"])
+    with pytest.raises(ValueError, match="more than one column 'x'"):
+        read(file("time,x,x\n0,1,2\n"))
+    with pytest.raises(ValueError, match="cannot be read"):
+        read(file("not a table", "bad.parquet"))
+    with pytest.raises(ValueError, match="resampling needs both"):
+        read(flight, resample_to=0.1)
+    trace = Trace({"x": np.ones(3)}, times=np.array([0.0, 0.1, 0.3]))
+    with pytest.raises(ValueError, match="method is 'hold' or 'linear'; got 'cubic'"):
+        resample(trace, 0.1, "cubic")
+    with pytest.raises(ValueError, match="dt must be positive; got 0"):
+        resample(trace, 0, "hold")

@@ -1,0 +1,202 @@
+"""The text of formulas: what parses, what it means, and the wording of every refusal."""
+
+import pytest
+
+from verifai_jax.mtl import (
+    FALSE,
+    TRUE,
+    FormulaSyntaxError,
+    always,
+    eventually,
+    historically,
+    latex,
+    next_,
+    nnf,
+    once,
+    parse,
+    prev,
+    signal,
+    simplify,
+    since,
+    until,
+)
+
+X, Y, A, B = signal("x"), signal("y"), signal("a"), signal("b")
+
+
+@pytest.mark.parametrize(
+    ("text", "formula"),
+    [
+        ("x > 1", X > 1),
+        ("abs(x) <= 2.4 & abs(y) <= .5", (abs(X) <= 2.4) & (Y.abs() <= 0.5)),
+        ("always[0, 4] (x > 1)", always(X > 1, 0, 4)),
+        ("G[0:4] x > 1", always(X > 1, 0, 4)),
+        ("[] <> a", always(eventually(A))),
+        ("alw_[0,10] (a => ev_[0,500ms] b)", always(A >> eventually(B, 0, 0.5), 0, 10)),
+        ("F[1min, inf] a", eventually(A, 60)),
+        ("F[250us,1ms] a", eventually(A, 0.00025, 0.001)),
+        ("H[0,3](x >= 0) & (a S[2,6] b)", historically(X >= 0, 0, 3) & since(A, B, 2, 6)),
+        ("O a | hist b", once(A) | historically(B)),
+        ("X Y a", next_(prev(A))),
+        ("@ weak_prev a", next_(prev(A, weak=True))),
+        ("a U[0.2,0.6] b", until(A, B, 0.2, 0.6)),
+        ("a unless b", until(A, B) | always(A)),
+        ("a R b", ~until(~A, ~B)),
+        ("a <-> !b", always(A).operand.iff(~B)),
+        ("a xor b", always(A).operand ^ B),
+        ("a -> b and x < 3", A >> ((always(B).operand) & (X < 3))),
+        ("min(x, y, 1) / 4 > -x + 2*y - -3", X.min(Y, 1) / 4 > -X + 2 * Y - (-3)),
+        ("norm(p) > 1 & p[1] < 2", (signal("p").norm() > 1) & (signal("p")[1] < 2)),
+        ("sqrt(x) + sin(x) != cos(x)", (X.sqrt() + X.sin()).differs(X.cos())),
+        ("TRUE & !FALSE", TRUE & ~FALSE),
+        ('"ego speed [m/s]" > 2', signal("ego speed [m/s]") > 2),
+        ("ego.speed > 2", signal("ego.speed") > 2),
+        ("s > 1 & ms < 2", (signal("s") > 1) & (signal("ms") < 2)),
+        ("Gain > 0 & untilted", (signal("Gain") > 0) & signal("untilted")),
+        ("1e-3 < x & .5e1 > y", parse("0.001 < x & 5 > y")),
+    ],
+)
+def test_reads(text, formula):
+    parsed = parse(text)
+    assert parsed == formula
+    assert parse(str(parsed)) == parsed
+
+
+@pytest.mark.parametrize(
+    ("formula", "text"),
+    [
+        (always((abs(X) <= 2.4) & (Y > 0), 0, 4), "always[0,4] (abs(x) <= 2.4 & y > 0)"),
+        (
+            always((X > 1) >> eventually(Y > 0, 0, 0.5)),
+            "always (x > 1 -> eventually[0,0.5] (y > 0))",
+        ),
+        (until(X > 0, Y > 0, 1, 2), "(x > 0) until[1,2] (y > 0)"),
+        ((X > 0).weak_until(Y > 0), "(x > 0) weak_until (y > 0)"),
+        ((X > 0).release(Y > 0), "(x > 0) release (y > 0)"),
+        ((X > 0).iff(Y > 0), "x > 0 <-> y > 0"),
+        ((X > 0) ^ (Y > 0), "x > 0 ^ y > 0"),
+        (X - (Y - 1) > -2, "x - (y - 1) > -2"),
+        (signal("G") > 0, '"G" > 0'),
+        (signal("a b") > 0, '"a b" > 0'),
+    ],
+)
+def test_writes(formula, text):
+    assert str(formula) == text
+    assert parse(text) == formula
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a -> b -> c", "a chain of '->' is ambiguous: write a -> (b -> c) or (a -> b) -> c"),
+        ("a U b U c", "a chain of 'U' is ambiguous: write a U (b U c) or (a U b) U c"),
+        ("a <-> b <-> c", "a chain of '<->' is ambiguous"),
+        (
+            "always a and b",
+            "how far 'always' reaches is ambiguous: write always (a and b) or (always a) and b",
+        ),
+        ("always x > 1 -> b", "write always (x > 1 -> b) or (always x > 1) -> b"),
+        (
+            "a U b & c",
+            "until and its like beside '&' is ambiguous: put it in parentheses, as in (a U b)",
+        ),
+        ("a | b S c", "beside '|' is ambiguous: put it in parentheses, as in (b S c)"),
+        ("G[3,1] a", "an interval ends no earlier than it starts: write [1, 3]"),
+        ("G[-1,2] a", "an interval starts at 0 or later"),
+        ("G[inf,inf] a", "an interval starts at a finite time"),
+        ("G[a,2] x", "unknown constant 'a'"),
+        ("next[0,2] a", "'next' takes no interval"),
+        ("x >", "expected a signal or a number or '(', but found the end of the text"),
+        ("(x > 1", "expected ')', but found the end of the text"),
+        ("x > 1)", "there is no '(' for this ')'"),
+        ("a & & b", "but found '&'"),
+        ("x = 1", "'=' is no comparison: write == for equal, >= or <="),
+        ("0 < x < 1", "comparisons do not chain: write (0 < x) & (x < 1)"),
+        ("G[0,2 a", "expected a unit (s, ms, us, ns, min) or ']', but found 'a'"),
+        ("G[0] a", "expected ',' or ':', but found ']'"),
+        ("x ? 1", "but found '?'"),
+        ("foo(x) > 1", "unknown function 'foo'"),
+        ("sqr(x) > 1", "did you mean 'sqrt'?"),
+        ("abs(x, y) > 1", "abs takes one argument; got 2"),
+        ("min(x) > 1", "min takes two arguments or more; got 1"),
+        ("(a & b) + 1 > 2", "a number or a signal is needed here, not the formula '(a & b)'"),
+        ("abs(a & b) > 2", "a number or a signal is needed here, not the formula 'a & b'"),
+        ("3", "a formula is needed here, not the number 3"),
+        ("a & 3", "a formula is needed here, not the number 3"),
+        ("", "a formula is needed; got an empty text"),
+        ("a b", "but found 'b'"),
+        ("abs > 1", "abs is a function: write abs(...), or quote it if it is a signal"),
+        ("p[1.5] > 2", "a component is a signal and a whole number, as in p[0]"),
+        ("(x + y)[0] > 2", "a component is a signal and a whole number"),
+    ],
+)
+def test_refuses(text, message):
+    with pytest.raises(FormulaSyntaxError) as caught:
+        parse(text)
+    assert message in str(caught.value).split("\n")[0]
+
+
+def test_the_caret_stands_under_the_place():
+    with pytest.raises(FormulaSyntaxError) as caught:
+        parse("x > 1 &\n  y >= >= 2")
+    assert str(caught.value).split("\n")[1:] == ["    y >= >= 2", "         ^^"]
+    assert caught.value.position == 15
+
+
+def test_constants_and_definitions():
+    formula = parse(
+        "G[0,T] (safe -> x < vmax)",
+        constants={"T": 3, "vmax": 2.5, "margin": 0.1},
+        definitions={"far": Y > 1, "safe": "far & x > margin"},
+    )
+    assert formula == always(((Y > 1) & (X > 0.1)) >> (X < 2.5), 0, 3)
+    with pytest.raises(ValueError, match="'T' is both a constant and a definition"):
+        parse("T", constants={"T": 3}, definitions={"T": "x > 0"})
+    with pytest.raises(ValueError, match="a definition's name must be an identifier; got 'a b'"):
+        parse("x > 0", definitions={"a b": "x > 0"})
+    with pytest.raises(FormulaSyntaxError):
+        parse("safe", definitions={"safe": "x >"})
+    with pytest.raises(TypeError, match="a formula's text is a str; got int"):
+        parse(3)
+
+
+def test_python_refuses_what_makes_no_sense():
+    with pytest.raises(ValueError, match=r"ends no earlier than it starts; got \[3,1\]"):
+        always(X > 0, 3, 1)
+    with pytest.raises(ValueError, match=r"starts at a finite time, at least 0; got \[-1,1\]"):
+        always(X > 0, -1, 1)
+    with pytest.raises(TypeError, match="a number or a signal is needed here; got 'three'"):
+        X > "three"  # noqa: B015
+    with pytest.raises(TypeError, match="a formula is needed here; got 3"):
+        always(3)
+    with pytest.raises(ValueError, match="a number in a formula must be finite; got nan"):
+        float("nan") < X  # noqa: B015
+    with pytest.raises(ValueError, match="only a signal has components"):
+        (X + 1)[0]
+    with pytest.raises(ValueError, match="without quotes or line breaks"):
+        signal('a"b')
+
+
+def test_services():
+    formula = parse("G[0,2] (x > 0 -> F[0.5,1] (y > 0 U[0,3] z)) & O[0,9] w & x < 1")
+    assert formula.signals() == ("x", "y", "z", "w")
+    assert formula.horizon() == 6.0
+    assert parse("G[0,2] X X a").horizon(0.1) == pytest.approx(2.2)
+    assert parse("F G[0,1] a").horizon() == float("inf")
+    assert parse("H a").horizon() == 0
+    assert nnf(parse("!(G[0,1] (x > 0 & !a))")) == parse("F[0,1] (x <= 0 | a)")
+    assert nnf(parse("!(X (x == 1))")) == parse("X (x != 1)")
+    assert simplify(parse("G G[0.1,0.2] !!a & TRUE")) == parse("G[0.1,inf] a")
+    assert simplify(parse("G[0.1,0.2] G[0.2,0.4] a")) == parse("G[0.3,0.6] a")
+    assert simplify(parse("(a & a) | FALSE")) == parse("a")
+    assert simplify(parse("TRUE U[1,2] a")) == parse("F[1,2] a")
+    assert simplify(parse("a & FALSE")) == FALSE
+
+
+def test_latex():
+    text = latex(parse("G[0,4] (abs(x_1) <= 2 -> F (norm(p) / 2 > y & !a))"))
+    assert text == (
+        r"\Box_{[0, 4]} \left(\left|\mathit{x\_1}\right| \leq 2 \rightarrow "
+        r"\left(\Diamond \left(\frac{\left\lVert\mathit{p}\right\rVert}{2} > \mathit{y} \land "
+        r"\left(\lnot \left(\mathit{a}\right)\right)\right)\right)\right)"
+    )
