@@ -57,7 +57,7 @@ class CrossEntropy:
     least_elite: int = 6
     focus: float = 0.7
     exploration: float = 0.1
-    widening: float = 1.1
+    widening: float = 1.5
     least_std: float = 0.02
     patience: int = 6
     wants_gradient: ClassVar[bool] = False

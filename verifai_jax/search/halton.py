@@ -8,7 +8,6 @@ the base.
 """
 
 from dataclasses import dataclass
-from itertools import groupby
 from typing import ClassVar, NamedTuple
 
 import jax
@@ -69,14 +68,15 @@ def halton_points(
     index: UInt32[Array, " n"], dim: int, key: Key[Array, ""] | None = None
 ) -> Float[Array, "n dim"]:
     """Points number `index` of the Halton sequence, in `[0, 1)`; scrambled if there is a key."""
+    bases = np.array(primes(dim), np.uint32)
+    digits = np.array([_digits(int(base)) for base in bases], int)
+    maps = None if key is None else _digit_maps(key, bases, int(np.max(digits, initial=0)))
     blocks = [jnp.zeros((len(index), 0), jnp.float32)]
-    # Bases whose indices have equally many digits go together: one loop for all large ones.
-    for number, (digits, group) in enumerate(groupby(primes(dim), _digits)):
-        bases = np.array(list(group), np.uint32)
-        maps = None
-        if key is not None:
-            maps = _digit_maps(jax.random.fold_in(key, number), bases, digits)
-        blocks.append(_radical_inverse(index, bases, digits, maps))
+    # Bases whose indices have equally many digits go together: one loop for many large ones.
+    for count in sorted(set(digits.tolist()), reverse=True):
+        group = digits == count
+        chosen = None if maps is None else (maps[0][:count, group], maps[1][:count, group])
+        blocks.append(_radical_inverse(index, bases[group], count, chosen))
     return jnp.concatenate(blocks, axis=1)
 
 

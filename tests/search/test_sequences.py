@@ -1,0 +1,95 @@
+"""Uniform and Halton points against what is known of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from verifai_jax.search import Cube, Halton, Uniform
+from verifai_jax.search.halton import halton_points, primes
+
+
+def exact_inverse(index, base):
+    inverse, weight = 0.0, 1.0
+    while index:
+        weight /= base
+        index, figure = divmod(index, base)
+        inverse += weight * figure
+    return inverse
+
+
+def points(search, dim, count, seed=0):
+    cube = Cube((0,) * dim)
+    first = jax.jit(lambda key: search.ask(search.init(key, cube, count), cube, count)[0])
+    return np.asarray(first(jax.random.key(seed)))
+
+
+class TestHalton:
+    def test_the_first_points(self):
+        # Radical inverses of 1..8 in bases 2, 3, 5, 7, as VerifAI's Halton sampler gives them.
+        np.testing.assert_allclose(
+            points(Halton(), 4, 8),
+            [
+                [1 / 2, 1 / 3, 1 / 5, 1 / 7],
+                [1 / 4, 2 / 3, 2 / 5, 2 / 7],
+                [3 / 4, 1 / 9, 3 / 5, 3 / 7],
+                [1 / 8, 4 / 9, 4 / 5, 4 / 7],
+                [5 / 8, 7 / 9, 1 / 25, 5 / 7],
+                [3 / 8, 2 / 9, 6 / 25, 6 / 7],
+                [7 / 8, 5 / 9, 11 / 25, 1 / 49],
+                [1 / 16, 8 / 9, 16 / 25, 8 / 49],
+            ],
+            atol=1e-7,
+        )
+
+    def test_equals_scipy(self):
+        reference = stats.qmc.Halton(30, scramble=False).random(1001)[1:]
+        np.testing.assert_allclose(points(Halton(False), 30, 1000), reference, atol=2e-7)
+
+    def test_large_indices(self):
+        index = [2**24 + 1, 123_456_789, 2**31 - 2, 2**31 - 1, 2**32 - 1]
+        u = np.asarray(halton_points(jnp.array(index, jnp.uint32), 5))
+        expected = [[exact_inverse(i, base) for base in primes(5)] for i in index]
+        np.testing.assert_allclose(u, expected, atol=2e-7)
+        assert np.all(u < 1)
+
+    @pytest.mark.parametrize("search", [Halton(), Halton(scramble=True)])
+    def test_each_cell_gets_its_share(self, search):
+        # b^k points in a row fall one into each cell of width b^-k, scrambled or not.
+        u = points(search, 2, 3**4 * 2**4)
+        for j, cells in ((0, 2**4), (1, 3**4)):
+            counts = np.bincount((u[:, j] * cells).astype(int), minlength=cells)
+            assert counts.min() >= len(u) // cells - 1
+            assert counts.max() <= len(u) // cells + 1
+
+    def test_scrambled_coordinates_do_not_run_in_step(self):
+        def together(u):
+            return np.max(np.abs(np.corrcoef(u[:, -10:].T) - np.eye(10)))
+
+        plain, default = points(Halton(False), 40, 150), points(Halton(), 40, 150)
+        assert together(plain) > 0.7
+        # Independent points would give 0.08 as standard deviation.
+        assert together(default) < 0.4
+
+    def test_is_more_even_than_random(self):
+        even = stats.qmc.discrepancy(points(Halton(), 4, 256))
+        assert even < 0.35 * stats.qmc.discrepancy(points(Uniform(), 4, 256))
+
+    def test_primes(self):
+        assert primes(6) == [2, 3, 5, 7, 11, 13]
+        assert primes(0) == []
+        assert primes(200)[-1] == 1223
+        assert primes(1000)[-1] == 7919
+
+
+class TestUniform:
+    def test_is_uniform(self):
+        u = points(Uniform(), 3, 4000)
+        for j in range(3):
+            assert stats.kstest(u[:, j], "uniform").pvalue > 1e-3
+        assert np.max(np.abs(np.corrcoef(u.T) - np.eye(3))) < 0.06
+
+    def test_points_differ(self):
+        u = points(Uniform(), 1, 2000)
+        assert len(np.unique(u)) > 1990
