@@ -14,11 +14,12 @@ PACKAGE = ROOT / "verifai_jax"
 ALLOWED = {
     "errors": set(),
     "trace": set(),
+    "figure": set(),
     "devices": set(),
     "rates": set(),
     "features": {"errors"},
     "search": {"errors"},
-    "mtl": {"errors", "trace"},
+    "mtl": {"errors", "figure", "trace"},
     "systems": {"errors", "trace"},
     "table": {"errors"},
     "progress": set(),

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.figure import new_figure
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.explain import Explanation, Node, heading
@@ -25,7 +26,6 @@ _MOST_ROWS = 14
 
 def draw(explanation: Explanation, path: str | Path | None = None) -> Any:
     """Draw an explanation; returns the matplotlib figure, saved to `path` if one is given."""
-    from matplotlib.figure import Figure
     from matplotlib.patches import ConnectionPatch
 
     rows = _rows(explanation.tree)
@@ -35,7 +35,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Any:
         title = [*title[:3], "..."]
     head = 0.95 + 0.23 * (len(title) - 1)
     size = (11.0, 0.38 * sum(heights) + 0.12 * len(rows) + head + 0.6)
-    figure = Figure(figsize=size, facecolor="white")
+    figure = new_figure(figsize=size, facecolor="white")
     top, bottom = 1 - head / size[1], 0.5 / size[1]
     grid = figure.add_gridspec(
         len(rows),

@@ -39,6 +39,7 @@ def animate(replay: "Replay", path: str | Path) -> Path:
     # The last instant is the one that matters: it stays for a while.
     shown = [1000 / FRAMES_PER_SECOND] * (count - 1) + [1500]
     path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     images = [Image.fromarray(frame).quantize(colors=32) for frame in frames]
     images[0].save(path, save_all=True, append_images=images[1:], duration=shown, loop=0)
     return path

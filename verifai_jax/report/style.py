@@ -2,17 +2,18 @@
 
 from typing import Any
 
+from verifai_jax import figure
+
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
 WITHOUT_VERDICT = "#7f7f7f"
 BOUND = "#30323d"
+DPI = 110
 
 
 def new_figure(**options: Any) -> Any:
-    """A figure that belongs to no window: nothing pops up, nothing has to be closed."""
-    from matplotlib.figure import Figure
-
-    return Figure(layout="constrained", dpi=110, **options)
+    """A figure in the common layout and resolution."""
+    return figure.new_figure(layout="constrained", dpi=DPI, **options)
 
 
 def tidy(axes: Any) -> None:
@@ -22,8 +23,8 @@ def tidy(axes: Any) -> None:
     axes.set_axisbelow(True)
 
 
-def show_or_save(figure: Any, path: Any) -> Any:
+def show_or_save(drawn: Any, path: Any) -> Any:
     """Write the figure where a path is given; return it for a notebook to show."""
     if path is not None:
-        figure.savefig(path)
-    return figure
+        drawn.savefig(path)
+    return drawn
