@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.features.domain import (
+    LEAST_REAL,
     MOST_LEVELS,
     MOST_REAL,
     Domain,
@@ -29,8 +30,8 @@ class Box(Domain):
 
     **Arguments:** `low < high`, two finite numbers or two sequences of one length.
 
-    **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite, wider
-    apart than float32 can hold, or of different lengths.
+    **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
+    farther apart or nearer than float32 can hold, or of different lengths.
     """
 
     low: Any
@@ -65,8 +66,8 @@ class Box(Domain):
                 )
             if low > high:
                 raise ValueError(f"low must be below high in a Box; {shown}")
-            if max(high - low, abs(low), abs(high)) > MOST_REAL:
-                raise ValueError(f"a Box must fit into float32; {shown}")
+            if max(high - low, abs(low), abs(high)) > MOST_REAL or high - low < LEAST_REAL:
+                raise ValueError(f"a Box must fit into float32, as must its width; {shown}")
 
     @property
     def levels(self) -> tuple[int, ...]:

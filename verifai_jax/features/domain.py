@@ -22,6 +22,8 @@ from jaxtyping import Array, Float
 
 # Cells narrower than this could not be told apart in a float32 coordinate.
 MOST_LEVELS = 2**20
+# Below, XLA takes numbers for zero.
+LEAST_REAL = float(np.finfo(np.float32).tiny)
 MOST_REAL = float(np.finfo(np.float32).max)
 
 
