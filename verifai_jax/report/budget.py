@@ -31,8 +31,12 @@ def plot_budget(
         for label, each in runs.items():
             rho = _robustness(each)
             number = np.arange(1, len(rho) + 1)
-            (line,) = axes.plot(number, np.fmin.accumulate(rho), label=label, linewidth=1.8)
-            _mark_first(axes, rho, line.get_color())
+            failing = np.flatnonzero(rho < 0)
+            first = f"first failure: {failing[0] + 1:,}" if len(failing) else "no failure"
+            best = np.fmin.accumulate(rho)
+            (line,) = axes.plot(number, best, label=f"{label}  ({first})", linewidth=1.8)
+            if len(failing):
+                axes.plot(failing[0] + 1, rho[failing[0]], "o", color=line.get_color())
         axes.set_xscale("log")
         axes.legend(frameon=False)
     axes.axhline(0, color=BOUND, linewidth=1, linestyle="--")
