@@ -21,7 +21,7 @@ from verifai_jax.mtl import (
 from verifai_jax.trace import Trace
 
 # Every example is another program: compiling them would take far longer than running them.
-UNCOMPILED = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+UNCOMPILED = settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -83,7 +83,7 @@ def test_rewriting_keeps_the_value(formula, recording):
 
 
 @given(formulas(3), recordings(sizes=(6,)), st.sampled_from([0.05, 0.5]))
-@settings(UNCOMPILED, max_examples=60)
+@settings(UNCOMPILED, max_examples=30)
 def test_gradient_equals_finite_differences(formula, recording, tau):
     base = trace_of(recording)
     # Off the grid, because |x| and == have corners on it.

@@ -248,7 +248,7 @@ def test_not_a_number_is_never_a_verdict():
     assert not verdict
 
 
-@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
+@pytest.mark.parametrize("scale", [1e-5, 1e5])
 @pytest.mark.parametrize("tau", [1e-3, 10.0])
 def test_single_precision_is_finite_at_every_scale(scale, tau):
     rng = np.random.default_rng(1)

@@ -60,35 +60,45 @@ def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
 
 
 def _windowed(n: int, reverse: bool, sign: int, x: Series, keep: bool) -> tuple[Series, Any]:
+    """The windows, and if `keep` what the way back needs: three truth values a sample.
+
+    `newest` says whether the newest sample is a running maximum, in each of the scans; `near`
+    whether a window's value comes from the scan that began there.
+    """
     length = x.shape[0]
     lowest = jnp.full(x.shape[1:], -jnp.inf, x.dtype)
-    if n >= length:
 
-        def running(m: Array, row: Array) -> tuple[Array, Array]:
-            m = jnp.maximum(m, sign * row)
-            return m, sign * m
-
-        y = lax.scan(running, lowest, x, reverse=reverse)[1]
-        return y, (x, y, None, None)
-
-    def begin(m: Array, row: Any) -> tuple[Array, Array]:
+    def begin(m: Array, row: Any) -> tuple[Array, Any]:
         value, start = row
         value = sign * value
+        newest = start | (value >= m)
         m = jnp.where(start, value, jnp.maximum(m, value))
-        return m, m
+        return m, (m, newest) if keep else (m, None)
 
-    ahead = lax.scan(begin, lowest, (x, _starts(n, length, reverse)), reverse=not reverse)[1]
+    if n >= length:
+        no_starts = np.zeros(length, bool)
+        y, newest = lax.scan(begin, lowest, (x, no_starts), reverse=reverse)[1]
+        return sign * y, (newest, None)
+    starts = _starts(n, length, reverse)
+    ahead, newest_ahead = lax.scan(begin, lowest, (x, starts), reverse=not reverse)[1]
 
     def finish(m: Array, row: Any) -> tuple[Array, Any]:
         value, end, (far, inside) = row
         value = sign * value
+        newest = end | (value >= m)
         m = jnp.where(end, value, jnp.maximum(m, value))
-        y = sign * jnp.where(inside, jnp.maximum(m, _row(ahead, far)), m)
-        return m, (y, m) if keep else y
+        other = jnp.where(inside, _row(ahead, far), -jnp.inf)
+        y = sign * jnp.maximum(m, other)
+        return m, (y, _code(newest, m >= other)) if keep else (y, None)
 
     rows = (x, _ends(n, length, reverse), _far(n - 1, length, reverse))
-    out = lax.scan(finish, lowest, rows, reverse=reverse)[1]
-    return (out[0], (x, *out, ahead)) if keep else (out, None)
+    y, code = lax.scan(finish, lowest, rows, reverse=reverse)[1]
+    return y, (code, newest_ahead)
+
+
+def _code(a: Array, b: Array) -> Array:
+    # Two truth values in one byte: what is stored for the way back is what it costs.
+    return a.astype(jnp.uint8) + 2 * b.astype(jnp.uint8)
 
 
 def _windowed_forward(n: int, reverse: bool, sign: int, x: Series) -> tuple[Series, Any]:
@@ -100,32 +110,26 @@ def _windowed_backward(
 ) -> tuple[Series]:
     # Towards the greatest sample: what reaches a running maximum goes to its newest sample where
     # that one is the greatest, and on to the maximum before it where not.
-    x, y, near, ahead = residuals
-    length = x.shape[0]
-    nothing = jnp.zeros(x.shape[1:], g.dtype)
+    code, newest_ahead = residuals
+    length = g.shape[0]
+    nothing = jnp.zeros(g.shape[1:], g.dtype)
 
     def back_near(carry: Array, row: Any) -> tuple[Array, Array]:
-        g, value, m, y, start = row
-        m = sign * y if m is None else m
-        carry = jnp.where(start, 0.0, carry) + jnp.where(m >= sign * y, g, 0.0)
-        here = sign * value >= m
-        return jnp.where(here, 0.0, carry), jnp.where(here, carry, 0.0)
+        g, code = row
+        newest = (code & 1) != 0
+        carry = carry + (g if newest_ahead is None else jnp.where(code >= 2, g, 0.0))
+        return jnp.where(newest, 0.0, carry), jnp.where(newest, carry, 0.0)
 
-    starts = np.zeros(length, bool) if ahead is None else _starts(n, length, reverse)
-    rows = (g, x, near, y, starts)
-    first = lax.scan(back_near, nothing, rows, reverse=not reverse)[1]
-    if ahead is None:
+    first = lax.scan(back_near, nothing, (g, code), reverse=not reverse)[1]
+    if newest_ahead is None:
         return (first,)
 
     def back_ahead(carry: Array, row: Any) -> tuple[Array, Array]:
-        value, m, end, other, (far, inside) = row
-        taken = _row(near, far) >= sign * _row(y, far)
-        carry = jnp.where(end, 0.0, carry)
-        carry = carry + jnp.where(inside & ~taken, _row(g, far), 0.0)
-        here = sign * value >= m
-        return jnp.where(here, 0.0, carry), other + jnp.where(here, carry, 0.0)
+        newest, other, (far, inside) = row
+        carry = carry + jnp.where(inside & (_row(code, far) < 2), _row(g, far), 0.0)
+        return jnp.where(newest, 0.0, carry), other + jnp.where(newest, carry, 0.0)
 
-    rows = (x, ahead, _ends(n, length, reverse), first, _far(n - 1, length, not reverse))
+    rows = (newest_ahead, first, _far(n - 1, length, not reverse))
     return (lax.scan(back_ahead, nothing, rows, reverse=reverse)[1],)
 
 
@@ -211,13 +215,18 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: str) -> tuple[Array, Any]:
     """The last value of the recursion, and what to `keep` of each step.
 
-    `"u"` keeps the values, `"v"` the smaller of `f` and the value before, for the way back.
+    `"u"` keeps the values, `"v"` what the way back needs: the smaller of `f` and the value before,
+    or in the hard case where a value comes from: `g` at once, or else `f`.
     """
 
     def step(u: Array, row: Any) -> Any:
         f, g = row
-        v = jnp.minimum(f, u) if tau is None else -_greater(-f, -u, tau)
-        u = _greater(g, v, tau)
+        if tau is None:
+            inner = jnp.minimum(f, u)
+            v = (g >= inner, f <= u)
+        else:
+            inner = v = -_greater(-f, -u, tau)
+        u = _greater(g, inner, tau)
         return u, {"u": u, "v": v, "uv": (u, v), "": None}[keep]
 
     nothing = jnp.full(g.shape[1:], -jnp.inf if tau is None else -NEVER, g.dtype)
@@ -232,13 +241,14 @@ def _greater(a: Array, b: Array, tau: Any) -> Array:
 def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, Series]:
     """`pull` is the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
     f, g, v, tau = residuals
-    whole = pull.ndim == g.ndim
+    lanes = jnp.ndim(v if tau is not None else v[0]) - 1
+    whole = pull.ndim > lanes
 
     def step(carry: Array, row: Any) -> Any:
         pull, f, g, v = row
         carry = carry + pull if whole else carry
         if tau is None:
-            to_g, to_f = g >= v, f <= v
+            to_g, to_f = v
             down = jnp.where(to_g, 0.0, carry)
             return jnp.where(to_f, 0.0, down), (
                 jnp.where(to_f, down, 0.0),
@@ -249,7 +259,7 @@ def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, S
         to_f = jnp.exp(jnp.minimum(v - f, 0.0) / tau) * down
         return down - to_f, (to_f, to_g)
 
-    start = jnp.zeros_like(g[0]) if whole else pull
+    start = jnp.zeros_like(pull[0]) if whole else pull
     rows = (pull if whole else None, f, g, v)
     return lax.scan(step, start, rows, reverse=not reverse)[1]
 
@@ -262,7 +272,7 @@ def until(reverse: bool, f: Series, g: Series) -> Series:
 
 def _until_forward(reverse: bool, f: Series, g: Series) -> tuple[Series, Any]:
     u, v = _until(reverse, f, g, None, "uv")[1]
-    return u, (f, g, v, None)
+    return u, (None, None, v, None)
 
 
 until.defvjp(_until_forward, _until_backward)
@@ -294,7 +304,7 @@ def until_first(f: Series, g: Series) -> Array:
 
 def _until_first_forward(f: Series, g: Series) -> tuple[Array, Any]:
     u, v = _until(True, f, g, None, "v")
-    return u, (f, g, v, None)
+    return u, (None, None, v, None)
 
 
 def _until_first_backward(residuals: Any, pull: Array) -> tuple[Series, Series]:
