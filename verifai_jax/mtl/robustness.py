@@ -20,6 +20,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from verifai_jax.errors import unknown_name
+from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.certificate import Certificate, slack
 from verifai_jax.mtl.evaluate import End, Evaluator
@@ -342,9 +343,10 @@ def _in_chunks(
         for leaf in jax.tree.leaves(argument)
     }
     size = max(sizes, default=1)
-    count = -(-size // LANES)
-    if count < 2 or jax.default_backend() != "cpu":
+    # The engine's batches come in at most 512 lanes, which fit well enough as they are.
+    if size <= 2 * LANES or jax.default_backend() != "cpu":
         return function(*arguments)
+    count = -(-size // LANES)
     lanes = -(-size // count)
 
     def chunk(k: Array) -> Any:
@@ -384,6 +386,12 @@ def _in_chunks(
     return jax.lax.fori_loop(0, count, step, empty)
 
 
+def _nested(formula: Formula, within: bool = False) -> bool:
+    """Whether a temporal operator stands within another."""
+    temporal = not isinstance(formula, ast.Not | ast.And | ast.Or) and bool(formula.operands())
+    return (within and temporal) or any(_nested(p, within or temporal) for p in formula.operands())
+
+
 class _Root:
     """The value at time 0, and optionally its gradient: the work behind `robustness`."""
 
@@ -394,7 +402,10 @@ class _Root:
 
     def __call__(self, lanes: int, *arguments: Any) -> Any:
         work = functools.partial(self._work, lanes)
-        return _in_chunks(work, (1, 0, 0), self.out_axes, *arguments) if lanes else work(*arguments)
+        # One reduction makes no arrays in between, so there is nothing to keep in the cache.
+        if lanes and (self.gradient or _nested(self.setting.formula)):
+            return _in_chunks(work, (1, 0, 0), self.out_axes, *arguments)
+        return work(*arguments)
 
     def _work(self, lanes: int, signals: dict[str, Array], tau: Any, valid: Any) -> Any:
         def value(signals: dict[str, Array]) -> Array:
