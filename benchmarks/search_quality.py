@@ -18,11 +18,16 @@ from verifai_jax.targets import load_target
 
 BATCH = {"uniform": 512, "halton": 512, "cross_entropy": 16, "gradient": 8}
 
+# Unscrambled, Halton has one sequence for all seeds.
+SEARCH = {name: vj.search.named(name) for name in BATCH} | {
+    "halton": vj.search.Halton(scramble=True)
+}
+
 
 def first_failure(problem, name, seed, budget):
     """Number of the first failing simulation, counted from 1; the budget where there is none."""
     run = vj.falsify(
-        problem, name, budget, batch=BATCH[name], seed=seed, stop_after=1, progress=False
+        problem, SEARCH[name], budget, batch=BATCH[name], seed=seed, stop_after=1, progress=False
     )
     failing = np.flatnonzero(run.table.all["violated"])
     return (int(failing[0]) + 1, True) if len(failing) else (budget, False)

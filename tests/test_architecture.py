@@ -26,7 +26,7 @@ ALLOWED = {
     "problem": {"features", "mtl", "trace", "errors"},
     "engine": {"problem", "devices", "mtl", "trace"},
     "host": {"engine", "problem", "mtl", "trace"},
-    "run": {"engine", "problem", "rates", "table", "trace", "report"},
+    "run": {"engine", "mtl", "problem", "rates", "table", "trace", "report"},
     "falsify": {
         "engine",
         "errors",

@@ -29,6 +29,9 @@ def test_rows_are_what_was_simulated(problem):
     table = run.table.all
     assert len(table) == 500
     assert list(table.columns) == ["a", "b", "rho", "violated", "status"]
+    why = run.replay(run.best).explain()
+    assert str(why.predicate) == "x <= 1"
+    assert why.time == (1.0 if run.best["b"] > 0 else 0.0)
     expected = 1 - np.maximum(table["a"], table["a"] + table["b"])
     np.testing.assert_allclose(table["rho"], expected, atol=1e-6)
     assert (table["violated"] == (table["rho"] < 0)).all()

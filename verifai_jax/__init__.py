@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+from verifai_jax import mtl as mtl
 from verifai_jax import search as search
 from verifai_jax.devices import claim_cores as _claim_cores
 from verifai_jax.falsify import RunError as RunError
@@ -42,6 +43,7 @@ from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load
 from verifai_jax.systems import blackbox as blackbox
 from verifai_jax.systems import ode as ode
+from verifai_jax.systems import sin_cos as sin_cos
 from verifai_jax.table import ErrorTable as ErrorTable
 from verifai_jax.trace import Status as Status
 from verifai_jax.trace import Trace as Trace

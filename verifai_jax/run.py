@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from verifai_jax.engine import judge, simulation_key
+from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem import Problem
 from verifai_jax.rates import Rate, clopper_pearson
 from verifai_jax.table import ErrorTable
@@ -48,6 +49,21 @@ class Replay:
     def violated(self) -> bool:
         """Whether the simulation ended properly and breaks a formula."""
         return self.status == Status.OK and min(self.rho.values()) < 0
+
+    @property
+    def worst(self) -> str:
+        """Name of the formula with the least robustness."""
+        return min(self.rho, key=lambda name: float(np.nan_to_num(self.rho[name], nan=np.inf)))
+
+    def explain(self) -> Explanation:
+        """Which predicate decides the worst formula, when, and through which sub-formulas.
+
+        **Raises:** `ValueError` for a simulation without a verdict.
+        """
+        if self.status != Status.OK:
+            raise ValueError(f"no verdict to explain: the simulation is {self.status.name.lower()}")
+        formula = self.problem.formulas[self.worst]
+        return explain(formula, self.trace, end=self.problem.end)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the signals with the violated bound and instant marked; returns the figure."""

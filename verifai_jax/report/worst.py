@@ -23,7 +23,7 @@ def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
     Returns the figure.
     """
     trace = replay.trace
-    name = min(replay.rho, key=lambda n: np.nan_to_num(replay.rho[n], nan=np.inf))
+    name = replay.worst
     formula = replay.problem.formulas[name]
     monitored = [signal for signal in formula.signals() if signal in trace.signals]
     others = [signal for signal in trace.signals if signal not in monitored]
