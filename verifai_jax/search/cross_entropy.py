@@ -20,6 +20,7 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction
@@ -101,10 +102,11 @@ class CrossEntropy:
     def tell(self, state: CrossEntropyState, cube: Cube, evaluated: Evaluated) -> CrossEntropyState:
         usable = evaluated.counted & jnp.isfinite(evaluated.rho)
         score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
-        # New points come first: of equally good ones the sort keeps the newest.
-        points = jnp.concatenate([evaluated.u, state.elite])
+        # New points come first: of equally good ones the first, so the newest, are kept.
+        u = jnp.where(usable[:, None], evaluated.u, 0.5)
+        points = jnp.concatenate([u, state.elite])
         scores = jnp.concatenate([score, state.score])
-        best = jnp.argsort(scores, stable=True)[: len(state.score)]
+        _, best = jax.lax.top_k(-scores, len(state.score))
         level, before = scores[best[-1]], state.score[-1]
         progress = ~jnp.isfinite(before) | (level < 0.99 * before)
         stale = jnp.where(progress, 0, state.stale + 1)
@@ -118,34 +120,36 @@ class CrossEntropy:
     def _draw(
         self, key: Key[Array, ""], state: CrossEntropyState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
+        """Points from the mixture that the elite gives."""
+        cells = np.array([i for i in cube.discrete if cube.levels[i] <= MOST_CELLS], np.int32)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        random = jax.random.uniform(key, (batch, 1 + cube.dim + 2 * len(cells)), jnp.float32)
+        pick, noise, draw, inherit = jnp.split(
+            random, [1, 1 + cube.dim, 1 + cube.dim + len(cells)], axis=1
+        )
         weight = jnp.isfinite(state.score).astype(jnp.float32)
         count = jnp.maximum(jnp.sum(weight), 1.0)
-        pick_key, noise_key, cell_key, place_key = jax.random.split(key, 4)
-        # Elites are sorted: the ones that exist come first.
-        pick = jax.random.uniform(pick_key, (batch,), jnp.float32) * count
-        parent = state.elite[jnp.minimum(pick.astype(jnp.int32), len(weight) - 1)]
+        # The elite is sorted: the points that exist come first.
+        parent = state.elite[jnp.minimum((pick[:, 0] * count).astype(jnp.int32), len(weight) - 1)]
+
         mean = weight @ state.elite / count
         std = jnp.sqrt(weight @ (state.elite - mean) ** 2 / count)
         std = jnp.maximum(self.widening * std, self.least_std)
-        noise = jax.random.normal(noise_key, parent.shape, jnp.float32)
+        normal = ndtri(jnp.maximum(noise, np.float32(2**-25)))
         spread = float(np.sqrt(1 - self.focus**2))
-        u = jnp.clip(mean + self.focus * (parent - mean) + spread * std * noise, 0.0, 1.0)
-
-        cells = np.array([i for i in cube.discrete if cube.levels[i] <= MOST_CELLS], np.int32)
+        u = jnp.clip(mean + self.focus * (parent - mean) + spread * std * normal, 0.0, 1.0)
         if len(cells) == 0:
             return u
-        levels = np.array([cube.levels[i] for i in cells])
-        # Probabilities with one pseudo-count of the prior, so that no choice dies out.
-        seen = jnp.clip((state.elite[:, cells] * levels).astype(jnp.int32), 0, levels - 1)
+
+        levels = np.array([cube.levels[i] for i in cells], np.int32)
         exists = np.arange(levels.max()) < levels[:, None]
+        seen = jnp.clip((state.elite[:, cells] * levels).astype(jnp.int32), 0, levels - 1)
         counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(seen, levels.max()))
-        probability = (counts + exists / levels[:, None]) / (count + 1)
-        drawn = jnp.sum(
-            jax.random.uniform(cell_key, (batch, len(cells), 1), jnp.float32)
-            > jnp.cumsum(probability, axis=1),
-            axis=-1,
-        )
-        keep = jax.random.uniform(place_key, drawn.shape, jnp.float32) < self.focus**2
+        # With one pseudo-count of the prior, so that no choice dies out.
+        prior = (exists / levels[:, None]).astype(np.float32)
+        limits = jnp.cumsum((counts + prior) / (count + 1), axis=1)
+        drawn = jnp.sum(draw[:, :, None] > limits, axis=-1)
+        # Inherited as often as keeps the correlation that a continuous coordinate has.
         inherited = (parent[:, cells] * levels).astype(jnp.int32)
-        cell = jnp.clip(jnp.where(keep, inherited, drawn), 0, levels - 1)
+        cell = jnp.clip(jnp.where(inherit < self.focus**2, inherited, drawn), 0, levels - 1)
         return u.at[:, cells].set(((cell + 0.5) / levels).astype(jnp.float32))

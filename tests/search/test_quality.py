@@ -1,0 +1,144 @@
+"""How many simulations the active searches need on landscapes with a known failure rate.
+
+Uniform sampling needs log(2) / p in the median, p being the share of the cube that fails.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.search import CrossEntropy, Cube, Evaluated, Gradient
+
+BATCH, ROUNDS, SEEDS = 16, 24, 25
+BALL = jnp.array([0.3, 0.62, 0.71, 0.4])
+
+
+def ball(u):
+    """A cone whose tip fails: radius 0.1193 in four dimensions."""
+    return jnp.linalg.norm(u - BALL + 1e-9) - 0.1193
+
+
+def ridge(u):
+    """A narrow valley across three dimensions that sinks towards one place."""
+    along = jnp.array([1.0, 1.0, 0.5, -0.5]) / math.sqrt(2.5)
+    offset = u - jnp.array([0.75, 0.7, 0.4, 0.5])
+    distance = offset @ along
+    across = offset - distance * along
+    return jnp.sqrt(1e-6 + (distance / 4) ** 2 + across @ across) - 0.082
+
+
+def saddles(u):
+    """Two products, least in four of the sixteen corners."""
+    x = 2 * u - 1
+    return 1.5 - x[0] * x[1] - x[2] * x[3]
+
+
+def corner(u):
+    """A plane that fails in one corner, a simplex with legs of 0.39."""
+    return 4 - 0.39 - jnp.sum(u)
+
+
+def mixed(u):
+    """A cone in three dimensions for the right two of twelve combinations of two choices."""
+    wrong = 0.3 * (jnp.floor(u[3] * 4) != 2) + 0.3 * (jnp.floor(u[4] * 3) > 1)
+    return jnp.linalg.norm(u[:3] - jnp.array([0.3, 0.6, 0.8]) + 1e-9) - 0.112 + wrong
+
+
+FLAT = Cube((0, 0, 0, 0))
+LANDSCAPES = {  # name: robustness, cube, share that fails
+    "ball": (ball, FLAT, math.pi**2 / 2 * 0.1193**4),
+    "ridge": (ridge, FLAT, 9.2e-4),
+    "saddles": (saddles, FLAT, 7.9e-4),
+    "corner": (corner, FLAT, 0.39**4 / 24),
+    "mixed": (mixed, Cube((0, 0, 0, 4, 3)), 4 / 3 * math.pi * 0.112**3 / 6),
+}
+
+
+def play(search, landscapes, cube, batch=BATCH, rounds=ROUNDS, seeds=SEEDS):
+    """Points `[landscapes, seeds, rounds * batch, d]` and their robustness.
+
+    All landscapes in one program: compiling is what takes time.
+    """
+
+    def one(which, key):
+        def rho(u):
+            return jnp.stack([landscape(u) for landscape in landscapes])[which]
+
+        def step(state, _):
+            u, state = search.ask(state, cube, batch)
+            value, gradient = jax.vmap(jax.value_and_grad(rho))(u)
+            told = Evaluated(
+                u, value, jnp.ones(batch, bool), gradient if search.wants_gradient else None
+            )
+            return search.tell(state, cube, told), (u, value)
+
+        _, seen = jax.lax.scan(step, search.init(key, cube, batch), None, length=rounds)
+        return jax.tree.map(lambda leaf: leaf.reshape(rounds * batch, *leaf.shape[2:]), seen)
+
+    keys = jax.random.split(jax.random.key(11), seeds)
+    every = jax.vmap(jax.vmap(one, (None, 0)), (0, None))
+    u, value = jax.jit(every)(jnp.arange(len(landscapes)), keys)
+    return np.asarray(u), np.asarray(value)
+
+
+def first_median(value):
+    """Median over the seeds of the number of the first simulation that fails."""
+    failing = value < 0
+    return np.median(np.where(failing.any(1), failing.argmax(1) + 1.0, np.inf))
+
+
+@pytest.mark.parametrize("name", LANDSCAPES)
+def test_the_failure_rates_are_as_stated(name):
+    rho, cube, share = LANDSCAPES[name]
+    u = np.random.default_rng(0).random((2**18, cube.dim), np.float32)
+    failures = int(np.sum(jax.jit(jax.vmap(rho))(u) < 0))
+    assert abs(failures - share * 2**18) < 5 * math.sqrt(share * 2**18)
+
+
+@pytest.mark.parametrize(
+    ("search", "factor"), [(CrossEntropy(), 6), (Gradient(), 8)], ids=["cross_entropy", "gradient"]
+)
+def test_beats_uniform(search, factor):
+    medians = {}
+    for cube in {cube for _, cube, _ in LANDSCAPES.values()}:
+        group = {name: rho for name, (rho, its, _) in LANDSCAPES.items() if its == cube}
+        _, value = play(search, list(group.values()), cube)
+        medians |= dict(zip(group, map(first_median, value), strict=True))
+    uniform = {name: math.log(2) / share for name, (_, _, share) in LANDSCAPES.items()}
+    slow = {
+        name: (medians[name], uniform[name])
+        for name in LANDSCAPES
+        if medians[name] > uniform[name] / factor
+    }
+    assert not slow
+
+
+@pytest.mark.parametrize("search", [CrossEntropy(), Gradient()], ids=["cross_entropy", "gradient"])
+def test_goes_on_to_other_failures(search):
+    (u,), (value,) = play(search, [saddles], FLAT, rounds=60, seeds=8)
+    corners = [
+        len({tuple(p) for p in np.round(points[rho < 0]).astype(int)})
+        for points, rho in zip(u, value, strict=True)
+    ]
+    assert min(corners) >= 2
+    assert np.mean(corners) >= 3
+    # And goes on failing: at random it would be one in a thousand.
+    assert np.all(np.mean(value[:, value.shape[1] // 2 :] < 0, axis=1) > 0.03)
+
+
+def test_cross_entropy_never_stops_exploring():
+    (u,), _ = play(CrossEntropy(exploration=0.1), [corner], FLAT, rounds=60, seeds=4)
+    # Two of sixteen rows are always spread over the cube.
+    late = u[:, -320:].reshape(4, 20, 16, 4)[:, :, -2:]
+    assert np.all(np.abs(late.mean(axis=(0, 1, 2)) - 0.5) < 0.1)
+    assert np.all(late.std(axis=(0, 1, 2)) > 0.25)
+
+
+def test_cross_entropy_learns_in_large_batches_too():
+    _, (value,) = play(CrossEntropy(), [ball], FLAT, batch=512, rounds=6, seeds=4)
+    failing = (value < 0).reshape(4, 6, 512).mean(axis=2)
+    assert np.all(failing[:, -1] > 0.2)
+    assert np.all(failing[:, 0] < 0.02)
