@@ -7,4 +7,4 @@ import matplotlib
 
 matplotlib.use("Agg")
 
-import verifai_jax  # noqa: E402, F401 - before any test starts JAX's backend, as users should
+import verifai_jax  # noqa: F401 - before any test starts JAX's backend, as users should

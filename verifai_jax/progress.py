@@ -1,6 +1,7 @@
 """The progress bar of a run: simulations per second, best robustness, counterexamples, time left.
 
-Drawn by rich on the error stream, on a terminal, or in a notebook that has ipywidgets; nothing elsewhere.
+Drawn by rich on the error stream, on a terminal or in a notebook that has ipywidgets; nothing
+elsewhere.
 """
 
 import importlib.util
