@@ -8,6 +8,7 @@ A search is a frozen dataclass of hyper-parameters; its functions are pure and i
 pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing of features.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -98,11 +99,18 @@ class Search(Protocol):
         ...
 
 
-def check_fraction(name: str, value: Any, *, low_open: bool = True) -> None:
+def check_positive(name: str, value: Any) -> None:
+    """Raise `ValueError` unless `value` is a positive finite number."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and 0 < value < math.inf):
+        raise ValueError(f"{name} must be positive and finite; got {value!r}")
+
+
+def check_fraction(name: str, value: Any, *, or_zero: bool = False) -> None:
     """Raise `ValueError` unless `value` is a number in `(0, 1]`, or in `[0, 1]`."""
-    ok = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (ok and (0 < value <= 1 or (value == 0 and not low_open))):
-        raise ValueError(f"{name} must be in {'(' if low_open else '['}0, 1]; got {value!r}")
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and (0 < value <= 1 or (or_zero and value == 0))):
+        raise ValueError(f"{name} must be in {'[' if or_zero else '('}0, 1]; got {value!r}")
 
 
 def check_count(name: str, value: Any, least: int = 1) -> None:

@@ -1,16 +1,16 @@
 """Cross-entropy: sample around the best points seen, and look again.
 
 The method fits a parametric family to an elite of the samples and draws the next ones from the fit
-(de Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method, 2005, algorithm 2.1
-with level eq. 16; for failures the level stops at 0 as in algorithm 2.1, step 2, so that all
-failures are equally good and the fit covers their region instead of its deepest point).
+(de Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method, Annals of Operations
+Research 134, 2005). As in its algorithm for rare events the level of the elite stops at the event:
+all failures are equally good, and the fit covers their region instead of its deepest point.
 
 Three departures, all for small batches of expensive simulations:
 
 - the elite is kept over the rounds rather than taken from the last batch alone;
-- the family is a mixture with one component an elite point, shrunk towards the mean so that mean
-  and variance are those of the elite (West, Approximating posterior distributions by mixture,
-  1993): it follows several failure regions and narrow valleys, which one Gaussian cannot;
+- the family is a mixture with one component an elite point, shrunk towards the mean so that the
+  components do not add to the elite's variance (West, Approximating posterior distributions by
+  mixture, 1993): it follows several failure regions and narrow valleys, as one Gaussian cannot;
 - Gaussians are projected to the cube, not truncated: failures are often in its corners.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction
+from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction, check_positive
 from verifai_jax.search.halton import halton_points
 
 # More cells than this are an ordered quantity: a batch cannot fill a histogram of them.
@@ -36,6 +36,7 @@ class CrossEntropyState(NamedTuple):
     elite: Float[Array, "k d"]
     score: Float[Array, " k"]  # robustness, 0 for all failures; infinite where there is no point
     stale: Int[Array, ""]  # rounds without progress
+    explored: UInt32[Array, ""]  # how many points of the prior were asked for
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class CrossEntropy:
     - `elite`: size of the elite, as a share of the batch; at least `least_elite` points.
     - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the surroundings of elite points.
     - `exploration`: share of each batch drawn from the prior, for ever.
-    - `widening`: factor on the elite's standard deviation.
+    - `widening`: factor on the elite's standard deviation; above 1 it reaches out of the elite.
     - `least_std`: standard deviation, in unit coordinates, below which no coordinate narrows.
     - `patience`: rounds without progress after which it starts afresh elsewhere.
 
@@ -67,12 +68,11 @@ class CrossEntropy:
     def __post_init__(self) -> None:
         check_fraction("elite", self.elite)
         check_count("least_elite", self.least_elite, 2)
-        check_fraction("focus", self.focus, low_open=False)
+        check_fraction("focus", self.focus, or_zero=True)
         check_fraction("exploration", self.exploration)
         check_fraction("least_std", self.least_std)
         check_count("patience", self.patience)
-        if not (isinstance(self.widening, int | float) and self.widening > 0):
-            raise ValueError(f"widening must be positive; got {self.widening!r}")
+        check_positive("widening", self.widening)
 
     def check(self, cube: Cube) -> None:
         """Works on every cube."""
@@ -85,6 +85,7 @@ class CrossEntropy:
             elite=jnp.full((k, cube.dim), 0.5, jnp.float32),
             score=jnp.full(k, jnp.inf, jnp.float32),
             stale=jnp.int32(0),
+            explored=jnp.uint32(0),
         )
 
     def ask(
@@ -92,12 +93,15 @@ class CrossEntropy:
     ) -> tuple[Float[Array, "batch d"], CrossEntropyState]:
         key = jax.random.fold_in(state.key, state.round)
         fitted = self._draw(key, state, cube, batch)
-        index = 1 + state.round * batch + jnp.arange(batch, dtype=jnp.uint32)
-        prior = halton_points(index, cube.dim, state.key)
+        row = jnp.arange(batch, dtype=jnp.uint32)
         known = jnp.sum(jnp.isfinite(state.score)) >= 2
-        exploit = jnp.arange(batch) < batch - int(np.ceil(self.exploration * batch))
-        u = jnp.where((known & exploit)[:, None], fitted, prior)
-        return u, state._replace(round=state.round + 1)
+        exploited = jnp.where(known, batch - int(np.ceil(self.exploration * batch)), 0)
+        exploited = exploited.astype(jnp.uint32)
+        # Numbered without gaps: every 16th point of the sequence would stay in one half of it.
+        prior = halton_points(1 + state.explored + row - exploited, cube.dim, state.key)
+        u = jnp.where((row < exploited)[:, None], fitted, prior)
+        explored = state.explored + batch - exploited
+        return u, state._replace(round=state.round + 1, explored=explored)
 
     def tell(self, state: CrossEntropyState, cube: Cube, evaluated: Evaluated) -> CrossEntropyState:
         usable = evaluated.counted & jnp.isfinite(evaluated.rho)

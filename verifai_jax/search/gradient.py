@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction
+from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction, check_positive
 from verifai_jax.search.halton import halton_points
 
 BETA1, BETA2, EPSILON = 0.5, 0.9, 1e-12
@@ -29,7 +29,7 @@ class GradientState(NamedTuple):
     stale: Int[Array, " batch"]  # steps without progress
     starts: UInt32[Array, ""]  # how many starts were made
     round: Int[Array, ""]
-    scale: Float[Array, ""]  # of the robustness
+    scale: Float[Array, ""]  # of the robustness; 0 until a batch shows it
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,7 @@ class Gradient:
         for name in ("learning_rate", "decay", "least_rate"):
             check_fraction(name, getattr(self, name))
         for name in ("hot", "cold"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 < value < float("inf")):
-                raise ValueError(f"{name} must be positive; got {value!r}")
+            check_positive(name, getattr(self, name))
         check_count("cooling", self.cooling)
         check_count("patience", self.patience)
 
@@ -90,7 +88,7 @@ class Gradient:
             stale=jnp.zeros(batch, jnp.int32),
             starts=jnp.uint32(batch),
             round=jnp.int32(0),
-            scale=jnp.float32(1),
+            scale=jnp.float32(0),
         )
 
     def ask(
@@ -101,7 +99,8 @@ class Gradient:
     def temperature(self, state: GradientState) -> Float[Array, ""]:
         """Geometric from `hot` to `cold`, relative to the spread of the robustness."""
         progress = jnp.minimum(state.round / self.cooling, 1.0).astype(jnp.float32)
-        return state.scale * self.hot * (self.cold / self.hot) ** progress
+        scale = jnp.where(state.scale > 0, state.scale, 1.0)
+        return scale * self.hot * (self.cold / self.hot) ** progress
 
     def tell(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
         assert evaluated.gradient is not None, "the gradient search needs gradients"
@@ -110,9 +109,9 @@ class Gradient:
         rho = jnp.where(usable, evaluated.rho, jnp.inf)
         usable &= jnp.all(jnp.isfinite(evaluated.gradient), axis=1)
         gradient = jnp.where(usable[:, None] & free, evaluated.gradient, 0.0)
-        # Divided by its length, so that squares neither overflow nor vanish.
-        length = jnp.max(jnp.abs(gradient), axis=1, keepdims=True, initial=0.0)
-        gradient = gradient / jnp.where(length > 0, length, 1.0)
+        # Divided by its largest entry, so that squares neither overflow nor vanish.
+        largest = jnp.max(jnp.abs(gradient), axis=1, keepdims=True, initial=0.0)
+        gradient = gradient / jnp.where(largest > 0, largest, 1.0)
 
         step = state.step + 1
         first = BETA1 * state.first + (1 - BETA1) * gradient
@@ -138,7 +137,7 @@ class Gradient:
                 step=step,
                 stale=stale.astype(jnp.int32),
                 round=state.round + 1,
-                scale=jnp.where(state.round == 0, _spread(rho), state.scale),
+                scale=jnp.where(state.scale > 0, state.scale, _spread(rho)),
             ),
             cube,
             again,
@@ -163,9 +162,9 @@ class Gradient:
 
 
 def _spread(rho: Float[Array, " n"]) -> Float[Array, ""]:
-    """Standard deviation of the finite entries; 1 where there is none."""
+    """Standard deviation of the finite entries, or where it is zero their mean size."""
     finite = jnp.isfinite(rho)
     count = jnp.maximum(jnp.sum(finite), 1)
     mean = jnp.sum(jnp.where(finite, rho, 0.0)) / count
     std = jnp.sqrt(jnp.sum(jnp.where(finite, (rho - mean) ** 2, 0.0)) / count)
-    return jnp.where(std > 0, std, 1.0).astype(jnp.float32)
+    return jnp.where(std > 0, std, jnp.abs(mean)).astype(jnp.float32)
