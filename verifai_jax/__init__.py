@@ -25,6 +25,7 @@ from verifai_jax.mtl import hard as hard
 from verifai_jax.mtl import historically as historically
 from verifai_jax.mtl import next_ as next_
 from verifai_jax.mtl import once as once
+from verifai_jax.mtl import online as online
 from verifai_jax.mtl import parse as parse
 from verifai_jax.mtl import prev as prev
 from verifai_jax.mtl import robustness as robustness
