@@ -325,10 +325,18 @@ class TestRefusedBeforeAnythingCompiles:
             vj.falsify(problem, **options)
 
     def test_a_misspelt_option_names_itself(self, problem):
-        with pytest.raises(TypeError, match="max_second"):
+        with pytest.raises(ValueError, match="'max_second'; did you mean 'max_seconds'"):
             vj.falsify(problem, max_second=3)
         with pytest.raises(ValueError, match=r"'elit'.*did you mean 'elite"):
             vj.search.named("cross_entropy", elit=0.1)
+        with pytest.raises(ValueError, match="'controler'; did you mean 'controller'"):
+            vj.ode(None, None, dt=0.1, steps=3, controler=None)
+
+    def test_a_misspelt_feature_names_itself(self):
+        with pytest.raises(ValueError, match="'theta'; did you mean 'theta0'"):
+            vj.Problem(
+                "typo", {"theta0": vj.Box(0, 1)}, ramp, "always x < 1", nominal={"theta": 0.5}
+            )
 
     def test_a_formula_over_a_signal_that_is_not_there(self):
         problem = vj.Problem("typo", space=SPACE, system=ramp, spec="always xx <= 1")

@@ -5,7 +5,13 @@ UnknownNameError: unknown search 'halten'; did you mean 'halton'? Known: uniform
 """
 
 import difflib
-from collections.abc import Iterable
+import functools
+import inspect
+from collections.abc import Callable, Iterable
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class UnknownNameError(ValueError):
@@ -27,3 +33,15 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
     for name in names:
         if name not in known:
             raise unknown_name(kind, name, known)
+
+
+def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords."""
+    known = list(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def checked(*arguments: P.args, **options: P.kwargs) -> R:
+        check_names(f"option of {function.__name__}", options, known)
+        return function(*arguments, **options)
+
+    return checked

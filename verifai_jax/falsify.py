@@ -16,6 +16,7 @@ import numpy as np
 import verifai_jax
 from verifai_jax import search as searches
 from verifai_jax.engine import Evaluation, engine_for
+from verifai_jax.errors import suggests_options
 from verifai_jax.host import HostEngine
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
@@ -35,6 +36,7 @@ class RunError(RuntimeError):
         self.run = run
 
 
+@suggests_options
 def falsify(
     problem: Problem,
     search: str | Search = "cross_entropy",

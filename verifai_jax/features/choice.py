@@ -127,8 +127,11 @@ class Categorical(Domain):
     def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
         index = np.asarray(values)
         if self.numeric:
-            distance = np.abs(index.astype(np.float64)[:, None] - self._shown.astype(np.float64))
-            index = np.argmin(distance, axis=1)
+            # The nearest one: a system sees 0.1 as float32, the table shows 0.1.
+            numbers = self._shown.astype(np.float64)
+            order = np.argsort(numbers)
+            middles = (numbers[order][1:] + numbers[order][:-1]) / 2
+            index = order[np.searchsorted(middles, index.astype(np.float64))]
         return {name: self._shown[index]}
 
     def from_columns(self, row: Mapping[str, Any], name: str) -> Any:

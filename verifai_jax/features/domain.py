@@ -101,6 +101,7 @@ def as_real(value: Any) -> Float[Array, "*shape"]:
 
 
 def as_number(value: Any, what: str) -> float:
+    """One number; `what` names it in the error."""
     if not isinstance(value, bool | np.bool_ | str | bytes):
         try:
             return float(value)
@@ -110,6 +111,7 @@ def as_number(value: Any, what: str) -> float:
 
 
 def as_numbers(value: Any, name: str) -> np.ndarray:
+    """A concrete number or an array of them, in float64; `name` names it in the error."""
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
@@ -129,18 +131,22 @@ def as_scalar(value: Any) -> Any:
 
 
 def as_tuple(value: Any) -> Any:
+    """Nested tuples instead of nested lists."""
     return tuple(map(as_tuple, value)) if isinstance(value, list) else value
 
 
 def indexed(name: str, count: int) -> tuple[str, ...]:
+    """`name[0]`, `name[1]`, ..."""
     return tuple(f"{name}[{i}]" for i in range(count))
 
 
 def listed(choices: Sequence[Any]) -> str:
+    """Choices for a message."""
     return ", ".join(map(repr, choices))
 
 
 def short(value: Any) -> str:
+    """A number, or a tuple of them, as a person would write it."""
     if isinstance(value, tuple):
         return "[" + ", ".join(map(short, value)) + "]"
     if isinstance(value, float) and value == int(value if math.isfinite(value) else 0):

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from verifai_jax.errors import suggests_options
 from verifai_jax.systems.integrators import integrator
 from verifai_jax.systems.structure import (
     check_like,
@@ -232,6 +233,7 @@ def _whole(seconds: float, dt: float, name: str) -> int:
     return steps
 
 
+@suggests_options
 def ode(
     dynamics: Callable[..., Any],
     initial: Callable[..., Any],
