@@ -25,7 +25,7 @@ from verifai_jax.problem import Problem
 from verifai_jax.trace import Status, Trace
 
 CHUNK = 512  # Lanes worked on together: about 1 MB of a 200-sample trace with two signals.
-FORWARD_MODE_LIMIT = 16  # Features up to which a forward sweep each beats one reverse sweep.
+FORWARD_MODE_LIMIT = 4  # Features up to which a forward sweep each is no slower than one reverse.
 
 
 class Evaluation(NamedTuple):
