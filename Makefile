@@ -50,10 +50,17 @@ lint: .venv/lint
 notebooks: .venv/installed
 	$(BIN)/python notebooks/execute.py
 
-bench: .venv/installed
-	$(BIN)/python benchmarks/throughput.py
-	$(BIN)/python benchmarks/search_quality.py
-	$(BIN)/python benchmarks/monitor.py
+# The monitors to compare with pin old versions of what others use newer ones of, so they get an
+# environment of their own, without the constraints.
+.venv-bench/installed: pyproject.toml
+	$(PYTHON) -m venv .venv-bench
+	.venv-bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]'
+	@touch $@
+
+bench: .venv-bench/installed
+	.venv-bench/bin/python benchmarks/throughput.py
+	.venv-bench/bin/python benchmarks/search_quality.py
+	.venv-bench/bin/python benchmarks/monitor.py
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole
@@ -65,4 +72,4 @@ wheel: .venv/lint
 	sh tests/wheel_smoke.sh dist/*.whl
 
 clean:
-	rm -rf .venv dist build .pytest_cache .ruff_cache
+	rm -rf .venv .venv-bench dist build .pytest_cache .ruff_cache

@@ -223,7 +223,7 @@ class Table:
         if self.markdown:
             print("| " + " | ".join(cells) + " |", flush=True)
         else:
-            print(f"{cells[0]:22s}" + "".join(f"{cell:>13s}" for cell in cells[1:]), flush=True)
+            print(f"{cells[0]:22s}" + "".join(f" {cell:>12s}" for cell in cells[1:]), flush=True)
 
     def note(self, text: str) -> None:
         print(f"\n{text}\n" if self.markdown else text, flush=True)
