@@ -75,8 +75,8 @@ def main():
     """Measure and print one line a side."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=9)
-    parser.add_argument("--simulations", type=int, default=65536, help="a round")
-    parser.add_argument("--batch", type=int, default=8192, help="of the engine")
+    parser.add_argument("--simulations", type=int, default=131_072, help="a round")
+    parser.add_argument("--batch", type=int, default=32_768, help="of the engine")
     options = parser.parse_args()
     n = options.simulations - options.simulations % options.batch
 
