@@ -99,10 +99,12 @@ def telling_features(run: "Run") -> list[str]:
             return _distance(failing[name].to_numpy(), safe[name].to_numpy())
     else:
         proper = table.loc[table["status"] == "ok"]
+        if len(np.unique(proper["rho"].to_numpy())) < 2:
+            return varying or list(run.table.features)
         rho = proper["rho"].rank()
 
         def score(name: str) -> float:
-            return float(np.nan_to_num(abs(np.corrcoef(proper[name].rank(), rho)[0, 1])))
+            return abs(float(proper[name].rank().corr(rho)))
 
     ranked = sorted(numeric, key=score, reverse=True)
     return ranked or list(run.table.features)
