@@ -22,6 +22,7 @@ BETA1, BETA2, EPSILON = 0.5, 0.9, 1e-12
 class GradientState(NamedTuple):
     key: Key[Array, ""]
     u: Float[Array, "batch d"]
+    restart: Bool[Array, " batch"]  # rows that take a new start instead of `u`
     first: Float[Array, "batch d"]  # moments of the gradient
     second: Float[Array, "batch d"]
     best: Float[Array, " batch"]  # least robustness since the start
@@ -77,16 +78,16 @@ class Gradient:
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GradientState:
         zeros = jnp.zeros((batch, cube.dim), jnp.float32)
-        starts = jnp.arange(1, batch + 1, dtype=jnp.uint32)
         return GradientState(
             key=key,
-            u=halton_points(starts, cube.dim, key),
+            u=zeros,
+            restart=jnp.ones(batch, bool),
             first=zeros,
             second=zeros,
             best=jnp.full(batch, jnp.inf, jnp.float32),
             step=jnp.zeros(batch, jnp.int32),
             stale=jnp.zeros(batch, jnp.int32),
-            starts=jnp.uint32(batch),
+            starts=jnp.uint32(0),
             round=jnp.int32(0),
             scale=jnp.float32(0),
         )
@@ -94,7 +95,20 @@ class Gradient:
     def ask(
         self, state: GradientState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], GradientState]:
-        return state.u, state
+        index = state.starts + jnp.cumsum(state.restart).astype(jnp.uint32)
+        fresh = halton_points(index, cube.dim, state.key)
+        row = state.restart[:, None]
+        u = jnp.where(row, fresh, state.u)
+        return u, state._replace(
+            u=u,
+            restart=jnp.zeros(batch, bool),
+            first=jnp.where(row, 0.0, state.first),
+            second=jnp.where(row, 0.0, state.second),
+            best=jnp.where(state.restart, jnp.inf, state.best),
+            step=jnp.where(state.restart, 0, state.step),
+            stale=jnp.where(state.restart, 0, state.stale),
+            starts=index[-1],
+        )
 
     def temperature(self, state: GradientState) -> Float[Array, ""]:
         """Geometric from `hot` to `cold`, relative to the spread of the robustness."""
@@ -127,37 +141,16 @@ class Gradient:
         better |= jnp.isinf(state.best) & jnp.isfinite(rho)
         stale = jnp.where(better, 0, state.stale + 1)
         stuck = jnp.all(moved == evaluated.u, axis=1)
-        again = ~usable | stuck | (rho < 0) | (stale >= self.patience)
-        return self._restarted(
-            state._replace(
-                u=moved,
-                first=first,
-                second=second,
-                best=jnp.minimum(state.best, rho),
-                step=step,
-                stale=stale.astype(jnp.int32),
-                round=state.round + 1,
-                scale=jnp.where(state.scale > 0, state.scale, _spread(rho)),
-            ),
-            cube,
-            again,
-        )
-
-    def _restarted(
-        self, state: GradientState, cube: Cube, again: Bool[Array, " batch"]
-    ) -> GradientState:
-        """Rows marked `again` take the next starts, in order."""
-        index = state.starts + jnp.cumsum(again).astype(jnp.uint32)
-        fresh = halton_points(index, cube.dim, state.key)
-        row = again[:, None]
         return state._replace(
-            u=jnp.where(row, fresh, state.u),
-            first=jnp.where(row, 0.0, state.first),
-            second=jnp.where(row, 0.0, state.second),
-            best=jnp.where(again, jnp.inf, state.best),
-            step=jnp.where(again, 0, state.step),
-            stale=jnp.where(again, 0, state.stale),
-            starts=index[-1],
+            u=moved,
+            restart=~usable | stuck | (rho < 0) | (stale >= self.patience),
+            first=first,
+            second=second,
+            best=jnp.minimum(state.best, rho),
+            step=step,
+            stale=stale.astype(jnp.int32),
+            round=state.round + 1,
+            scale=jnp.where(state.scale > 0, state.scale, _spread(rho)),
         )
 
 
