@@ -115,7 +115,7 @@ class Engine:
         - `temperature`: of the smooth robustness that is differentiated; unused without gradient.
         """
         n = len(u)
-        arguments = (_pad(u, self.padded), key, jnp.int32(first), jnp.float32(temperature))
+        arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(temperature))
         rho, status, features, gradient = self._executable("evaluate")(*arguments)
         return Evaluation(
             rho=np.asarray(rho)[:n],
@@ -126,7 +126,7 @@ class Engine:
 
     def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
         """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
-        arguments = (_pad(u, self.padded), key, jnp.int32(first), jnp.float32(1.0))
+        arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(1.0))
         return np.asarray(self._executable("verdicts")(*arguments))[: len(u)]
 
     def _executable(self, mode: str) -> Any:
