@@ -21,6 +21,7 @@ SPACES = {
     "one feature": {"a": vj.Box(0, 1)},
     "discrete": {"a": vj.DiscreteBox(0, 1), "c": vj.Categorical(0, 1)},
     "names": {"a": vj.Box(0, 1), "color": vj.Categorical("red", "blue")},
+    "nothing varies": {"a": vj.Constant(1.0)},
     "never finite": {"a": vj.Box(0, 1), "broken": vj.Constant(1.0)},
 }
 

@@ -42,6 +42,10 @@ def plot_features(
         from verifai_jax.errors import check_names
 
         check_names("feature", features, run.table.features)
+    if not features:
+        figure = new_figure(figsize=(4, 1))
+        figure.text(0.5, 0.5, f"{run.name}: no feature varies", ha="center", va="center")
+        return show_or_save(figure, path)
     if len(features) == 1:
         features = [features[0], features[0]]
     pairs = list(combinations(features, 2))
