@@ -58,6 +58,19 @@ def test_passive_searches_do_not_depend_on_the_batch(problem, search):
     np.testing.assert_allclose(one["rho"], two["rho"], atol=1e-6)
 
 
+@pytest.mark.parametrize("search", ["uniform", "gradient"])
+def test_results_do_not_depend_on_a_users_64_bit_setting(search):
+    def run():
+        problem = vj.Problem("ramp", space=SPACE, system=ramp, spec="always[0, 1] x <= 1")
+        return vj.falsify(problem, search, 48, batch=16, seed=2).table.all
+
+    plain = run()
+    with jax.enable_x64(True):
+        wide = run()
+    assert (wide.dtypes == plain.dtypes).all()
+    np.testing.assert_allclose(wide["rho"], plain["rho"], atol=1e-5)
+
+
 def test_random_systems_replay_and_do_not_depend_on_the_batch():
     def noisy(features, key):
         return vj.Trace({"x": features["a"] + jax.random.normal(key, (4,))}, dt=1.0)

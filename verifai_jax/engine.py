@@ -183,7 +183,7 @@ class Engine:
         if not self.gradient:
             features = self.problem.space.unflatten(u)
             rho, status = judge(self.problem, self.problem.system(features, key))
-            return rho, status, features, ()
+            return rho.astype(u.dtype), status, features, ()
 
         def objective(u: Array) -> tuple[Array, Any]:
             features = self.problem.space.unflatten(u)
@@ -199,7 +199,7 @@ class Engine:
             derivative, (rho, status, features) = _forward(objective, u)
         else:
             derivative, (rho, status, features) = jax.grad(objective, has_aux=True)(u)
-        return rho, status, features, derivative
+        return rho.astype(u.dtype), status, features, derivative.astype(u.dtype)
 
     def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
         trace = self.problem.system(self.problem.space.unflatten(u), key).hold()
@@ -214,7 +214,7 @@ def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"],
         return jax.jvp(objective, (u,), (direction,), has_aux=True)
 
     # Only the tangents depend on the direction: the simulation itself is done once.
-    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(jnp.eye(u.shape[0]))
+    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(jnp.eye(u.shape[0], dtype=u.dtype))
     return derivative, aux
 
 
