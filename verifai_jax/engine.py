@@ -214,7 +214,8 @@ def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"],
         return jax.jvp(objective, (u,), (direction,), has_aux=True)
 
     # Only the tangents depend on the direction: the simulation itself is done once.
-    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(jnp.eye(u.shape[0], dtype=u.dtype))
+    directions = jnp.eye(u.shape[0], dtype=u.dtype)
+    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(directions)
     return derivative, aux
 
 
