@@ -167,9 +167,11 @@ def test_at_zero_the_comparator_decides(spec, violated):
         system=lambda f, key: vj.Trace({"x": f["a"] * jnp.ones(3)}, dt=1.0),
         spec=spec,
     )
-    table = vj.falsify(problem, "uniform", 32, batch=32).table.all
+    run = vj.falsify(problem, "uniform", 32, batch=32)
+    table = run.table.all
     assert set(table["a"]) == {0, 1}
     assert (table["violated"] == ((table["a"] == 0) & violated)).all()
+    assert run.replay(run.best).violated == violated
 
 
 def test_several_formulas_give_a_column_each():

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.mtl import robustness, satisfied, smooth
@@ -65,6 +65,13 @@ def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], In
     status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
     status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
     return jnp.where(status == Status.OK, rho, jnp.nan), status
+
+
+def verdict(problem: Problem, trace: Trace) -> Bool[Array, " formulas"]:
+    """Whether each formula holds on one trace: what decides where robustness is exactly zero."""
+    trace = trace.hold()
+    formulas = problem.formulas.values()
+    return jnp.stack([satisfied(formula, trace, end=problem.end) for formula in formulas])
 
 
 class Engine:
@@ -202,9 +209,7 @@ class Engine:
         return rho.astype(u.dtype), status, features, derivative.astype(u.dtype)
 
     def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
-        trace = self.problem.system(self.problem.space.unflatten(u), key).hold()
-        formulas = self.problem.formulas.values()
-        return jnp.stack([satisfied(formula, trace, end=self.problem.end) for formula in formulas])
+        return verdict(self.problem, self.problem.system(self.problem.space.unflatten(u), key))
 
 
 def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"], Any]:

@@ -6,12 +6,10 @@ A simulation that raises becomes a row with status ERROR and its message; the ot
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.engine import Evaluation, judge, simulation_key
-from verifai_jax.mtl import satisfied
+from verifai_jax.engine import Evaluation, judge, simulation_key, verdict
 from verifai_jax.problem import Problem
 from verifai_jax.trace import Status, Trace
 
@@ -24,11 +22,7 @@ class HostEngine:
         self.compile_seconds = 0.0
         self._unflatten = jax.jit(jax.vmap(problem.space.unflatten))
         self._judge = jax.jit(lambda trace: judge(problem, trace))
-        self._verdict = jax.jit(
-            lambda trace: jnp.stack(
-                [satisfied(f, trace.hold(), end=problem.end) for f in problem.formulas.values()]
-            )
-        )
+        self._verdict = jax.jit(lambda trace: verdict(problem, trace))
 
     def compile(self) -> None:
         """Nothing to do: monitors compile when the first trace shows its length."""

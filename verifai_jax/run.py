@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.engine import judge, simulation_key
+from verifai_jax.engine import judge, simulation_key, verdict
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem import Problem
 from verifai_jax.rates import Rate, clopper_pearson
@@ -48,7 +48,9 @@ class Replay:
     @property
     def violated(self) -> bool:
         """Whether the simulation ended properly and breaks a formula."""
-        return self.status == Status.OK and min(self.rho.values()) < 0
+        if self.status != Status.OK or min(self.rho.values()) != 0:
+            return self.status == Status.OK and min(self.rho.values()) < 0
+        return not bool(jnp.all(verdict(self.problem, self.trace)))
 
     @property
     def worst(self) -> str:
@@ -77,7 +79,8 @@ class Run:
     """What `falsify` returns.
 
     **Fields:** `name` and `formulas` (texts) of the problem; `table`; `search` (its repr), `seed`
-    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"` or `"interrupted"`;
+    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"interrupted"`, the error
+    that ended it, or `"running"` for one that was cut off;
     `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
     independent samples of the feature space; `folder` on disk, if any; `target`: how the command
     line names the problem; `problem` itself, None for a loaded run without one.
@@ -162,10 +165,10 @@ class Run:
         return _summary(self)
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the feature space with safe and failing samples, and robustness over the budget."""
-        from verifai_jax.report import plot_run
+        """Draw the feature space with safe and failing samples; returns the figure."""
+        from verifai_jax.report import plot_features
 
-        return plot_run(self, path)
+        return plot_features(self, path)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: `run.json` and `table.parquet`; returns the folder."""
@@ -301,7 +304,7 @@ def _summary(run: Run) -> str:
         )
     if failures + len(run.table.safe):
         best = run.best
-        where = ", ".join(f"{name}={_short(best[name])}" for name in run.table.features)
+        where = told({name: best[name] for name in run.table.features})
         lines.append(
             f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
             f"robustness {best['rho']:.4g} at {where}"
@@ -321,5 +324,9 @@ def _summary(run: Run) -> str:
     return "\n".join(lines)
 
 
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
+def told(features: Mapping[str, Any]) -> str:
+    """Features as a person reads them: `x0=0.1353, alg=sac`."""
+    return ", ".join(
+        f"{name}={value:.4g}" if isinstance(value, (float, np.floating)) else f"{name}={value}"
+        for name, value in features.items()
+    )

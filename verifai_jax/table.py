@@ -119,10 +119,7 @@ class ErrorTable:
     def save(self, folder: Path) -> None:
         """Write the rows to `folder` as one Parquet file."""
         folder.mkdir(parents=True, exist_ok=True)
-        # A reader never meets a half-written file under the final name.
-        partial = folder / f"{FINISHED}.part"
-        self.all.to_parquet(partial)
-        partial.replace(folder / FINISHED)
+        _write(self.all, folder)
 
     def __repr__(self) -> str:
         return (
@@ -154,10 +151,15 @@ class _Stream:
         if self._writer is not None:
             self._writer.close()
             self._file.close()
-        partial = self.folder / f"{FINISHED}.part"
-        frame.to_parquet(partial)
-        partial.replace(self.folder / FINISHED)
+        _write(frame, self.folder)
         (self.folder / STREAM).unlink(missing_ok=True)
+
+
+def _write(frame: "pd.DataFrame", folder: Path) -> None:
+    # A reader never meets a half-written file under the final name.
+    partial = folder / f"{FINISHED}.part"
+    frame.to_parquet(partial)
+    partial.replace(folder / FINISHED)
 
 
 def _read(folder: Path) -> "pd.DataFrame":

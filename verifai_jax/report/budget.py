@@ -31,7 +31,7 @@ def plot_budget(
         for label, each in runs.items():
             rho = _robustness(each)
             number = np.arange(1, len(rho) + 1)
-            failing = np.flatnonzero(rho < 0)
+            failing = _failing(each)
             first = f"first failure: {failing[0] + 1:,}" if len(failing) else "no failure"
             best = np.fmin.accumulate(rho)
             (line,) = axes.plot(number, best, label=f"{label}  ({first})", linewidth=1.8)
@@ -51,18 +51,17 @@ def _one(axes: Any, run: "Run") -> None:
     number = np.arange(1, len(rho) + 1)
     shown = np.unique(np.linspace(0, len(rho) - 1, DOTS).astype(int))
     # The counterexamples are what one looks for: they are never thinned out.
-    shown = np.union1d(shown, np.flatnonzero(rho < 0)[:DOTS])
-    colors = np.where(rho[shown] < 0, FAILING, SAFE)
+    failing = _failing(run)
+    shown = np.union1d(shown, failing[:DOTS])
+    colors = np.where(np.isin(shown, failing), FAILING, SAFE)
     axes.scatter(number[shown], rho[shown], c=colors, s=5, alpha=0.5, linewidths=0)
     axes.plot(number, np.fmin.accumulate(rho), color=BOUND, linewidth=1.6, label="best so far")
-    _mark_first(axes, rho, FAILING)
-    failures = int(np.sum(rho < 0))
-    axes.set_title(f"{run.name}: {failures:,} of {len(rho):,} simulations violate the property")
+    _mark_first(axes, rho, failing)
+    axes.set_title(f"{run.name}: {len(failing):,} of {len(rho):,} simulations violate the property")
     axes.legend(frameon=False, loc="upper right")
 
 
-def _mark_first(axes: Any, rho: np.ndarray, color: str) -> None:
-    failing = np.flatnonzero(rho < 0)
+def _mark_first(axes: Any, rho: np.ndarray, failing: np.ndarray) -> None:
     if len(failing):
         first = failing[0]
         axes.annotate(
@@ -71,11 +70,16 @@ def _mark_first(axes: Any, rho: np.ndarray, color: str) -> None:
             textcoords="offset points",
             xytext=(24, 48),
             fontsize=8,
-            color=color,
+            color=FAILING,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.8},
+            arrowprops={"arrowstyle": "-", "color": FAILING, "linewidth": 0.8},
         )
 
 
 def _robustness(run: "Run") -> np.ndarray:
     return run.table.all["rho"].to_numpy(float)
+
+
+def _failing(run: "Run") -> np.ndarray:
+    """Row numbers of the counterexamples."""
+    return run.table.counterexamples.index.to_numpy()

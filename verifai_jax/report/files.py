@@ -1,7 +1,7 @@
 """The pictures of a run in its folder: features.png, robustness.png, worst.png, worst.gif."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from verifai_jax.report.animation import animate
 from verifai_jax.report.budget import plot_budget
@@ -37,8 +37,3 @@ def draw_replay(replay: "Replay", folder: str | Path, name: str | None = None) -
     if replay.problem.draw is not None:
         paths.append(animate(replay, folder / f"{name}.gif"))
     return paths
-
-
-def plot_run(run: "Run", path: str | Path | None = None) -> Any:
-    """Draw the feature space of a run; see `plot_budget` for its course."""
-    return plot_features(run, path)

@@ -1,7 +1,7 @@
 """One simulation: its signals, the bounds they must keep, and the instant that decided."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -9,15 +9,13 @@ from verifai_jax.mtl import Formula, explain, robustness_signal
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal
 from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.run import Replay, told
 from verifai_jax.trace import Trace
-
-if TYPE_CHECKING:
-    from verifai_jax.run import Replay
 
 MOST_PANELS = 6
 
 
-def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
+def plot_replay(replay: Replay, path: str | Path | None = None) -> Any:
     """Draw the signals over time, the monitored first, with bounds, violations and the instant.
 
     Returns the figure.
@@ -47,7 +45,7 @@ def plot_replay(replay: "Replay", path: str | Path | None = None) -> Any:
         _mark(panels[shown.index(decisive[0])], trace, *decisive)
     panels[-1].set_xlabel("time [s]")
     verdict = "violated" if replay.violated else replay.status.name.lower()
-    where = ", ".join(f"{k}={_short(v)}" for k, v in _flat(replay).items())
+    where = told(_flat(replay))
     figure.suptitle(
         f"{formula}\nrobustness {replay.rho[name]:.4g} ({verdict}) at {where}"[:400],
         fontsize=9,
@@ -147,12 +145,8 @@ def _mark(axes: Any, trace: Trace, signal: str, sample: int) -> None:
     )
 
 
-def _flat(replay: "Replay") -> dict[str, Any]:
+def _flat(replay: Replay) -> dict[str, Any]:
     import jax
 
     one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], replay.features)
     return {name: column[0] for name, column in replay.problem.space.rows(one).items()}
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, (float, np.floating)) else str(value)
