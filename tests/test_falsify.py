@@ -218,6 +218,22 @@ class TestBlackBox:
         )
         assert "'x'" in run.table.all["message"][0]
 
+    @pytest.mark.parametrize(
+        ("spec", "violated"), [("always x >= 0", False), ("always x > 0", True)]
+    )
+    def test_at_zero_the_comparator_decides_without_simulating_again(self, spec, violated):
+        calls = []
+
+        def simulate(features):
+            calls.append(features["n"])
+            return vj.Trace({"x": np.full(3, float(features["n"]))}, dt=1.0)
+
+        problem = vj.Problem("zero", {"n": vj.DiscreteBox(0, 1)}, vj.blackbox(simulate), spec)
+        table = vj.falsify(problem, "uniform", 16, batch=8).table.all
+        assert set(table["n"]) == {0, 1}
+        assert (table["violated"] == ((table["n"] == 0) & violated)).all()
+        assert len(calls) == 16
+
     def test_gradients_are_refused(self):
         with pytest.raises(ValueError, match="black box, which has no gradient"):
             vj.falsify(self.problem(lambda f: None), "gradient", 10)

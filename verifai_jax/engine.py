@@ -34,6 +34,8 @@ class Evaluation(NamedTuple):
     `rho` is `[n, formulas]`, hard robustness; NaN where the status is not OK. `gradient` is
     `[n, d]`, of the least smooth robustness with respect to the unit coordinates. `features` are
     the simulated values. `messages` say what a black box raised, one a row, empty where nothing.
+    `holds` are its Boolean verdicts where the robustness is exactly zero; None where `verdicts` has
+    to be asked.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -41,6 +43,7 @@ class Evaluation(NamedTuple):
     features: dict[str, Any]
     gradient: Float[np.ndarray, "n d"] | None = None
     messages: list[str] | None = None
+    holds: Bool[np.ndarray, "n formulas"] | None = None
 
 
 def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array, ""]:

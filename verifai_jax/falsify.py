@@ -169,10 +169,12 @@ class _Rounds:
         undecided = proper & ~violated & np.any(evaluation.rho == 0, axis=1)
         if undecided.any():
             # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
-            compiled = self.engine.compile_seconds
-            satisfied = self.engine.verdicts(u[:n], self.simulation_key, first)
-            self.compile_seconds += self.engine.compile_seconds - compiled
-            violated |= undecided & ~np.all(satisfied, axis=1)
+            holds = evaluation.holds
+            if holds is None:
+                compiled = self.engine.compile_seconds
+                holds = self.engine.verdicts(u[:n], self.simulation_key, first)
+                self.compile_seconds += self.engine.compile_seconds - compiled
+            violated |= undecided & ~np.all(holds, axis=1)
         self.state = self.program.tell(
             self.state,
             Evaluated(

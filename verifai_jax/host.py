@@ -39,27 +39,19 @@ class HostEngine:
         n = len(u)
         rho = np.full((n, len(self.problem.formulas)), np.nan, np.float32)
         status = np.full(n, Status.ERROR, np.int32)
+        holds = np.ones(rho.shape, bool)
         messages = [""] * n
         for i in range(n):
             try:
-                trace = self._simulate(features, i, simulation_key(key, first + i))
-                judged = self._judge(pad_trace(trace))
-                rho[i], status[i] = np.asarray(judged[0]), int(judged[1])
+                trace = pad_trace(self._simulate(features, i, simulation_key(key, first + i)))
+                values, code = jax.device_get(self._judge(trace))
+                if np.any(values == 0):
+                    # Now, while the trace is here: simulating again may be dear.
+                    holds[i] = np.asarray(self._verdict(trace))
+                rho[i], status[i] = values, code
             except Exception as error:
                 messages[i] = f"{type(error).__name__}: {error}"
-        return Evaluation(rho=rho, status=status, features=features, messages=messages)
-
-    def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
-        """Boolean semantics `[n, formulas]`; see `engine.Engine`."""
-        features = jax.tree.map(np.asarray, self._unflatten(u))
-        verdicts = np.ones((len(u), len(self.problem.formulas)), bool)
-        for i in range(len(u)):
-            try:
-                trace = self._simulate(features, i, simulation_key(key, first + i))
-                verdicts[i] = np.asarray(self._verdict(pad_trace(trace)))
-            except Exception:
-                continue
-        return verdicts
+        return Evaluation(rho, status, features, messages=messages, holds=holds)
 
     def _simulate(self, features: Any, i: int, key: Key[Array, ""]) -> Trace:
         trace = self.problem.system(jax.tree.map(lambda leaf: leaf[i], features), key)
