@@ -159,7 +159,12 @@ def test_samples_behind_the_end_do_not_count():
     np.testing.assert_allclose(run.table.all["rho"], 0.5 - run.table.all["a"], atol=1e-6)
 
 
-@pytest.mark.parametrize(("spec", "violated"), [("always x >= 0", False), ("always x > 0", True)])
+AT_ZERO = pytest.mark.parametrize(
+    ("spec", "violated"), [("always x >= 0", False), ("always x > 0", True)]
+)
+
+
+@AT_ZERO
 def test_at_zero_the_comparator_decides(spec, violated):
     problem = vj.Problem(
         "edge",
@@ -218,9 +223,7 @@ class TestBlackBox:
         )
         assert "'x'" in run.table.all["message"][0]
 
-    @pytest.mark.parametrize(
-        ("spec", "violated"), [("always x >= 0", False), ("always x > 0", True)]
-    )
+    @AT_ZERO
     def test_at_zero_the_comparator_decides_without_simulating_again(self, spec, violated):
         calls = []
 

@@ -15,7 +15,7 @@ import numpy as np
 
 import verifai_jax
 from verifai_jax import search as searches
-from verifai_jax.engine import Evaluation, engine_for
+from verifai_jax.engine import Engine, Evaluation, engine_for
 from verifai_jax.errors import suggests_options
 from verifai_jax.host import HostEngine
 from verifai_jax.problem import Problem
@@ -171,6 +171,7 @@ class _Rounds:
             # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
             holds = evaluation.holds
             if holds is None:
+                assert isinstance(self.engine, Engine)
                 compiled = self.engine.compile_seconds
                 holds = self.engine.verdicts(u[:n], self.simulation_key, first)
                 self.compile_seconds += self.engine.compile_seconds - compiled
