@@ -8,11 +8,13 @@ A search is a frozen dataclass of hyper-parameters; its functions are pure and i
 pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing of features.
 """
 
+import abc
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -21,18 +23,45 @@ from jaxtyping import Array, Bool, Float, Int, Key
 class Cube:
     """The unit cube `[0, 1]^d` with the prior uniform on it.
 
-    **Arguments:** `levels`: for each coordinate 0 if it is continuous, or the number `n >= 1` of
-    its equally wide cells, inside which points mean the same.
+    **Arguments:** for each coordinate
 
-    **Raises:** `ValueError` for a negative level.
+    - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
+      mean the same.
+    - `weights`: the probabilities of its cells, which are their widths; None where they are equal.
+    - `ordered`: whether its cells have an order; all of them when left out.
+    - `names`: what it is called, such as `cars[0].x`; nothing when left out.
+
+    and `lengths`: which coordinates are lengths of arrays, on which others depend.
+
+    **Raises:** `ValueError` for a negative level, or entries that do not go with the levels.
     """
 
     levels: tuple[int, ...]
+    weights: tuple[tuple[float, ...] | None, ...] = ()
+    ordered: tuple[bool, ...] = ()
+    names: tuple[str, ...] = ()
+    lengths: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", tuple(int(level) for level in self.levels))
         if any(level < 0 for level in self.levels):
             raise ValueError(f"levels must not be negative; got {self.levels}")
+        for name, default in (("weights", None), ("ordered", True), ("names", "")):
+            given = tuple(getattr(self, name)) or (default,) * self.dim
+            if len(given) != self.dim:
+                raise ValueError(f"{name} must have {self.dim} entries, as levels; got {given}")
+            object.__setattr__(self, name, given)
+        for level, weights in zip(self.levels, self.weights, strict=True):
+            if weights is not None and not (
+                len(weights) == level
+                and all(weight > 0 for weight in weights)
+                and abs(math.fsum(weights) - 1) < 1e-6
+            ):
+                raise ValueError(
+                    f"{level} cells need {level} positive weights that sum to one; got {weights}"
+                )
+        if not all(0 <= i < self.dim and self.levels[i] for i in self.lengths):
+            raise ValueError(f"lengths must be discrete coordinates; got {self.lengths}")
 
     @property
     def dim(self) -> int:
@@ -48,6 +77,44 @@ class Cube:
     def discrete(self) -> Int[np.ndarray, " k"]:
         """Indices of the discrete coordinates."""
         return np.flatnonzero(np.array(self.levels, np.int64) > 0)
+
+    @cached_property
+    def probabilities(self) -> tuple[Float[np.ndarray, " cells"], ...]:
+        """The prior of the cells, for each discrete coordinate."""
+        return tuple(
+            np.full(self.levels[i], 1 / self.levels[i])
+            if self.weights[i] is None
+            else np.array(self.weights[i], np.float64)
+            for i in self.discrete
+        )
+
+    def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
+        """Which cell holds each discrete coordinate of these points."""
+        points = jnp.asarray(u)[..., self.discrete]
+        counts = np.array([self.levels[i] for i in self.discrete], np.int32)
+        found = jnp.clip((points * counts).astype(jnp.int32), 0, counts - 1)
+        for j, edges in self._edges:
+            place = jnp.searchsorted(edges[1:-1], points[..., j], side="right")
+            found = found.at[..., j].set(place.astype(jnp.int32))
+        return found
+
+    def centres(self, cells: Int[Array, "*n k"]) -> Float[Array, "*n k"]:
+        """The middles of these cells, as coordinates."""
+        counts = np.array([self.levels[i] for i in self.discrete], np.float32)
+        middles = ((jnp.asarray(cells) + 0.5) / counts).astype(jnp.float32)
+        for j, edges in self._edges:
+            centre = (edges[1:] + edges[:-1]) / 2
+            middles = middles.at[..., j].set(jnp.asarray(centre)[cells[..., j]])
+        return middles
+
+    @cached_property
+    def _edges(self) -> tuple[tuple[int, Float[np.ndarray, " edges"]], ...]:
+        """Where the unequal cells begin and end, by place among the discrete coordinates."""
+        return tuple(
+            (j, np.concatenate([[0], np.cumsum(self.probabilities[j])]).astype(np.float32))
+            for j, i in enumerate(self.discrete)
+            if self.weights[i] is not None
+        )
 
 
 class Evaluated(NamedTuple):
@@ -65,38 +132,49 @@ class Evaluated(NamedTuple):
     gradient: Float[Array, "n d"] | None = None
 
 
-class Search(Protocol):
+class Search(abc.ABC):
     """The contract; `verifai_jax.testing.check_search` tests it.
 
     `cube` and `batch` are static under `jit`. A state from `init` with one `batch` takes part in
-    calls with that `batch` only.
+    calls with that `batch` only. `ask` may be called several times before a `tell`: where a
+    constraint refuses rows, they are replaced by the same rows of the next proposals.
     """
 
-    wants_gradient: ClassVar[bool]
+    wants_gradient: ClassVar[bool] = False
     """Whether `tell` needs `Evaluated.gradient`."""
 
-    samples_prior: ClassVar[bool]
+    samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""
 
-    def check(self, cube: Cube) -> None:
-        """Raise `ValueError` if this search cannot work on this cube."""
-        ...
+    learns: ClassVar[bool] = True
+    """Whether `tell` changes what is asked next; False for sequences fixed from the start."""
 
+    def check(self, cube: Cube) -> None:  # noqa: B027 - most searches work on every cube
+        """Raise `ValueError` if this search cannot work on this cube."""
+
+    def total(self, cube: Cube) -> int | None:
+        """How many points there are in all; None where they never end."""
+        return None
+
+    @abc.abstractmethod
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> Any:
         """The state before the first round; all randomness comes from `key`."""
-        ...
 
+    @abc.abstractmethod
     def ask(self, state: Any, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], Any]:
         """The next points to simulate."""
-        ...
 
+    @abc.abstractmethod
     def tell(self, state: Any, cube: Cube, evaluated: Evaluated) -> Any:
-        """Learn from the points of the last `ask`."""
-        ...
+        """Learn from the points of the last `ask`, which are in `evaluated`, row by row."""
+
+    def warm(self, state: Any, cube: Cube, evaluated: Evaluated) -> Any:
+        """Learn from points of an earlier table, a batch of them, before the first `ask`."""
+        return self.tell(state, cube, evaluated)
 
     def temperature(self, state: Any) -> Float[Array, ""]:
         """Of the smooth robustness to differentiate next; only where `wants_gradient`."""
-        ...
+        raise NotImplementedError(f"{type(self).__name__} uses no gradient")
 
 
 def check_positive(name: str, value: Any) -> None:

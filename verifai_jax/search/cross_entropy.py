@@ -15,7 +15,7 @@ Three departures, all for small batches of expensive simulations:
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,14 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction, check_positive
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
 from verifai_jax.search.halton import halton_points
 
 # More cells than this are an ordered quantity: a batch cannot fill a histogram of them.
@@ -40,7 +47,7 @@ class CrossEntropyState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CrossEntropy:
+class CrossEntropy(Search):
     """Cross-entropy over Gaussian and categorical mixtures around the best points so far.
 
     **Arguments:**
@@ -62,8 +69,6 @@ class CrossEntropy:
     widening: float = 1.5
     least_std: float = 0.02
     patience: int = 6
-    wants_gradient: ClassVar[bool] = False
-    samples_prior: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_fraction("elite", self.elite)
@@ -73,9 +78,6 @@ class CrossEntropy:
         check_fraction("least_std", self.least_std)
         check_count("patience", self.patience)
         check_positive("widening", self.widening)
-
-    def check(self, cube: Cube) -> None:
-        """Works on every cube."""
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CrossEntropyState:
         k = max(self.least_elite, int(np.ceil(self.elite * batch)))
@@ -125,7 +127,11 @@ class CrossEntropy:
         self, key: Key[Array, ""], state: CrossEntropyState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
         """Points from the mixture that the elite gives."""
-        cells = np.array([i for i in cube.discrete if cube.levels[i] <= MOST_CELLS], np.int32)
+        # Places among the discrete coordinates, and their indices among all.
+        narrow = np.array(
+            [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MOST_CELLS], np.int32
+        )
+        cells = cube.discrete[narrow]
         # One call for all random numbers: each costs a good part of a second to compile.
         random = jax.random.uniform(key, (batch, 1 + cube.dim + 2 * len(cells)), jnp.float32)
         pick, noise, draw, inherit = jnp.split(
@@ -146,14 +152,16 @@ class CrossEntropy:
             return u
 
         levels = np.array([cube.levels[i] for i in cells], np.int32)
-        exists = np.arange(levels.max()) < levels[:, None]
-        seen = jnp.clip((state.elite[:, cells] * levels).astype(jnp.int32), 0, levels - 1)
+        prior = np.zeros((len(cells), levels.max()), np.float32)
+        for row, j in zip(prior, narrow, strict=True):
+            row[: len(cube.probabilities[j])] = cube.probabilities[j]
+        seen = cube.cells(state.elite)[:, narrow]
         counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(seen, levels.max()))
         # With one pseudo-count of the prior, so that no choice dies out.
-        prior = (exists / levels[:, None]).astype(np.float32)
         limits = jnp.cumsum((counts + prior) / (count + 1), axis=1)
         drawn = jnp.sum(draw[:, :, None] > limits, axis=-1)
         # Inherited as often as keeps the correlation that a continuous coordinate has.
-        inherited = (parent[:, cells] * levels).astype(jnp.int32)
-        cell = jnp.clip(jnp.where(inherit < self.focus**2, inherited, drawn), 0, levels - 1)
-        return u.at[:, cells].set(((cell + 0.5) / levels).astype(jnp.float32))
+        inherited = cube.cells(parent)
+        cell = jnp.where(inherit < self.focus**2, inherited[:, narrow], drawn)
+        cell = inherited.at[:, narrow].set(jnp.clip(cell, 0, levels - 1).astype(jnp.int32))
+        return u.at[:, cells].set(cube.centres(cell)[:, narrow])

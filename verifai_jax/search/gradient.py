@@ -13,7 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, check_count, check_fraction, check_positive
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
 from verifai_jax.search.halton import halton_points
 
 BETA1, BETA2, EPSILON = 0.5, 0.9, 1e-12
@@ -34,7 +41,7 @@ class GradientState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Gradient:
+class Gradient(Search):
     """Multi-start Adam on the smooth robustness; discrete coordinates keep their start's value.
 
     **Arguments:**
@@ -58,7 +65,6 @@ class Gradient:
     cooling: int = 10
     patience: int = 4
     wants_gradient: ClassVar[bool] = True
-    samples_prior: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         for name in ("learning_rate", "decay", "least_rate"):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated
+from verifai_jax.search.base import Cube, Evaluated, Search
 
 BITS = 32  # of the index
 PLAIN_UP_TO = 8  # coordinates; beyond, the bases are so large that lines are visible
@@ -27,7 +27,7 @@ class HaltonState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Halton:
+class Halton(Search):
     """Halton points, the first one with index 1; the same for any batch size.
 
     **Arguments:**
@@ -39,15 +39,11 @@ class Halton:
     """
 
     scramble: bool | None = None
-    wants_gradient: ClassVar[bool] = False
-    samples_prior: ClassVar[bool] = False
+    learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.scramble is not None and not isinstance(self.scramble, bool):
             raise ValueError(f"scramble must be True, False or None; got {self.scramble!r}")
-
-    def check(self, cube: Cube) -> None:
-        """Works on every cube."""
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> HaltonState:
         return HaltonState(key, jnp.uint32(1))

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated
+from verifai_jax.search.base import Cube, Evaluated, Search
 
 
 class UniformState(NamedTuple):
@@ -16,14 +16,11 @@ class UniformState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(Search):
     """Independent uniform points; point `i` depends on the key and `i` alone, not on the batch."""
 
-    wants_gradient: ClassVar[bool] = False
+    learns: ClassVar[bool] = False
     samples_prior: ClassVar[bool] = True
-
-    def check(self, cube: Cube) -> None:
-        """Works on every cube."""
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> UniformState:
         return UniformState(key, jnp.uint32(0))
