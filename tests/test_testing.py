@@ -1,14 +1,13 @@
 """The contract suites find what they are there to find."""
 
 import dataclasses
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from verifai_jax.features import Box
-from verifai_jax.search import Cube, Uniform
+from verifai_jax.search import Cube, Search, Uniform
 from verifai_jax.testing import check_batch_independence, check_domain, check_search
 
 CUBE = Cube((0, 0))
@@ -46,15 +45,16 @@ def test_domains(flaw, message):
 
 
 @dataclasses.dataclass(frozen=True)
-class Wayward:
+class Wayward(Search):
     """A search with one law broken: it moves by the mean robustness, or worse."""
 
     flaw: str = ""
-    wants_gradient: ClassVar[bool] = False
-    samples_prior: ClassVar[bool] = False
 
-    def check(self, cube):
-        pass
+    def total(self, cube):
+        return 0 if self.flaw == "total" else None
+
+    def warm(self, state, cube, evaluated):
+        return {} if self.flaw == "warm" else state
 
     def init(self, key, cube, batch):
         return {"key": key, "shift": jnp.zeros((), jnp.float32)}
@@ -83,6 +83,8 @@ class Wayward:
         ("range", r"points must stay in \[0, 1\]"),
         ("types", "tell must keep the types of the state"),
         ("padding", "rows that are not counted must not influence the search"),
+        ("total", "total must be None or a positive integer; got 0"),
+        ("warm", "warm must keep the state's form"),
     ],
 )
 def test_searches(flaw, message):

@@ -76,9 +76,14 @@ def check_search(
     """
     search.check(cube)
     hash(search)
+    total = search.total(cube)
+    assert total is None or (isinstance(total, int) and total >= 1), (
+        f"total must be None or a positive integer; got {total!r}"
+    )
     init = jax.jit(search.init, static_argnums=(1, 2))
     ask = jax.jit(search.ask, static_argnums=(1, 2))
     tell = jax.jit(search.tell, static_argnums=1)
+    warm = jax.jit(search.warm, static_argnums=1)
     key = jax.random.key(seed)
     odd = np.arange(batch) % 3 == 1
 
@@ -118,6 +123,22 @@ def check_search(
     _same(spoiled[0], spoiled[1], law, exact=True)
     for points in spoiled[0]:
         assert np.all(np.isfinite(points)), "points must be finite"
+
+    # What a constraint does: some rows are those of the second proposals, some stay refused.
+    first, asked = ask(state, cube, batch)
+    second, asked = ask(asked, cube, batch)
+    mixed = _evaluate(jnp.where(odd[:, None], second, first), search.wants_gradient)
+    refused = mixed._replace(counted=jnp.asarray(np.arange(batch) % 4 != 0))
+    after = tell(asked, cube, refused)
+    _same_type(asked, after)
+
+    earlier = jax.random.uniform(jax.random.key(seed + 1), (batch, cube.dim), jnp.float32)
+    table = _evaluate(earlier, search.wants_gradient)
+    warmed = warm(state, cube, table._replace(gradient=None))
+    _same_type(state, warmed, "warm")
+    for beginning in (after, warmed):
+        for points in run(beginning, 0, 2)[1]:
+            assert np.all(np.isfinite(points)), "points must be finite"
 
 
 def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) -> None:
@@ -165,13 +186,13 @@ def _saved(state: Any) -> Any:
     return jax.tree.map(detour, state)
 
 
-def _same_type(before: Any, after: Any) -> None:
+def _same_type(before: Any, after: Any, step: str = "tell") -> None:
     assert jax.tree.structure(before) == jax.tree.structure(after), (
-        "tell must keep the state's form"
+        f"{step} must keep the state's form"
     )
     for one, two in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         assert jax.typeof(one) == jax.typeof(two), (
-            f"tell must keep the types of the state; {jax.typeof(one)} became {jax.typeof(two)}"
+            f"{step} must keep the types of the state; {jax.typeof(one)} became {jax.typeof(two)}"
         )
 
 

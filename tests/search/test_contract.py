@@ -23,6 +23,7 @@ CUBES = {
     "continuous": Cube((0, 0, 0)),
     "mixed": Cube((0, 4, 0, 1, 1000)),
     "discrete": Cube((3, 2)),
+    "weighted": Cube((3, 0, 2), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True)),
     "wide": Cube((0,) * 200),
 }
 
