@@ -2,8 +2,10 @@
 
 CrossEntropy(elite=0.2)
 named("cross_entropy", elite=0.2)
+split({"wind": "cross_entropy"}, rest="halton")
 """
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -14,9 +16,10 @@ from verifai_jax.search.base import Search as Search
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
 from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.halton import Halton as Halton
+from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
 
-_SEARCHES: dict[str, Any] = {
+_SEARCHES: dict[str, type[Search]] = {
     "uniform": Uniform,
     "halton": Halton,
     "cross_entropy": CrossEntropy,
@@ -36,6 +39,47 @@ def named(name: str, **options: Any) -> Search:
     """
     if name not in _SEARCHES:
         raise unknown_name("search", name, _SEARCHES)
-    known = [field.name for field in fields(_SEARCHES[name])]
+    known = [field.name for field in fields(_SEARCHES[name])]  # pyright: ignore[reportArgumentType]
     check_names(f"option of search {name}", options, known)
     return _SEARCHES[name](**options)
+
+
+def split(parts: Mapping[str, str | Search], rest: str | Search = "uniform") -> Split:
+    """A search for each part of the space, by name or with options; see `Split`."""
+    return Split({name: _search(part) for name, part in parts.items()}, _search(rest))
+
+
+def _search(search: str | Search) -> Search:
+    return named(search) if isinstance(search, str) else search
+
+
+def to_json(search: Search) -> dict[str, Any] | None:
+    """A search as plain data, for the record of a run; None for one that has no name here."""
+    if isinstance(search, Split):
+        parts = [[name, to_json(part)] for name, part in search.parts]
+        rest = to_json(search.rest)
+        whole = rest is not None and all(part is not None for _, part in parts)
+        return {"split": parts, "rest": rest} if whole else None
+    for name, kind in _SEARCHES.items():
+        if type(search) is kind:
+            options = {field.name: getattr(search, field.name) for field in fields(search)}  # pyright: ignore[reportArgumentType]
+            return {"name": name, "options": options}
+    return None
+
+
+def from_json(data: Mapping[str, Any]) -> Search:
+    """The search that `to_json` described.
+
+    **Raises:** `ValueError` as `named`, and for data that describes no search.
+    """
+    if "split" in data:
+        return Split(
+            {name: from_json(part) for name, part in data["split"]}, from_json(data["rest"])
+        )
+    if not isinstance(data.get("options"), Mapping):
+        raise ValueError(f"this describes no search: {data!r}")
+    options = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in data["options"].items()
+    }
+    return named(data["name"], **options)

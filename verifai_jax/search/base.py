@@ -88,6 +88,16 @@ class Cube:
             for i in self.discrete
         )
 
+    def take(self, places: tuple[int, ...]) -> "Cube":
+        """The cube of these coordinates alone."""
+        return Cube(
+            levels=tuple(self.levels[i] for i in places),
+            weights=tuple(self.weights[i] for i in places),
+            ordered=tuple(self.ordered[i] for i in places),
+            names=tuple(self.names[i] for i in places),
+            lengths=tuple(j for j, i in enumerate(places) if i in self.lengths),
+        )
+
     def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
         """Which cell holds each discrete coordinate of these points."""
         points = jnp.asarray(u)[..., self.discrete]

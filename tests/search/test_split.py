@@ -1,0 +1,104 @@
+"""Compositions: every part does what it does alone, and sees its own coordinates only."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.search import (
+    CrossEntropy,
+    Cube,
+    Evaluated,
+    Gradient,
+    Halton,
+    Split,
+    Uniform,
+    from_json,
+    split,
+    to_json,
+)
+from verifai_jax.testing import check_search
+
+CUBE = Cube(
+    (0, 3, 0, 0),
+    ordered=(True, False, True, True),
+    names=("x", "colour", "cars[0].x", "cars[1].x"),
+)
+
+
+@pytest.mark.parametrize(
+    "search",
+    [
+        split({"cars": "halton"}),
+        split({"x": "gradient", "cars": "cross_entropy"}),
+        split({"x, colour, cars": "cross_entropy"}),
+    ],
+    ids=repr,
+)
+def test_contract(search):
+    check_search(search, CUBE)
+
+
+def test_parts_are_what_they_are_alone():
+    search, key = Split({"cars": Halton()}, Uniform()), jax.random.key(0)
+    u, _ = search.ask(search.init(key, CUBE, 8), CUBE, 8)
+    alone = Cube((0, 0))
+    expected, _ = Halton().ask(Halton().init(key, alone, 8), alone, 8)
+    np.testing.assert_array_equal(u[:, 2:], expected)
+    assert len(np.unique(np.asarray(u[:, 0]))) == 8
+
+
+def test_parts_learn_from_their_own_coordinates():
+    search = Split({"x": Gradient()}, Uniform())
+    ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)
+    state = search.init(jax.random.key(1), CUBE, 16)
+    for _ in range(5):
+        u, state = ask(state, CUBE, 16)
+        gradient = jnp.zeros_like(u).at[:, 0].set(1.0).at[:, 2].set(-1.0)
+        state = tell(state, CUBE, Evaluated(u, 1 + u[:, 0], u[:, 0] >= 0, gradient))
+    assert float(jnp.mean(u[:, 0])) < 0.3
+    assert 0.2 < float(jnp.mean(u[:, 2])) < 0.8
+
+
+def test_what_the_whole_is():
+    assert split({"x": "gradient"}).wants_gradient
+    assert not split({"x": "halton"}).wants_gradient
+    assert split({"x": "uniform"}).samples_prior
+    assert not split({"x": "halton"}).samples_prior
+    assert split({"x": "cross_entropy"}).learns
+    assert not split({"x": "halton"}).learns
+    assert split({"x": "halton"}).total(CUBE) is None
+
+
+@pytest.mark.parametrize(
+    "search", [Split({"x": Gradient(decay=0.5)}, CrossEntropy(elite=0.2)), Halton(scramble=True)]
+)
+def test_json(search):
+    assert from_json(to_json(search)) == search
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: split({"car": "halton"}).check(CUBE),
+            "unknown feature 'car'; did you mean 'cars'",
+        ),
+        (
+            lambda: split({"cars": "halton", "cars[1].x": "uniform"}).check(CUBE),
+            r"feature 'cars\[1\].x' is in two parts",
+        ),
+        (lambda: split({}), "at least one part; got none"),
+        (lambda: split({"x": "halten"}), "unknown search 'halten'"),
+        (lambda: split({"colour": "gradient"}).check(CUBE), "at least one continuous feature"),
+        (lambda: from_json({"name": "halton"}), "describes no search"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_part_that_is_no_search():
+    with pytest.raises(TypeError, match="the part 'x' of a Split must be a search; got 3"):
+        Split({"x": 3}, Uniform())

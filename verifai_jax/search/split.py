@@ -1,0 +1,149 @@
+"""Compositions: a search for each part of the space.
+
+    Split({"wind": CrossEntropy(), "cars": "halton"}, rest="uniform")
+    Split({"x0": Grid(5), "alg": Grid()}, rest=Uniform())
+
+Every part sees its own coordinates and the robustness of the whole simulation. A part that learns
+takes the others for noise, so that what belongs together belongs into one part.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.errors import unknown_name
+from verifai_jax.search.base import Cube, Evaluated, Search
+
+
+@dataclass(frozen=True, init=False)
+class Split(Search):
+    """A search for each part of the space, and one for the rest.
+
+    **Arguments:**
+
+    - `parts`: feature name -> search; `"cars"` means all of `cars[0].x`, `cars[0].v`, ...; several
+      names for one search are written `"x0, v0"`.
+    - `rest`: the search of all other features.
+
+    A composition ends when its first finite part (a grid) does, samples the prior if all parts do,
+    and takes the temperature of its first part that wants gradients.
+
+    **Raises:** `ValueError` for no parts; `TypeError` for a part that is no search. `check` raises
+    `ValueError` for a name that is no feature, a feature in two parts, or a part that cannot work
+    on its features.
+    """
+
+    parts: tuple[tuple[str, Search], ...]
+    rest: Search
+
+    def __init__(self, parts: Mapping[str, Search], rest: Search) -> None:
+        pairs = tuple(parts.items() if isinstance(parts, Mapping) else parts)
+        if not pairs:
+            raise ValueError("a Split needs at least one part; got none")
+        for name, search in (*pairs, ("the rest", rest)):
+            if not isinstance(search, Search):
+                raise TypeError(f"the part {name!r} of a Split must be a search; got {search!r}")
+        object.__setattr__(self, "parts", pairs)
+        object.__setattr__(self, "rest", rest)
+
+    @property
+    def searches(self) -> tuple[Search, ...]:
+        """One a part, that of the rest last."""
+        return (*(search for _, search in self.parts), self.rest)
+
+    @property
+    def wants_gradient(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return any(search.wants_gradient for search in self.searches)
+
+    @property
+    def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return all(search.samples_prior for search in self.searches)
+
+    @property
+    def learns(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return any(search.learns for search in self.searches)
+
+    def check(self, cube: Cube) -> None:
+        for search, _, part in self._shares(cube):
+            search.check(part)
+
+    def total(self, cube: Cube) -> int | None:
+        totals = [search.total(part) for search, _, part in self._shares(cube)]
+        return min((total for total in totals if total is not None), default=None)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> tuple[Any, ...]:
+        shares = self._shares(cube)
+        keys = jax.random.split(key, len(shares))
+        return tuple(
+            search.init(key, part, batch)
+            for key, (search, _, part) in zip(keys, shares, strict=True)
+        )
+
+    def ask(
+        self, state: tuple[Any, ...], cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], tuple[Any, ...]]:
+        u = jnp.zeros((batch, cube.dim), jnp.float32)
+        states = []
+        for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
+            points, its = search.ask(its, part, batch)
+            u = u.at[:, places].set(points)
+            states.append(its)
+        return u, tuple(states)
+
+    def tell(self, state: tuple[Any, ...], cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
+        return self._told("tell", state, cube, evaluated)
+
+    def warm(self, state: tuple[Any, ...], cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
+        return self._told("warm", state, cube, evaluated)
+
+    def temperature(self, state: tuple[Any, ...]) -> Float[Array, ""]:
+        """That of the first part that wants gradients."""
+        for search, its in zip(self.searches, state, strict=True):
+            if search.wants_gradient:
+                return search.temperature(its)
+        return super().temperature(state)
+
+    def _told(self, verb: str, state: Any, cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
+        states = []
+        for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
+            gradient = evaluated.gradient
+            its_own = evaluated._replace(
+                u=evaluated.u[:, places],
+                gradient=gradient[:, places]
+                if gradient is not None and search.wants_gradient
+                else None,
+            )
+            states.append(getattr(search, verb)(its, part, its_own))
+        return tuple(states)
+
+    def _shares(self, cube: Cube) -> list[tuple[Search, np.ndarray, Cube]]:
+        """Each search with its coordinates, as indices and as a cube of their own."""
+        owner = np.full(cube.dim, len(self.parts))
+        for number, (names, _) in enumerate(self.parts):
+            for name in map(str.strip, names.split(",")):
+                places = [i for i, label in enumerate(cube.names) if _covers(name, label)]
+                if not places:
+                    raise unknown_name("feature", name, dict.fromkeys(map(_top, cube.names)))
+                for i in places:
+                    if owner[i] != len(self.parts):
+                        raise ValueError(f"feature {cube.names[i]!r} is in two parts of the Split")
+                    owner[i] = number
+        shares = []
+        for number, search in enumerate(self.searches):
+            places = np.flatnonzero(owner == number)
+            shares.append((search, places, cube.take(tuple(places.tolist()))))
+        return shares
+
+
+def _covers(name: str, label: str) -> bool:
+    """Whether a coordinate called `label` belongs to the feature `name`."""
+    return label == name or label.startswith((f"{name}.", f"{name}["))
+
+
+def _top(label: str) -> str:
+    return label.split(".")[0].split("[")[0]
