@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,35 @@ def test_a_process_that_dies_loses_only_the_batch_in_flight(tmp_path):
     (tmp_path / STREAM).write_bytes(whole[:10])
     assert len(ErrorTable.load(tmp_path, ("x",))) == 0
     table.close()
+
+
+def test_resuming_drops_what_came_later_and_goes_on(tmp_path):
+    table = ErrorTable(("x",), tmp_path / "first")
+    for i in range(3):
+        table.append(batch([i, -i], x=[float(i), 0.5]))
+    # As it is on disk while it grows, or if the process dies.
+    tmp_path = shutil.copytree(tmp_path / "first", tmp_path / "cut off")
+    table.close()
+    earlier = ErrorTable.load(tmp_path, ("x",))
+    resumed = earlier.resumed(3, tmp_path)
+    assert ErrorTable.load(tmp_path, ("x",)).all.equals(earlier.all.iloc[:3])
+    resumed.append(batch([7], x=[7.0]))
+    rows = ErrorTable.load(tmp_path, ("x",)).all
+    assert rows["rho"].tolist() == [0, 0, 1, 7]
+    assert rows.index.tolist() == [0, 1, 2, 3]
+    resumed.close()
+    assert not (tmp_path / STREAM).exists()
+    assert ErrorTable.load(tmp_path, ("x",)).all.equals(resumed.all)
+    assert len(earlier.resumed(0)) == 0
+
+
+def test_a_process_that_dies_while_it_finishes_leaves_no_row_twice(tmp_path):
+    table = ErrorTable(("x",), tmp_path)
+    table.append(batch([1, -1], x=[0.1, 0.2]))
+    stream = (tmp_path / STREAM).read_bytes()
+    table.close()
+    (tmp_path / STREAM).write_bytes(stream)
+    assert ErrorTable.load(tmp_path, ("x",)).all.equals(table.all)
 
 
 def test_an_empty_table_is_a_table(tmp_path):

@@ -5,7 +5,8 @@
     table.safe              rows that ended properly and kept it
 
 On disk a growing table is an Arrow stream, to which each batch is appended; a process that dies
-loses at most the batch in flight. A finished table is one Parquet file.
+loses at most the batch in flight. A finished table is one Parquet file. A run that is resumed
+keeps its earlier rows in the Parquet file and streams the new ones beside it until it ends.
 """
 
 from collections.abc import Mapping
@@ -111,15 +112,31 @@ class ErrorTable:
         **Raises:** `FileNotFoundError` where there is none.
         """
         table = cls(features)
-        frame = _read(folder)
-        if len(frame):
-            table.append({name: frame[name].to_numpy() for name in frame.columns})
+        table._fill(_read(folder))
+        return table
+
+    def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
+        """A table with the first `rows` rows of this one, to which more can be appended.
+
+        With a `folder` it is kept there, in place of what the folder held.
+        """
+        table = ErrorTable(self.features)
+        table._fill(self.all.iloc[:rows])
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            _write(table.all, folder)
+            (folder / STREAM).unlink(missing_ok=True)
+            table._stream = _Stream(folder)
         return table
 
     def save(self, folder: Path) -> None:
         """Write the rows to `folder` as one Parquet file."""
         folder.mkdir(parents=True, exist_ok=True)
         _write(self.all, folder)
+
+    def _fill(self, frame: "pd.DataFrame") -> None:
+        if len(frame):
+            self.append({name: frame[name].to_numpy() for name in frame.columns})
 
     def __repr__(self) -> str:
         return (
@@ -165,14 +182,24 @@ def _write(frame: "pd.DataFrame", folder: Path) -> None:
 def _read(folder: Path) -> "pd.DataFrame":
     import pandas as pd
 
-    if (folder / FINISHED).exists():
-        return pd.read_parquet(folder / FINISHED)
-    if not (folder / STREAM).exists():
+    finished, stream = folder / FINISHED, folder / STREAM
+    if not finished.exists() and not stream.exists():
         raise FileNotFoundError(f"no error table in {folder}: neither {FINISHED} nor {STREAM}")
+    parts = [pd.read_parquet(finished)] if finished.exists() else []
+    if stream.exists():
+        parts.append(_read_stream(stream))
+    parts = [part for part in parts if len(part)] or parts[:1]
+    frame = parts[0] if len(parts) == 1 else pd.concat(parts)
+    # A process that died between finishing the file and removing the stream left rows in both.
+    return frame.loc[~frame.index.duplicated()]
+
+
+def _read_stream(path: Path) -> "pd.DataFrame":
+    import pandas as pd
     import pyarrow as pa
 
     batches = []
-    with open(folder / STREAM, "rb") as file:
+    with open(path, "rb") as file:
         try:
             # Reading ends in an error where the process died in the middle of writing a batch;
             # those before it are whole.
