@@ -1,0 +1,288 @@
+"""Gaussian process regression with a Matern-5/2 covariance, on a buffer of fixed size.
+
+Rasmussen, Williams, Gaussian Processes for Machine Learning, 2006: posterior and evidence are those
+of algorithm 2.1, the gradient of the evidence is that of section 5.4.1. Every coordinate has its
+own length scale; unordered coordinates hold codes, and contribute a factor that only asks whether
+two codes are the same. Samples of the posterior are whole functions, drawn by pathwise conditioning
+(Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020): a
+random function of the prior, plus the update that takes it to the observations.
+
+Everything keeps its shape whatever the number of observations is: rows that are not there have the
+covariance of independent noise and the target zero, which changes nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Bool, Float, Key
+
+# What the logarithms of the hyper-parameters may be; the noise keeps 32-bit factors finite.
+VARIANCE, LENGTH, NOISE = (-3.0, 4.0), (-4.0, 8.0), (-9.0, 0.0)
+SMALLEST = 2.0**-24  # uniform numbers below are zero, where a normal quantile is infinite
+
+
+class Hyper(NamedTuple):
+    """Natural logarithms of the hyper-parameters."""
+
+    variance: Float[Array, ""]
+    lengths: Float[Array, " d"]
+    noise: Float[Array, ""]  # variance of the noise
+
+
+class Observations(NamedTuple):
+    """Points, their targets, and which rows there are."""
+
+    x: Float[Array, "n d"]
+    y: Float[Array, " n"]
+    mask: Bool[Array, " n"]
+
+
+class Posterior(NamedTuple):
+    hyper: Hyper
+    x: Float[Array, "n d"]
+    mask: Bool[Array, " n"]
+    residual: Float[Array, " n"]  # targets less the mean of the prior
+    factor: Float[Array, "n n"]  # Cholesky factor of the covariance of the observations
+    weights: Float[Array, " n"]  # its inverse times the targets
+
+
+class Paths(NamedTuple):
+    """Functions drawn from a posterior, as weights of random waves and of covariances."""
+
+    frequencies: Float[Array, "f c"]
+    phases: Float[Array, " f"]
+    ignored: Bool[Array, "f k"]  # which unordered coordinates a wave ignores
+    multiply: Array  # [f, k] unsigned: the sign of a wave at a code is a hash of it
+    add: Array
+    weights: Float[Array, "f+n paths"]
+
+
+@dataclass(frozen=True)
+class GaussianProcess:
+    """Regression over points with these coordinates; the prior's mean is zero.
+
+    **Arguments:**
+
+    - `unordered`: for each coordinate, whether it holds codes rather than a quantity in `[0, 1]`.
+    """
+
+    unordered: tuple[bool, ...]
+
+    def first(self) -> Hyper:
+        """Where fitting starts: neighbours are related over half the diagonal of the cube."""
+        plain, codes = self._places()
+        lengths = np.zeros(len(self.unordered))
+        lengths[plain] = math.log(0.5 * math.sqrt(max(len(plain), 1)))
+        lengths[codes] = math.log(max(len(codes), 1))
+        return Hyper(jnp.float32(0.0), jnp.asarray(lengths, jnp.float32), jnp.float32(-6.0))
+
+    def covariance(
+        self, hyper: Hyper, a: Float[Array, "n d"], b: Float[Array, "m d"]
+    ) -> Float[Array, "n m"]:
+        """Of the values at the points `a` and `b`, without noise."""
+        plain, codes = self._places()
+        inverse = jnp.exp(-hyper.lengths)
+        # About the middle, so that the difference below loses few digits.
+        left, right = ((x[:, plain] - 0.5) * inverse[plain] for x in (a, b))
+        square = jnp.sum(left**2, 1)[:, None] + jnp.sum(right**2, 1)[None] - 2 * left @ right.T
+        value = jnp.exp(hyper.variance) * _matern(jnp.maximum(square, 0.0))
+        if len(codes) == 0:
+            return value
+        differ = (a[:, None, codes] != b[None, :, codes]).astype(value.dtype)
+        return value * jnp.exp(-differ @ inverse[codes])
+
+    def evidence(self, hyper: Hyper, seen: Observations) -> Float[Array, ""]:
+        """Logarithm of the marginal likelihood of the observations."""
+        return _evidence(self._noisy(hyper, seen.x, seen.mask), _masked(seen)) - (
+            0.5 * math.log(2 * math.pi) * jnp.sum(seen.mask)
+        )
+
+    def log_prior(self, hyper: Hyper) -> Float[Array, ""]:
+        """Of the hyper-parameters, up to a constant.
+
+        Length scales grow with the root of the dimension, so that the prior's complexity does not
+        (Hvarfner, Hellsten, Nardi, Vanilla Bayesian optimization performs great in high dimensions,
+        ICML 2024).
+        """
+        plain, codes = self._places()
+        mean = math.sqrt(2) + 0.5 * math.log(max(len(plain), 1))
+        lengths = jnp.sum((hyper.lengths[plain] - mean) ** 2) / 3
+        mean = math.log(max(len(codes), 1))
+        lengths = lengths + jnp.sum((hyper.lengths[codes] - mean) ** 2)
+        return -0.5 * (lengths + hyper.variance**2 + (hyper.noise + 6.0) ** 2 / 2)
+
+    def fit(self, hyper: Hyper, seen: Observations, steps: int, rate: float = 0.15) -> Hyper:
+        """The most probable hyper-parameters, by Adam from `hyper` on.
+
+        A step that is not finite is not taken.
+        """
+
+        def loss(hyper: Hyper) -> Float[Array, ""]:
+            return -self.evidence(hyper, seen) - self.log_prior(hyper)
+
+        def step(carry: tuple[Hyper, Hyper, Hyper], count: Array) -> tuple:
+            hyper, first, second = carry
+            gradient = jax.grad(loss)(hyper)
+            finite = jax.tree.map(lambda g: jnp.all(jnp.isfinite(g)), gradient)
+            ok = jnp.all(jnp.stack(jax.tree.leaves(finite)))
+            gradient = jax.tree.map(lambda g: jnp.where(ok, g, 0.0), gradient)
+            first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, gradient)
+            second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, gradient)
+
+            def moved(h: Array, m: Array, v: Array) -> Array:
+                root = jnp.sqrt(v / (1 - 0.95**count)) + 1e-8
+                return h - rate * (m / (1 - 0.8**count)) / root
+
+            return (_bounded(jax.tree.map(moved, hyper, first, second)), first, second), None
+
+        zero = jax.tree.map(jnp.zeros_like, hyper)
+        counts = jnp.arange(1, steps + 1, dtype=hyper.variance.dtype)
+        (fitted, _, _), _ = jax.lax.scan(step, (hyper, zero, zero), counts)
+        return fitted
+
+    def condition(self, hyper: Hyper, seen: Observations) -> Posterior:
+        """The process given these observations."""
+        noisy = self._noisy(hyper, seen.x, seen.mask)
+        y = _masked(seen)
+
+        def bad(carry: tuple[Array, Array]) -> Array:
+            return ~jnp.isfinite(carry[0][-1, -1]) & (carry[1] < 1)
+
+        def more(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            jitter = jnp.maximum(10 * carry[1], 1e-6)
+            extra = jitter * jnp.exp(hyper.variance) * jnp.eye(len(y), dtype=y.dtype)
+            return jnp.linalg.cholesky(noisy + extra), jitter
+
+        factor = jnp.linalg.cholesky(noisy)
+        factor, _ = jax.lax.while_loop(bad, more, (factor, jnp.zeros((), y.dtype)))
+        weights = cho_solve((factor, True), y)
+        return Posterior(hyper, seen.x, seen.mask, y, factor, weights)
+
+    def predict(
+        self, posterior: Posterior, x: Float[Array, "m d"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and standard deviation of the values at these points, without noise."""
+        cross = self._cross(posterior, x)
+        left = solve_triangular(posterior.factor, cross.T, lower=True)
+        variance = jnp.exp(posterior.hyper.variance) - jnp.sum(left**2, axis=0)
+        return cross @ posterior.weights, jnp.sqrt(jnp.maximum(variance, 1e-12))
+
+    def paths(self, posterior: Posterior, key: Key[Array, ""], count: int, waves: int) -> Paths:
+        """Draw `count` functions from the posterior; the prior's part has `waves` random waves."""
+        hyper, n = posterior.hyper, len(posterior.residual)
+        plain, codes = self._places()
+        c, k = len(plain), len(codes)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        sizes = [waves * (c + 5), waves * (1 + 3 * k), (waves + n) * count]
+        random = jax.random.uniform(key, (sum(sizes),), posterior.factor.dtype)
+        random = jnp.split(random, np.cumsum(sizes)[:-1])
+        normal = ndtri(jnp.maximum(jnp.concatenate([random[0], random[2]]), SMALLEST))
+        spectrum = normal[: sizes[0]].reshape(waves, c + 5)
+        amplitudes, noise = jnp.split(normal[sizes[0] :].reshape(waves + n, count), [waves])
+        # The spectral density of Matern-5/2 is a t distribution with five degrees of freedom.
+        scale = jnp.sqrt(5 / jnp.maximum(jnp.sum(spectrum[:, c:] ** 2, axis=1), 1e-6))
+        phases, ignore, multiply, add = jnp.split(
+            random[1].reshape(waves, 1 + 3 * k), [1, 1 + k, 1 + 2 * k], axis=1
+        )
+        drawn = Paths(
+            frequencies=spectrum[:, :c] * scale[:, None] * jnp.exp(-hyper.lengths[plain]),
+            phases=2 * math.pi * phases[:, 0],
+            ignored=ignore < jnp.exp(-jnp.exp(-hyper.lengths[codes])),
+            multiply=(multiply * 2.0**31).astype(jnp.uint32) * 2 + 1,
+            add=(add * 2.0**31).astype(jnp.uint32) * 2,
+            weights=amplitudes,
+        )
+        prior = self._waves(hyper, drawn, posterior.x) @ amplitudes
+        noise = jnp.exp(hyper.noise / 2) * noise
+        left = jnp.where(posterior.mask[:, None], posterior.residual[:, None] - prior - noise, 0.0)
+        update = cho_solve((posterior.factor, True), left)
+        return drawn._replace(weights=jnp.concatenate([amplitudes, update]))
+
+    def basis(
+        self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
+    ) -> Float[Array, "m f+n"]:
+        """Times the paths' weights it is the paths' values at these points."""
+        waves = self._waves(posterior.hyper, paths, x)
+        return jnp.concatenate([waves, self._cross(posterior, x)], axis=1)
+
+    def _waves(self, hyper: Hyper, paths: Paths, x: Float[Array, "m d"]) -> Float[Array, "m f"]:
+        plain, codes = self._places()
+        size = jnp.sqrt(2 * jnp.exp(hyper.variance) / len(paths.phases))
+        waves = size * jnp.cos((x[:, plain] - 0.5) @ paths.frequencies.T + paths.phases)
+        if len(codes) == 0:
+            return waves
+        # Multiply-shift hashing: signs at two codes are equal half of the time (Dietzfelbinger,
+        # Universal hashing and k-wise independent random variables, 1996).
+        code = x[:, None, codes].astype(jnp.uint32)
+        odd = (paths.multiply * code + paths.add) >> 31
+        flips = jnp.sum(jnp.where(paths.ignored, 0, odd), axis=-1)
+        return jnp.where(flips % 2 == 0, waves, -waves)
+
+    def _cross(self, posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, "m n"]:
+        return jnp.where(posterior.mask, self.covariance(posterior.hyper, x, posterior.x), 0.0)
+
+    def _noisy(
+        self, hyper: Hyper, x: Float[Array, "n d"], mask: Bool[Array, " n"]
+    ) -> Float[Array, "n n"]:
+        """Covariance of the observations; that of the absent ones is the identity."""
+        both = mask[:, None] & mask[None]
+        value = jnp.where(both, self.covariance(hyper, x, x), 0.0)
+        return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
+
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the quantities and of the codes."""
+        codes = np.array(self.unordered, bool)
+        return np.flatnonzero(~codes), np.flatnonzero(codes)
+
+
+def _masked(seen: Observations) -> Float[Array, " n"]:
+    return jnp.where(seen.mask, seen.y, 0.0)
+
+
+def _bounded(hyper: Hyper) -> Hyper:
+    return Hyper(
+        jnp.clip(hyper.variance, *VARIANCE),
+        jnp.clip(hyper.lengths, *LENGTH),
+        jnp.clip(hyper.noise, *NOISE),
+    )
+
+
+@jax.custom_jvp
+def _matern(square: Array) -> Array:
+    """Matern-5/2 of the squared distance; its derivative is finite at zero."""
+    r = jnp.sqrt(5 * square)
+    return (1 + r + r**2 / 3) * jnp.exp(-r)
+
+
+@_matern.defjvp
+def _matern_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    r = jnp.sqrt(5 * primals[0])
+    decay = jnp.exp(-r)
+    return (1 + r + r**2 / 3) * decay, -5 / 6 * (1 + r) * decay * tangents[0]
+
+
+@jax.custom_vjp
+def _evidence(covariance: Float[Array, "n n"], y: Float[Array, " n"]) -> Float[Array, ""]:
+    return _evidence_forward(covariance, y)[0]
+
+
+def _evidence_forward(covariance: Array, y: Array) -> tuple[Array, tuple[Array, Array]]:
+    factor = jnp.linalg.cholesky(covariance)
+    weights = cho_solve((factor, True), y)
+    value = -0.5 * y @ weights - jnp.sum(jnp.log(jnp.diag(factor)))
+    return value, (factor, weights)
+
+
+def _evidence_backward(saved: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array]:
+    factor, weights = saved
+    inverse = cho_solve((factor, True), jnp.eye(len(weights), dtype=weights.dtype))
+    return 0.5 * cotangent * (jnp.outer(weights, weights) - inverse), -cotangent * weights
+
+
+_evidence.defvjp(_evidence_forward, _evidence_backward)
