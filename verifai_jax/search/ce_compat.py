@@ -1,0 +1,141 @@
+"""VerifAI's cross-entropy: one histogram a coordinate, updated by one sample at a time.
+
+After each point that fails, `rho < threshold`, every histogram is multiplied by `alpha` and gets
+`1 - alpha` in the point's bucket, in the order of the rows (Dreossi et al., VerifAI: a toolkit for
+the formal design and analysis of artificial intelligence-based systems, CAV 2019). Before the
+first failure it learns nothing: `CrossEntropy` is the search to use, this one is for comparisons.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt32
+
+from verifai_jax.search.base import Cube, Evaluated, Search, check_count, check_fraction
+
+MOST_COMBINATIONS = 1024
+MOST_BINS = 2**22
+
+
+class CECompatState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    # One set of histograms for each combination of lengths, `bins` wide, zero where there is none.
+    histograms: Float[Array, "sets d bins"]
+
+
+@dataclass(frozen=True)
+class CECompat(Search):
+    """VerifAI's one-sample histogram rule, exactly.
+
+    Histograms start at the prior. Those of continuous coordinates have equally wide buckets, those
+    of discrete ones a bin for each cell. Lengths of arrays are always drawn from the prior, and
+    each combination of them has histograms of its own.
+
+    **Arguments:**
+
+    - `buckets`: of a continuous coordinate.
+    - `alpha`: share that a histogram keeps of itself at each failure.
+    - `threshold`: robustness below which a point is a failure; at it, it is none.
+
+    **Raises:** `ValueError` for values out of range. `check` raises it for more than 1024
+    combinations of lengths, or histograms that would not fit into memory.
+    """
+
+    buckets: int = 5
+    alpha: float = 0.9
+    threshold: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_count("buckets", self.buckets)
+        check_fraction("alpha", self.alpha, or_zero=True)
+        number = isinstance(self.threshold, int | float) and not isinstance(self.threshold, bool)
+        if not (number and math.isfinite(self.threshold)):
+            raise ValueError(f"threshold must be a finite number; got {self.threshold!r}")
+
+    def check(self, cube: Cube) -> None:
+        """Raise `ValueError` for too many combinations of lengths, or too many bins."""
+        lengths = [cube.levels[i] for i in cube.lengths]
+        sets = math.prod(lengths)
+        if sets > MOST_COMBINATIONS:
+            raise ValueError(
+                f"search ce_compat keeps histograms for each combination of the arrays' lengths, "
+                f"{MOST_COMBINATIONS} at most; this space has {' * '.join(map(str, lengths))} = "
+                f"{sets}. Use 'cross_entropy'"
+            )
+        bins = sets * cube.dim * max(self._sizes(cube), default=0)
+        if bins > MOST_BINS:
+            raise ValueError(
+                f"search ce_compat would keep {bins} histogram bins on this space, {MOST_BINS} at "
+                "most are allowed. Use 'cross_entropy'"
+            )
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CECompatState:
+        sizes = self._sizes(cube)
+        prior = np.zeros((cube.dim, max(sizes, default=0)), np.float32)
+        for i in cube.continuous:
+            prior[i, : self.buckets] = 1 / self.buckets
+        for i, probabilities in zip(cube.discrete, cube.probabilities, strict=True):
+            prior[i, : sizes[i]] = probabilities
+        sets = math.prod(cube.levels[i] for i in cube.lengths)
+        return CECompatState(key, jnp.uint32(0), jnp.tile(jnp.asarray(prior), (sets, 1, 1)))
+
+    def ask(
+        self, state: CECompatState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], CECompatState]:
+        key = jax.random.fold_in(state.key, state.round)
+        pick, inside = jax.random.uniform(key, (2, batch, cube.dim), jnp.float32)
+        after = state._replace(round=state.round + 1)
+        if cube.dim == 0:
+            return pick, after
+        histograms = state.histograms[self._set(pick, cube)]
+        limits = jnp.cumsum(histograms, axis=-1)
+        # Rounding leaves a sum next to one: a pick must not fall behind the last bin.
+        scaled = pick * limits[:, :, -1]
+        sizes = np.array(self._sizes(cube), np.int32)
+        bins = jnp.minimum(jnp.sum(scaled[:, :, None] >= limits, axis=-1), sizes - 1)
+        u = jnp.clip((bins + inside) / sizes, 0.0, 1.0)
+        u = u.at[:, cube.discrete].set(cube.centres(bins[:, cube.discrete]))
+        lengths = np.array(cube.lengths, np.int32)
+        return u.at[:, lengths].set(pick[:, lengths]), after
+
+    def tell(self, state: CECompatState, cube: Cube, evaluated: Evaluated) -> CECompatState:
+        fails = evaluated.counted & (evaluated.rho < self.threshold)  # False where it is NaN
+        if cube.dim == 0:
+            return state
+        which = self._set(evaluated.u, cube)
+        sets, _, most = state.histograms.shape
+        own = jax.nn.one_hot(which, sets, dtype=jnp.int32) * fails[:, None]
+        total = jnp.sum(own, axis=0)
+        # A failure's share shrinks with each further one of the same set, as row by row it would.
+        later = jnp.take_along_axis(total - jnp.cumsum(own, axis=0), which[:, None], axis=1)[:, 0]
+        share = jnp.where(fails, (1 - self.alpha) * self._power(later), 0.0)
+        new = jnp.zeros((sets, cube.dim, most), jnp.float32)
+        bins = self._bins(evaluated.u, cube)
+        new = new.at[which[:, None], np.arange(cube.dim), bins].add(share[:, None])
+        histograms = self._power(total)[:, None, None] * state.histograms + new
+        return state._replace(histograms=histograms)
+
+    def _power(self, count: Int[Array, "..."]) -> Float[Array, "..."]:
+        """`alpha` to the power of whole numbers; the zeroth of zero is one."""
+        return jnp.power(jnp.float32(self.alpha), count.astype(jnp.float32))
+
+    def _sizes(self, cube: Cube) -> tuple[int, ...]:
+        return tuple(level or self.buckets for level in cube.levels)
+
+    def _bins(self, u: Float[Array, "n d"], cube: Cube) -> Int[Array, "n d"]:
+        bins = jnp.clip((u * self.buckets).astype(jnp.int32), 0, self.buckets - 1)
+        return bins.at[:, cube.discrete].set(cube.cells(u))
+
+    def _set(self, u: Float[Array, "n d"], cube: Cube) -> Int[Array, " n"]:
+        """Number of the combination of lengths that each point has."""
+        number = jnp.zeros(len(u), jnp.int32)
+        cells = cube.cells(u)
+        for i in cube.lengths:
+            place = int(np.flatnonzero(cube.discrete == i)[0])
+            number = number * cube.levels[i] + cells[:, place]
+        return number

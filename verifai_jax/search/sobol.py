@@ -1,0 +1,130 @@
+"""Sobol' sequences: points that fall evenly into the dyadic boxes of the cube.
+
+Point i is the sum over the set bits of the Gray code of i, without carry, of direction numbers
+(Sobol' 1967; Antonov, Saleev 1979), with the primitive polynomials and initial numbers of Joe,
+Kuo, Constructing Sobol' sequences with better two-dimensional projections, SIAM J. Sci. Comput.
+30, 2008, as SciPy ships them. Scrambled by random lower triangular matrices and a digital shift
+(Matousek, On the L2-discrepancy for anchored boxes, J. Complexity 14, 1998), which keeps how even
+they are and makes each point uniform on the cube.
+"""
+
+import importlib.util
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, UInt32
+
+from verifai_jax.search.base import Cube, Evaluated, Search
+
+BITS = 32
+MOST_DIMENSIONS = 21201  # direction numbers are known for
+
+
+class SobolState(NamedTuple):
+    directions: UInt32[Array, "bits d"]
+    shift: UInt32[Array, " d"]
+    index: UInt32[Array, ""]
+
+
+@dataclass(frozen=True)
+class Sobol(Search):
+    """Sobol' points, the first one with index 0; the same for any batch size.
+
+    The first `2^k` points, and each `2^k` after them, are the most even. Unscrambled, the first
+    point is the corner at the origin: leaving it out would spoil that (Owen, On dropping the first
+    Sobol' point, 2022).
+
+    **Arguments:**
+
+    - `scramble`: scramble at random (from the key). `False` is the plain sequence, which does not
+      depend on the key.
+
+    **Raises:** `ValueError` for a `scramble` that is neither True nor False. `check` raises it for
+    more coordinates than there are direction numbers for.
+    """
+
+    scramble: bool = True
+    learns: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scramble, bool):
+            raise ValueError(f"scramble must be True or False; got {self.scramble!r}")
+
+    def check(self, cube: Cube) -> None:
+        """Raise `ValueError` for more than 21201 coordinates."""
+        if cube.dim > MOST_DIMENSIONS:
+            raise ValueError(
+                f"search sobol works on at most {MOST_DIMENSIONS} unit coordinates; this space has "
+                f"{cube.dim}. Use 'uniform'"
+            )
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> SobolState:
+        directions = jnp.asarray(direction_numbers(cube.dim))
+        shift = jnp.zeros(cube.dim, jnp.uint32)
+        if self.scramble:
+            random = jax.random.bits(key, (BITS + 1, cube.dim), jnp.uint32)
+            directions, shift = _scrambled(directions, random[1:]), random[0]
+        return SobolState(directions, shift, jnp.uint32(0))
+
+    def ask(
+        self, state: SobolState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], SobolState]:
+        index = state.index + jnp.arange(batch, dtype=jnp.uint32)
+        gray = (index ^ (index >> 1))[:, None]
+        digits = jnp.broadcast_to(state.shift, (batch, cube.dim))
+        for k in range(BITS):
+            digits ^= ((gray >> k) & 1) * state.directions[k]
+        # A float32 in [0, 1) holds 24 digits.
+        u = (digits >> 8).astype(jnp.float32) * np.float32(2**-24)
+        return u, state._replace(index=state.index + batch)
+
+    def tell(self, state: SobolState, cube: Cube, evaluated: Evaluated) -> SobolState:
+        return state
+
+
+@lru_cache(maxsize=8)
+def direction_numbers(dim: int) -> UInt32[np.ndarray, "bits dim"]:
+    """Direction numbers of the first `dim` coordinates, their binary point before the first bit."""
+    polynomials, initial = _joe_kuo()
+    numbers = np.zeros((BITS, dim), np.uint32)
+    for j in range(dim):
+        polynomial = int(polynomials[j])
+        degree = polynomial.bit_length() - 1
+        # The first coordinate is the van der Corput sequence: all its numbers are 1.
+        m = [1] * BITS if j == 0 else [int(number) for number in initial[j, :degree]]
+        for k in range(len(m), BITS):
+            number = m[k - degree] ^ (m[k - degree] << degree)
+            for i in range(1, degree):
+                if polynomial >> (degree - i) & 1:
+                    number ^= m[k - i] << i
+            m.append(number)
+        numbers[:, j] = [number << (BITS - 1 - k) for k, number in enumerate(m)]
+    numbers.setflags(write=False)
+    return numbers
+
+
+@lru_cache(maxsize=1)
+def _joe_kuo() -> tuple[np.ndarray, np.ndarray]:
+    """Primitive polynomials and initial numbers, from SciPy's file (importing it takes longer)."""
+    scipy = importlib.util.find_spec("scipy")
+    assert scipy is not None, "JAX depends on SciPy"
+    with np.load(Path(str(scipy.origin)).parent / "stats/_sobol_direction_numbers.npz") as file:
+        return file["poly"], file["vinit"]
+
+
+def _scrambled(
+    directions: UInt32[Array, "bits d"], random: UInt32[Array, "bits d"]
+) -> UInt32[Array, "bits d"]:
+    """The direction numbers times a random lower triangular matrix of bits for each coordinate."""
+    digit = np.arange(BITS, dtype=np.uint32)
+    own = (np.uint32(1) << (BITS - 1 - digit))[:, None]
+    # Each digit is flipped by random ones of the digits before it, and keeps itself.
+    before = (np.uint64(2**32) - 2 * own.astype(np.uint64)).astype(np.uint32)
+    rows = (random & before) | own
+    parity = jax.lax.population_count(rows[:, None] & directions[None]) & 1
+    return jnp.sum(parity * own[:, None], axis=0, dtype=jnp.uint32)
