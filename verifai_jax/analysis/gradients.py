@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from verifai_jax.analysis.samples import whole
 from verifai_jax.analysis.sensitivity import (
     RESAMPLES,
     Sensitivity,
     Simulator,
-    check_count,
     check_problem,
     coordinates_of,
     ranked,
@@ -26,8 +26,9 @@ def gradient_sensitivity(
     """Mean squared gradient of the robustness by each feature, and what it bounds.
 
     `bound` is an upper bound on the total Sobol index: a feature whose bound is near 0 can be
-    fixed. It is no estimate of the index, and may exceed 1. `slope` is the mean gradient, whose
-    sign tells which way is worse. NaN for discrete coordinates, which have no gradient.
+    fixed. It is no estimate of the index, and says nothing above 1, which a few huge gradients of
+    a chaotic system suffice for. `slope` is the mean gradient, whose sign tells which way is worse;
+    `typical` the median of its size. NaN for discrete coordinates, which have no gradient.
 
     - `temperature`: of the smooth robustness that is differentiated; by default a hundredth of the
       standard deviation of the robustness. The bound holds for the smooth robustness, and as far
@@ -45,7 +46,7 @@ def gradient_sensitivity(
             f"the system of problem {problem.name!r} is a black box, which has no gradient; "
             "use sobol_indices or morris"
         )
-    check_count("samples", samples, 16)
+    whole(samples, "samples", 16)
     space = coordinates_of(problem)
     continuous = np.array(space.levels) == 0
     if not continuous.any():
@@ -86,6 +87,7 @@ def gradient_sensitivity(
             "high": high,
             "mean_squared": squared,
             "slope": np.mean(gradient, axis=0),
+            "typical": np.median(np.abs(gradient), axis=0),
         },
         by="bound",
     )

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.analysis.samples import whole
 from verifai_jax.analysis.sensitivity import (
     RESAMPLES,
     Coordinates,
     Sensitivity,
     Simulator,
-    check_count,
     check_problem,
     coordinates_of,
     mean_of,
@@ -49,7 +49,7 @@ def morris(
     of levels; where no simulation has a verdict or the robustness never varies.
     """
     check_problem(problem, "elementary effects", of)
-    check_count("trajectories", trajectories, 2)
+    whole(trajectories, "trajectories", 2)
     if not isinstance(levels, int) or levels < 2 or levels % 2:
         raise ValueError(f"levels must be an even number of at least 2; got {levels!r}")
     space = coordinates_of(problem)

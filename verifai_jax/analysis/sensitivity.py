@@ -57,6 +57,8 @@ class Sensitivity:
         if "total" in shown:
             columns = {"total": "in all", "first": "alone"}
             return plot_bars(shown, columns, title, "share of the variance", path)
+        # Above 1 a bound says nothing; at its own length it would hide those that do.
+        shown = shown.clip(upper=1)
         return plot_bars(shown, {"bound": ""}, title, "upper bound on the total index", path)
 
     def __str__(self) -> str:
@@ -159,11 +161,6 @@ def check_problem(problem: Any, what: str, of: str | None) -> None:
         check_names("formula", [of], problem.formulas)
 
 
-def check_count(name: str, value: Any, least: int) -> None:
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")
-
-
 def variance_of(rho: Float[np.ndarray, " n"], problem: Problem) -> float:
     proper = rho[np.isfinite(rho)]
     if not len(proper):
@@ -206,7 +203,10 @@ def _words(method: str, row: Any) -> str:
         )
     if np.isnan(row["bound"]):
         return "discrete: has no gradient"
+    slope = f"typical slope {row['typical']:.3g}"
+    if row["bound"] >= 1:
+        return f"no bound below 100 %: mean squared slope {row['mean_squared']:.3g}, {slope}"
     return (
         f"at most {row['bound']:.1%} of the variance ({row['low']:.1%} to {row['high']:.1%}), "
-        f"mean slope {row['slope']:.3g}"
+        f"{slope}"
     )

@@ -3,11 +3,11 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.analysis.samples import whole
 from verifai_jax.analysis.sensitivity import (
     RESAMPLES,
     Sensitivity,
     Simulator,
-    check_count,
     check_problem,
     coordinates_of,
     ranked,
@@ -45,7 +45,7 @@ def sobol_indices(
     fewer than 16 samples; where no simulation has a verdict or the robustness never varies.
     """
     check_problem(problem, "Sobol indices", of)
-    check_count("samples", samples, 16)
+    whole(samples, "samples", 16)
     names = coordinates_of(problem).names
     d = len(names)
     from scipy.stats import qmc

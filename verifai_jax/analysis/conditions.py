@@ -1,0 +1,203 @@
+"""Conditions on features in words, and the regions of the feature space that they make.
+
+>>> print(Between("masspole", above=0.31))
+masspole > 0.31
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.analysis.columns import Column
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Between:
+    """Numbers above `above` and up to `upto`, which is included; `integer`: only whole ones.
+
+    An absent entry never fulfils a condition.
+    """
+
+    feature: str
+    above: float = -np.inf
+    upto: float = np.inf
+    integer: bool = False
+
+    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
+        """Which rows fulfil the condition."""
+        values = frame[self.feature].to_numpy(np.float64)
+        return (values > self.above) & (values <= self.upto)
+
+    def __str__(self) -> str:
+        if self.integer and self.upto - self.above == 1:
+            return f"{self.feature} = {_number(self.upto)}"
+        if np.isinf(self.above):
+            return f"{self.feature} <= {_number(self.upto)}"
+        if np.isinf(self.upto):
+            return f"{self.feature} > {_number(self.above)}"
+        return f"{_number(self.above)} < {self.feature} <= {_number(self.upto)}"
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Choices that are at the `places` of a column's `choices`."""
+
+    column: Column
+    places: tuple[int, ...]
+
+    @property
+    def feature(self) -> str:
+        """Name of the column."""
+        return self.column.name
+
+    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
+        """Which rows fulfil the condition."""
+        return np.isin(self.column.codes(frame[self.feature]), self.places)
+
+    def __str__(self) -> str:
+        choices = self.column.choices
+        others = [i for i in range(len(choices)) if i not in self.places]
+        excluded = len(others) < len(self.places)
+        named = ", ".join(str(choices[i]) for i in (others if excluded else self.places))
+        several = len(others if excluded else self.places) > 1
+        verb = ("is none of" if several else "is not") if excluded else "is"
+        return f"{self.feature} {verb} {'one of ' * (several and not excluded)}{named}"
+
+
+Condition: TypeAlias = Between | OneOf
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box: bounds on the ordered columns, allowed choices of the unordered ones.
+
+    **Fields:** `above` and `upto`, one a column of `Samples.values()`, infinite where there is no
+    bound; `allowed`: for each column of `Samples.codes()` the places allowed, None for all.
+    """
+
+    above: tuple[float, ...]
+    upto: tuple[float, ...]
+    allowed: tuple[frozenset[int] | None, ...]
+
+    def covers(
+        self, values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Which rows lie inside; absent entries only where nothing is asked of them."""
+        inside = np.ones(len(values), bool)
+        for j, (above, upto) in enumerate(zip(self.above, self.upto, strict=True)):
+            if np.isfinite(above):
+                inside &= values[:, j] > above
+            if np.isfinite(upto):
+                inside &= values[:, j] <= upto
+        for j, allowed in enumerate(self.allowed):
+            if allowed is not None:
+                inside &= np.isin(codes[:, j], list(allowed))
+        return inside
+
+    @property
+    def size(self) -> int:
+        """On how many columns it has conditions."""
+        ends = zip(self.above, self.upto, strict=True)
+        bounded = sum(bool(np.isfinite(above) or np.isfinite(upto)) for above, upto in ends)
+        return bounded + sum(allowed is not None for allowed in self.allowed)
+
+    def bounded(self, j: int, above: float = -np.inf, upto: float = np.inf) -> "Region":
+        """The part of the region with a further bound on ordered column `j`."""
+        return replace(
+            self,
+            above=_put(self.above, j, max(self.above[j], above)),
+            upto=_put(self.upto, j, min(self.upto[j], upto)),
+        )
+
+    def restricted(self, j: int, places: frozenset[int]) -> "Region":
+        """The part of the region with these choices of unordered column `j` only."""
+        before = self.allowed[j]
+        places = places if before is None else before & places
+        return replace(self, allowed=_put(self.allowed, j, places))
+
+    def loosened(self) -> list["Region"]:
+        """The regions with one bound or restriction less."""
+        found = []
+        for j in range(len(self.above)):
+            if np.isfinite(self.above[j]):
+                found.append(replace(self, above=_put(self.above, j, -np.inf)))
+            if np.isfinite(self.upto[j]):
+                found.append(replace(self, upto=_put(self.upto, j, np.inf)))
+        for j, allowed in enumerate(self.allowed):
+            if allowed is not None:
+                found.append(replace(self, allowed=_put(self.allowed, j, None)))
+        return found
+
+    def rounded(self, values: Float[np.ndarray, "n k"], integer: Sequence[bool]) -> "Region":
+        """The region in short numbers, which covers the same of these rows.
+
+        - `integer`: for each ordered column, whether it holds whole numbers only.
+        """
+        region = self
+        for j in range(len(self.above)):
+            seen = np.unique(values[~np.isnan(values[:, j]), j])
+            ends = [
+                end if np.isinf(end) else _between_values(end, seen, integer[j])
+                for end in (self.above[j], self.upto[j])
+            ]
+            above, upto = _put(region.above, j, ends[0]), _put(region.upto, j, ends[1])
+            region = replace(region, above=above, upto=upto)
+        return region
+
+    def conditions(
+        self, ordered: Sequence[Column], unordered: Sequence[Column]
+    ) -> tuple[Condition, ...]:
+        """The region in words, one condition a column."""
+        found: list[Condition] = []
+        for column, above, upto in zip(ordered, self.above, self.upto, strict=True):
+            if np.isfinite(above) or np.isfinite(upto):
+                found.append(Between(column.name, above, upto, column.integer))
+        for column, allowed in zip(unordered, self.allowed, strict=True):
+            if allowed is not None:
+                found.append(OneOf(column, tuple(sorted(allowed))))
+        return tuple(found)
+
+
+def everywhere(ordered: int, unordered: int) -> Region:
+    """The region without any condition."""
+    return Region((-np.inf,) * ordered, (np.inf,) * ordered, (None,) * unordered)
+
+
+def short_number(least: float, below: float, near: float) -> float:
+    """The number with fewest decimals in `[least, below)`; the one closest to `near` of them.
+
+    >>> short_number(0.3071, 0.3164, 0.31175)
+    0.31
+    """
+    if not least < below:
+        return least
+    first = int(np.floor(np.log10(max(abs(least), abs(below))))) + 1
+    for decimals in range(-first, 18 - first):
+        number = round(near, decimals)
+        if least <= number < below:
+            return number + 0.0  # No negative zero.
+    return least
+
+
+def _between_values(end: float, seen: Float[np.ndarray, " n"], integer: bool) -> float:
+    """A short number that parts the values seen as `end` does."""
+    place = int(np.searchsorted(seen, end, side="right"))
+    if place in (0, len(seen)):
+        # All values are on one side: no bound at all, as far as these rows can tell.
+        return -np.inf if place == 0 else np.inf
+    least, below = float(seen[place - 1]), float(seen[place])
+    return float(np.floor(least)) if integer else short_number(least, below, (least + below) / 2)
+
+
+def _put(entries: tuple, j: int, entry: object) -> tuple:
+    return (*entries[:j], entry, *entries[j + 1 :])
+
+
+def _number(value: float) -> str:
+    return f"{value:.12g}"
