@@ -92,12 +92,16 @@ class CECompat(Search):
         after = state._replace(round=state.round + 1)
         if cube.dim == 0:
             return pick, after
-        histograms = state.histograms[self._set(pick, cube)]
-        limits = jnp.cumsum(histograms, axis=-1)
+        which, place = self._set(pick, cube)[:, None], np.arange(cube.dim)
+        limits = jnp.cumsum(state.histograms, axis=-1)
         # Rounding leaves a sum next to one: a pick must not fall behind the last bin.
-        scaled = pick * limits[:, :, -1]
+        scaled = pick * limits[which, place, -1]
         sizes = np.array(self._sizes(cube), np.int32)
-        bins = jnp.minimum(jnp.sum(scaled[:, :, None] >= limits, axis=-1), sizes - 1)
+        # The first bin whose limit is above the pick, by bisection.
+        bins = jnp.zeros((batch, cube.dim), jnp.int32)
+        for step in 2 ** np.arange(int(sizes.max() - 1).bit_length())[::-1]:
+            further = jnp.minimum(bins + step, sizes - 1)
+            bins = jnp.where(limits[which, place, further - 1] <= scaled, further, bins)
         u = jnp.clip((bins + inside) / sizes, 0.0, 1.0)
         u = u.at[:, cube.discrete].set(cube.centres(bins[:, cube.discrete]))
         lengths = np.array(cube.lengths, np.int32)
