@@ -11,51 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import CrossEntropy, Cube, Evaluated, Gradient
+from benchmarks.landscapes import LANDSCAPES as ALL
+from verifai_jax.search import CrossEntropy, Evaluated, Gradient
 
 BATCH, ROUNDS, SEEDS = 16, 60, 25
-BALL = jnp.array([0.3, 0.62, 0.71, 0.4])
-
-
-def ball(u):
-    """A cone whose tip fails: radius 0.1193 in four dimensions."""
-    return jnp.linalg.norm(u - BALL + 1e-9) - 0.1193
-
-
-def ridge(u):
-    """A narrow valley across three dimensions that sinks towards one place."""
-    along = jnp.array([1.0, 1.0, 0.5, -0.5]) / math.sqrt(2.5)
-    offset = u - jnp.array([0.75, 0.7, 0.4, 0.5])
-    distance = offset @ along
-    across = offset - distance * along
-    return jnp.sqrt(1e-6 + (distance / 4) ** 2 + across @ across) - 0.082
-
-
-def saddles(u):
-    """Two products, least in four of the sixteen corners."""
-    x = 2 * u - 1
-    return 1.5 - x[0] * x[1] - x[2] * x[3]
-
-
-def corner(u):
-    """A plane that fails in one corner, a simplex with legs of 0.39."""
-    return 4 - 0.39 - jnp.sum(u)
-
-
-def mixed(u):
-    """A cone in three dimensions for the right two of twelve combinations of two choices."""
-    wrong = 0.3 * (jnp.floor(u[3] * 4) != 2) + 0.3 * (jnp.floor(u[4] * 3) > 1)
-    return jnp.linalg.norm(u[:3] - jnp.array([0.3, 0.6, 0.8]) + 1e-9) - 0.112 + wrong
-
-
-FLAT = Cube((0, 0, 0, 0))
-LANDSCAPES = {  # name: robustness, cube, share that fails
-    "ball": (ball, FLAT, math.pi**2 / 2 * 0.1193**4),
-    "ridge": (ridge, FLAT, 9.2e-4),
-    "saddles": (saddles, FLAT, 7.9e-4),
-    "corner": (corner, FLAT, 0.39**4 / 24),
-    "mixed": (mixed, Cube((0, 0, 0, 4, 3)), 4 / 3 * math.pi * 0.112**3 / 6),
-}
+NAMES = ("ball", "ridge", "saddles", "corner", "mixed")
+LANDSCAPES = {name: ALL[name] for name in NAMES}
+FLAT = LANDSCAPES["ball"].cube
 
 
 @lru_cache
@@ -85,9 +47,9 @@ def play(search, landscapes, cube, batch=BATCH, rounds=ROUNDS, seeds=SEEDS):
     return np.asarray(u), np.asarray(value)
 
 
-@pytest.mark.parametrize("name", LANDSCAPES)
+@pytest.mark.parametrize("name", ALL)
 def test_the_failure_rates_are_as_stated(name):
-    rho, cube, share = LANDSCAPES[name]
+    rho, cube, share = ALL[name]
     u = np.random.default_rng(0).random((2**18, cube.dim), np.float32)
     failures = int(np.sum(jax.jit(jax.vmap(rho))(u) < 0))
     assert abs(failures - share * 2**18) < 5 * math.sqrt(share * 2**18)
@@ -142,7 +104,9 @@ def test_cross_entropy_never_stops_exploring():
 
 
 def test_cross_entropy_learns_in_large_batches_too():
-    _, (value,) = play(CrossEntropy(), (ball,), FLAT, batch=512, rounds=6, seeds=4)
+    _, (value,) = play(
+        CrossEntropy(), (LANDSCAPES["ball"].rho,), FLAT, batch=512, rounds=6, seeds=4
+    )
     failing = (value < 0).reshape(4, 6, 512).mean(axis=2)
     assert np.all(failing[:, -1] > 0.2)
     assert np.all(failing[:, 0] < 0.02)
