@@ -7,6 +7,7 @@ from verifai_jax import search as search
 from verifai_jax.devices import claim_cores as _claim_cores
 from verifai_jax.falsify import RunError as RunError
 from verifai_jax.falsify import falsify as falsify
+from verifai_jax.falsify import resume as resume
 from verifai_jax.features import Array as Array
 from verifai_jax.features import Box as Box
 from verifai_jax.features import Categorical as Categorical
@@ -37,8 +38,13 @@ from verifai_jax.mtl import smooth as smooth
 from verifai_jax.mtl import until as until
 from verifai_jax.problem import Problem as Problem
 from verifai_jax.problem import ProblemError as ProblemError
+from verifai_jax.rates import Decided as Decided
 from verifai_jax.rates import Rate as Rate
+from verifai_jax.rates import Within as Within
+from verifai_jax.rates import at_any_time as at_any_time
 from verifai_jax.rates import clopper_pearson as clopper_pearson
+from verifai_jax.rates import simulations_without_failure as simulations_without_failure
+from verifai_jax.rulebook import Rulebook as Rulebook
 from verifai_jax.run import Replay as Replay
 from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load

@@ -47,46 +47,77 @@ def main(traceback: bool) -> None:
 
 
 @main.command()
-@click.argument("target")
-@click.option("--search", default="cross_entropy", show_default=True, help="Name of the search.")
+@click.argument("target", required=False)
+@click.option("--search", help="Name of the search  [default: cross_entropy]")
 @click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
-@click.option("--budget", default=10_000, show_default=True, help="Simulations at most.")
-@click.option("--batch", default=1024, show_default=True, help="Simulations a round.")
-@click.option("--seed", default=0, show_default=True)
+@click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
+@click.option("--batch", type=int, help="Simulations a round  [default: 1024]")
+@click.option("--seed", type=int, help="[default: 0]")
+@click.option("--only", metavar="NAMES", help="Features to vary, comma-separated; others nominal.")
 @click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
 @click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+@click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
+@click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
+@click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
+@click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
 @click.option("--out", type=click.Path(path_type=Path), help="Run folder [runs/NAME-1, -2, ...].")
 @click.option("--pictures/--no-pictures", default=True, help="Draw pictures into the run folder.")
 def falsify(
-    target: str,
-    search: str,
+    target: str | None,
+    search: str | None,
     options: tuple[str, ...],
-    budget: int,
-    batch: int,
-    seed: int,
+    budget: int | None,
+    batch: int | None,
+    seed: int | None,
+    only: str | None,
     max_seconds: float | None,
     stop_after: int | None,
+    within: float | None,
+    decide: float | None,
+    warm_start: Path | None,
+    resume: Path | None,
     out: Path | None,
     pictures: bool,
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax.falsify import falsify as run_falsify
+    from verifai_jax.falsify import resume as run_resume
+    from verifai_jax.rates import Decided, Within
+    from verifai_jax.run import load
     from verifai_jax.search import named
     from verifai_jax.targets import load_target
 
-    chosen = named(search, **_options(options))
-    problem = load_target(target)
-    run = run_falsify(
-        problem,
-        chosen,
-        budget,
-        batch=batch,
-        seed=seed,
-        max_seconds=max_seconds,
-        stop_after=stop_after,
-        folder=out or _next_folder(problem.name),
-        target=target,
-    )
+    if within is not None and decide is not None:
+        raise click.UsageError("--within and --decide are two ways to stop; give one")
+    ends: dict[str, Any] = {"max_seconds": max_seconds, "stop_after": stop_after}
+    if within is not None or decide is not None:
+        ends["stop_when"] = Decided(decide) if within is None else Within(within)  # pyright: ignore[reportArgumentType]
+    if resume is not None:
+        fixed = {"--search": search, "--batch": batch, "--seed": seed, "--only": only, "--out": out}
+        fixed |= {"--set": options or None, "--warm-start": warm_start}
+        for option, value in fixed.items():
+            if value is not None:
+                raise click.UsageError(f"{option} is fixed in the run that --resume goes on with")
+        problem = load_target(target or _recorded_target(resume))
+        run = run_resume(resume, problem, budget=budget, **ends)
+    elif target is None:
+        raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
+    else:
+        chosen = named(search or "cross_entropy", **_options(options))
+        problem = load_target(target)
+        if only is not None:
+            problem = problem.only(*(name.strip() for name in only.split(",")))
+        run = run_falsify(
+            problem,
+            chosen,
+            10_000 if budget is None else budget,
+            batch=1024 if batch is None else batch,
+            seed=0 if seed is None else seed,
+            warm_start=None if warm_start is None else load(warm_start),
+            folder=out or _next_folder(problem.name),
+            target=target,
+            **ends,
+        )
     click.echo(run.summary())
     assert run.folder is not None
     click.echo(f"  table        {run.folder / 'table.parquet'}")

@@ -1,31 +1,31 @@
-"""The falsification loop: rounds, budgets, stopping, progress, storing.
+"""The falsification loop: budgets, stopping, progress, storing, resuming.
 
 run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
 run = falsify(problem, search=search.Gradient(learning_rate=0.2), stop_after=10)
+run = resume(run, budget=50_000)
 """
 
 import time
-from functools import lru_cache
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax
 from verifai_jax import search as searches
-from verifai_jax.engine import Engine, Evaluation, engine_for
-from verifai_jax.errors import suggests_options
-from verifai_jax.host import HostEngine
+from verifai_jax.errors import suggests_options, unknown_name
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
-from verifai_jax.run import Run, run_keys, write_record
-from verifai_jax.search import Cube, Evaluated, Search
+from verifai_jax.proposals import cube_of
+from verifai_jax.rates import StoppingRule
+from verifai_jax.rounds import Rounds
+from verifai_jax.run import Run, load, write_record
+from verifai_jax.search import Search
 from verifai_jax.table import ErrorTable
-from verifai_jax.trace import Status
 
-STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class RunError(RuntimeError):
@@ -46,6 +46,8 @@ def falsify(
     seed: int = 0,
     max_seconds: float | None = None,
     stop_after: int | None = None,
+    stop_when: StoppingRule | None = None,
+    warm_start: "Run | ErrorTable | pd.DataFrame | None" = None,
     folder: str | Path | None = None,
     progress: bool | None = None,
     target: str | None = None,
@@ -62,6 +64,10 @@ def falsify(
     - `seed`: the same seed gives the same table, bit for bit, on the same machine.
     - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
     - `stop_after`: stop after the round in which that many counterexamples are reached.
+    - `stop_when`: stop when the failure rate is known well enough: `Within(0.005)`,
+      `Decided(0.01)`; only for searches that sample the prior.
+    - `warm_start`: an earlier run or table with the same features, from which a search that learns
+      starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
@@ -69,16 +75,133 @@ def falsify(
     Ctrl-C ends the run and returns what is finished.
 
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
-    problem whose parts do not fit, a search that cannot work on the space; `RunError` with the
-    finished part of the run when the loop breaks down.
+    problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
+    work on the space; `RunError` with the finished part of the run when the loop breaks down.
     """
     started = time.perf_counter()
     _check_options(budget, batch, seed, max_seconds, stop_after)
     search = _check_search(problem, search)
+    _check_rule(search, stop_when)
+    earlier = _earlier(warm_start, problem)
     problem.check()
     batch = min(batch, budget)
     place = _new_folder(folder)
-    rounds = _Rounds(problem, search, batch, seed, ErrorTable(tuple(problem.space.columns), place))
+    table = ErrorTable(tuple(problem.space.columns), place)
+    rounds = Rounds(problem, search, batch, seed, table)
+
+    def prepare() -> None:
+        if earlier is not None:
+            rounds.warm(earlier)
+
+    ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
+    return _play(rounds, ends, seed, place, progress, target, prepare)
+
+
+@suggests_options
+def resume(
+    run: Run | str | Path,
+    problem: Problem | None = None,
+    *,
+    search: Search | None = None,
+    budget: int | None = None,
+    max_seconds: float | None = None,
+    stop_after: int | None = None,
+    stop_when: StoppingRule | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
+
+    **Arguments:**
+
+    - `run`: a run, or the folder of one; a folder is written on.
+    - `problem`: needed for a folder, which names no code to run.
+    - `search`: needed only if it is none of `verifai_jax.search`.
+    - `budget`: simulations in all, those done included; the run's own when left out.
+    - the others as in `falsify`.
+
+    The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
+    of a search that learns does a larger one go on with a new batch.
+
+    **Raises:** `ValueError` for a run without its problem or its state, or a budget that is spent;
+    as `falsify` otherwise.
+    """
+    started = time.perf_counter()
+    if isinstance(run, str | Path):
+        run = load(run, problem)
+    problem = problem or run.problem
+    if problem is None:
+        raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
+    if search is None:
+        if run.search_data is None:
+            raise ValueError(
+                f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
+            )
+        search = searches.from_json(run.search_data)
+    search = _check_search(problem, search)
+    _check_rule(search, stop_when)
+    budget = run.budget if budget is None else budget
+    _check_options(budget, run.batch, run.seed, max_seconds, stop_after)
+    snapshot = run.snapshot or {}
+    rows = int(snapshot.get("rows", 0))
+    if budget <= rows:
+        raise ValueError(
+            f"the run of {run.name!r} has {rows} simulations already; resume it with a larger "
+            f"budget than {budget}"
+        )
+    if not snapshot and len(run.table) and run.stopped != "running":
+        raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+    problem.check()
+    table = run.table.resumed(rows, run.folder)
+    rounds = Rounds(problem, search, run.batch, run.seed, table)
+
+    def prepare() -> None:
+        if snapshot:
+            rounds.resume(snapshot)
+
+    ends = _Ends(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
+    return _play(rounds, ends, run.seed, run.folder, progress, run.target, prepare)
+
+
+class _Ends(NamedTuple):
+    """What ends a run."""
+
+    started: float
+    budget: int
+    max_seconds: float | None
+    stop_after: int | None
+    stop_when: StoppingRule | None
+    earlier: float = 0.0  # Seconds that an earlier part of the run has taken.
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self.started
+
+    def reached(self, rounds: Rounds) -> str | None:
+        """What ends the run after this round, if anything does."""
+        if self.stop_after is not None and rounds.found >= self.stop_after:
+            return "stop_after"
+        if self.stop_when is not None and self.stop_when.done(rounds.found, rounds.judged):
+            return "stop_when"
+        if len(rounds.table) >= self.budget:
+            return "budget"
+        if rounds.exhausted:
+            return "exhausted"
+        if self.max_seconds is not None and self.seconds >= self.max_seconds:
+            return "max_seconds"
+        return None
+
+
+def _play(
+    rounds: Rounds,
+    ends: _Ends,
+    seed: int,
+    place: Path | None,
+    progress: bool | None,
+    target: str | None,
+    prepare: Callable[[], None],
+) -> Run:
+    """Compile, `prepare`, and play rounds until something ends them."""
+    problem, search = rounds.problem, rounds.search
 
     def run(stopped: str) -> Run:
         return Run(
@@ -87,35 +210,37 @@ def falsify(
             table=rounds.table,
             search=repr(search),
             seed=int(seed),
-            batch=batch,
+            batch=rounds.batch,
             stopped=stopped,
             compile_seconds=rounds.compile_seconds,
-            run_seconds=time.perf_counter() - started - rounds.compile_seconds,
+            run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds,
             version=verifai_jax.__version__,
             prior=search.samples_prior,
             folder=place,
             target=target,
             problem=problem,
+            budget=int(ends.budget),
+            search_data=searches.to_json(search),
+            acceptance=rounds.acceptance,
+            snapshot=rounds.snapshot,
         )
 
     if place is not None:
         write_record(run("running"), place)
-    stopped, cause = "budget", None
+    stopped, cause = None, None
     try:
-        with Progress(problem.name, budget, progress) as bar:
+        with Progress(problem.name, ends.budget, progress) as bar:
             rounds.compile()
+            prepare()
             # Checking and tracing are part of what a second run of the problem does not repeat.
-            rounds.compile_seconds = time.perf_counter() - started
-            while len(rounds.table) < budget:
-                rounds.advance(min(batch, budget - len(rounds.table)))
+            rounds.compile_seconds = ends.seconds
+            stopped = "exhausted" if rounds.exhausted else None
+            while stopped is None:
+                rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)))
                 bar.update(len(rounds.table), rounds.found, rounds.best)
-                if stop_after is not None and rounds.found >= stop_after:
-                    stopped = "stop_after"
-                    break
-                overtime = max_seconds is not None and time.perf_counter() - started >= max_seconds
-                if overtime and len(rounds.table) < budget:
-                    stopped = "max_seconds"
-                    break
+                stopped = ends.reached(rounds)
+                if place is not None and stopped is None:
+                    rounds.save(place, seldom=True)
     except KeyboardInterrupt:
         stopped = "interrupted"
     except Exception as error:
@@ -123,6 +248,7 @@ def falsify(
     result = run(stopped)
     rounds.table.close()
     if place is not None:
+        rounds.save(place)
         write_record(result, place)
     if cause is not None:
         raise RunError(
@@ -131,107 +257,6 @@ def falsify(
             result,
         ) from cause
     return result
-
-
-class _Rounds:
-    """The state of a run between rounds, and one round of it."""
-
-    def __init__(
-        self, problem: Problem, search: Search, batch: int, seed: int, table: ErrorTable
-    ) -> None:
-        self.problem, self.search, self.batch, self.table = problem, search, batch, table
-        self.engine = (
-            HostEngine(problem)
-            if problem.black_box
-            else engine_for(problem, batch, gradient=search.wants_gradient)
-        )
-        self.search_key, self.simulation_key = run_keys(seed)
-        self.found, self.best = 0, float("nan")
-        self.compile_seconds = 0.0
-        self.program: Any = None
-        self.state: Any = None
-
-    def compile(self) -> None:
-        self.engine.compile()
-        cube = Cube(tuple(self.problem.space.levels))
-        self.program = _search_program(self.search, cube, self.batch)
-        self.state = self.program.init(self.search_key)
-
-    def advance(self, n: int) -> None:
-        """Ask, evaluate, tell and store `n` simulations."""
-        first = len(self.table)
-        u, self.state = self.program.ask(self.state)
-        temperature = self.program.temperature(self.state)
-        evaluation = self.engine.evaluate(u[:n], self.simulation_key, first, temperature)
-        rho = np.min(evaluation.rho, axis=1)
-        proper = evaluation.status == Status.OK
-        violated = np.any(evaluation.rho < 0, axis=1)
-        undecided = proper & ~violated & np.any(evaluation.rho == 0, axis=1)
-        if undecided.any():
-            # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
-            holds = evaluation.holds
-            if holds is None:
-                assert isinstance(self.engine, Engine)
-                compiled = self.engine.compile_seconds
-                holds = self.engine.verdicts(u[:n], self.simulation_key, first)
-                self.compile_seconds += self.engine.compile_seconds - compiled
-            violated |= undecided & ~np.all(holds, axis=1)
-        self.state = self.program.tell(
-            self.state,
-            Evaluated(
-                u=u,
-                rho=_fill(rho, self.batch, np.nan),
-                counted=_fill(proper, self.batch, False),
-                gradient=None
-                if evaluation.gradient is None
-                else _fill(evaluation.gradient, self.batch, 0.0),
-            ),
-        )
-        self.table.append(self._columns(evaluation, rho, violated))
-        self.found += int(np.sum(violated))
-        self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
-
-    def _columns(self, evaluation: Evaluation, rho: Any, violated: Any) -> dict[str, Any]:
-        columns: dict[str, Any] = {**self.problem.space.rows(evaluation.features), "rho": rho}
-        if len(self.problem.formulas) > 1:
-            for i, name in enumerate(self.problem.formulas):
-                columns[f"rho.{name}"] = evaluation.rho[:, i]
-        columns |= {"violated": violated, "status": STATUS_NAMES[evaluation.status]}
-        if evaluation.messages is not None:
-            columns["message"] = np.array(evaluation.messages, dtype=object)
-        return columns
-
-
-def _fill(rows: Any, batch: int, value: Any) -> Any:
-    if len(rows) == batch:
-        return rows
-    return np.concatenate([rows, np.full((batch - len(rows), *rows.shape[1:]), value, rows.dtype)])
-
-
-class _SearchProgram(NamedTuple):
-    init: Any
-    ask: Any
-    tell: Any
-    temperature: Any
-
-
-@lru_cache(maxsize=64)
-def _search_program(search: Search, cube: Cube, batch: int) -> _SearchProgram:
-    """The compiled `init / ask / tell` of one search on one cube."""
-    key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
-    init = jax.jit(lambda key: search.init(key, cube, batch)).lower(key).compile()
-    state = jax.eval_shape(lambda key: search.init(key, cube, batch), key)
-    ask = jax.jit(lambda state: search.ask(state, cube, batch)).lower(state).compile()
-    points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
-    rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
-    counted: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
-    evaluated = Evaluated(points, rho, counted, points if search.wants_gradient else None)
-    tell = jax.jit(lambda state, told: search.tell(state, cube, told))
-    tell = tell.lower(state, evaluated).compile()
-    temperature: Any = lambda state: 1.0  # noqa: E731
-    if search.wants_gradient:
-        temperature = jax.jit(search.temperature).lower(state).compile()
-    return _SearchProgram(init, ask, tell, temperature)
 
 
 def _is_integer(value: Any) -> bool:
@@ -255,15 +280,43 @@ def _check_search(problem: Any, search: Any) -> Search:
         raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
     if isinstance(search, str):
         search = searches.named(search)
-    if isinstance(search, type) or not hasattr(search, "ask"):
+    if not isinstance(search, Search):
         raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
     if problem.black_box and search.wants_gradient:
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
             f"search {search!r} needs one; use one that does not, such as 'cross_entropy'"
         )
-    search.check(Cube(tuple(problem.space.levels)))
+    if hasattr(problem.space, "check_where"):
+        problem.space.check_where()
+    search.check(cube_of(problem.space))
     return search
+
+
+def _check_rule(search: Search, rule: StoppingRule | None) -> None:
+    if rule is None:
+        return
+    if not hasattr(rule, "done"):
+        raise TypeError(f"stop_when must be a rule such as Within(0.005); got {rule!r}")
+    if not search.samples_prior:
+        raise ValueError(
+            f"stop_when needs independent samples of the space, which search {search!r} does not "
+            "give; use search='uniform'"
+        )
+
+
+def _earlier(warm_start: Any, problem: Problem) -> Any:
+    """The rows of an earlier table, as a DataFrame with the columns that are needed."""
+    if warm_start is None:
+        return None
+    table = warm_start.table if isinstance(warm_start, Run) else warm_start
+    frame = table.all if isinstance(table, ErrorTable) else table
+    if not hasattr(frame, "columns"):
+        raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
+    for column in (*problem.space.columns, "rho"):
+        if column not in frame.columns:
+            raise unknown_name("column of warm_start", column, map(str, frame.columns))
+    return frame
 
 
 def _new_folder(folder: str | Path | None) -> Path | None:

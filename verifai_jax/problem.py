@@ -6,8 +6,9 @@
 `Problem.check()` says everything that is wrong with it before anything compiles.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.rulebook import Rulebook
 from verifai_jax.trace import Trace
 
 System = Callable[..., Trace]
@@ -40,12 +42,16 @@ class Problem:
     - `nominal`: features of an ordinary day; must lie in the space.
     - `description`: one line for `verifai-jax list`.
     - `end`: what a formula sees behind the end of a trace; `"hold"` repeats the last sample.
+    - `priority`: which of several formulas matter more: names in falling order, or pairs
+      `(higher, lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest
+      counterexamples instead of the least robustness.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
 
-    `formulas` holds the parsed spec by name; `engines` what has been compiled for this problem.
+    `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
+    `engines` what has been compiled for this problem.
 
-    **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, or nominal
-    features outside the space.
+    **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, nominal
+    features outside the space, or a priority that names no formula or goes round in a circle.
     """
 
     name: str
@@ -56,7 +62,9 @@ class Problem:
     description: str = ""
     end: End = "hold"
     draw: Callable[..., None] | None = None
+    priority: Sequence[str] | Sequence[tuple[str, str]] | None = None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
+    rulebook: Rulebook | None = field(init=False, repr=False, default=None)
     engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -77,6 +85,8 @@ class Problem:
             raise ProblemError("spec has no formula; give a formula or a dictionary of them")
         formulas = {name: _formula(name, formula) for name, formula in spec.items()}
         object.__setattr__(self, "formulas", formulas)
+        if self.priority is not None:
+            object.__setattr__(self, "rulebook", _rulebook(self.priority, formulas))
         if self.nominal is not None:
             self.space.check(self.nominal)
 
@@ -84,6 +94,16 @@ class Problem:
     def black_box(self) -> bool:
         """Whether the system runs on the host, out of JAX's sight."""
         return bool(getattr(self.system, "black_box", False))
+
+    def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
+        """The same problem with these features varied alone, all others at their nominal values.
+
+        - `nominal`: values to fix the others at, where they differ from the problem's own.
+
+        **Raises:** `ValueError` for an unknown feature, or one to be fixed without a nominal value.
+        """
+        fixed = {**(self.nominal or {}), **(nominal or {})}
+        return replace(self, space=self.space.only(*features, nominal=fixed))
 
     def check(self) -> None:
         """Trace the system and its monitor abstractly: no simulation, nothing compiles.
@@ -116,6 +136,13 @@ class Problem:
             lines.append(f"  {name}: {formula}")
         lines.append(f"  features: {', '.join(self.space.columns)}")
         return "\n".join(lines)
+
+
+def _rulebook(priority: Any, formulas: Mapping[str, Formula]) -> Rulebook:
+    entries = [priority] if isinstance(priority, str) else list(priority)
+    if all(isinstance(entry, str) for entry in entries):
+        return Rulebook(formulas, list(pairwise(entries)))
+    return Rulebook(formulas, entries)
 
 
 def _formula(name: str, formula: Formula | str) -> Formula:

@@ -20,7 +20,9 @@ from jaxtyping import Array, Key
 from verifai_jax.engine import judge, simulation_key, verdict
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem import Problem
-from verifai_jax.rates import Rate, clopper_pearson
+from verifai_jax.rates import Rate, at_any_time, clopper_pearson
+from verifai_jax.rulebook import Rulebook
+from verifai_jax.snapshot import read_snapshot, write_snapshot
 from verifai_jax.table import ErrorTable
 from verifai_jax.trace import Status, Trace
 
@@ -79,11 +81,15 @@ class Run:
     """What `falsify` returns.
 
     **Fields:** `name` and `formulas` (texts) of the problem; `table`; `search` (its repr), `seed`
-    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"interrupted"`, the error
-    that ended it, or `"running"` for one that was cut off;
+    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`,
+    `"exhausted"` (a finite search came to its end), `"interrupted"`, the error that ended it, or
+    `"running"` for one that was cut off;
     `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
     independent samples of the feature space; `folder` on disk, if any; `target`: how the command
-    line names the problem; `problem` itself, None for a loaded run without one.
+    line names the problem; `problem` itself, None for a loaded run without one; `budget`;
+    `search_data`: the search as plain data, None for one of the user's own; `acceptance`: share of
+    proposed points that the constraint of the space let through, None without one; `snapshot`: what
+    `resume` goes on from.
     """
 
     name: str
@@ -100,6 +106,10 @@ class Run:
     folder: Path | None = None
     target: str | None = None
     problem: Problem | None = None
+    budget: int = 0
+    search_data: Mapping[str, Any] | None = None
+    acceptance: float | None = None
+    snapshot: Mapping[str, Any] | None = None
 
     @property
     def simulations(self) -> int:
@@ -123,16 +133,45 @@ class Run:
 
     @property
     def failure_rate(self) -> Rate | None:
-        """Failures per simulation with a 95 % Clopper-Pearson interval.
+        """Failures per simulation with a 95 % interval.
 
-        None unless the rows are independent samples of the feature space, their number was not
-        decided by the outcomes, and at least one of them has a verdict: an active search may
-        refute, it never certifies. Simulations without a verdict do not count.
+        Clopper-Pearson where the number of simulations was not decided by their outcomes, else
+        one that holds whenever sampling stops. None unless the rows are independent samples of
+        the feature space and at least one of them has a verdict: an active search may refute, it
+        never certifies. Simulations without a verdict do not count.
         """
         failures, safe = len(self.table.counterexamples), len(self.table.safe)
-        if not self.prior or self.stopped == "stop_after" or failures + safe == 0:
+        if not self.prior or failures + safe == 0:
             return None
+        if self.stopped in ("stop_after", "stop_when"):
+            return at_any_time(failures, failures + safe)
         return clopper_pearson(failures, failures + safe)
+
+    @property
+    def front(self) -> "pd.DataFrame":
+        """The counterexamples that no other one outdoes: with several formulas, the Pareto set.
+
+        Compared by how much each formula is broken, in the order of the problem's priority;
+        without one no formula makes up for another. With one formula: the worst row.
+
+        **Raises:** `ValueError` for a run loaded without its problem.
+        """
+        if self.problem is None:
+            raise ValueError(
+                f"the run of {self.name!r} was loaded without its problem, which has the priority "
+                "of its formulas; give it: vj.load(path, problem)"
+            )
+        failing = self.table.counterexamples
+        names = [f"rho.{name}" for name in self.formulas] if len(self.formulas) > 1 else ["rho"]
+        broken = np.maximum(-failing[names].to_numpy(np.float64), 0.0)
+        rulebook = self.problem.rulebook or Rulebook(self.formulas)
+        return failing.loc[rulebook.front(broken)] if len(failing) else failing
+
+    def analyze(self, **options: Any) -> Any:
+        """What the table says: rules, importance, clusters, coverage; see `analysis.analyze`."""
+        from verifai_jax.analysis import analyze
+
+        return analyze(self, **options)
 
     def replay(
         self, row: "int | pd.Series | Mapping[str, Any]", precision: str = "float32"
@@ -171,10 +210,12 @@ class Run:
         return plot_features(self, path)
 
     def save(self, path: str | Path) -> Path:
-        """Write the run to a folder: `run.json` and `table.parquet`; returns the folder."""
+        """Write the run to a folder: its record, table and state; returns the folder."""
         folder = Path(path)
         self.table.save(folder)
         write_record(self, folder)
+        if self.snapshot:
+            write_snapshot(self.snapshot, folder)
         return folder
 
     def __repr__(self) -> str:
@@ -228,7 +269,7 @@ def _cast(leaf: Any, precision: str) -> Any:
 def write_record(run: Run, folder: Path) -> None:
     """Write everything about a run but its table to `run.json`."""
     record = {"format": FORMAT, "features": list(run.table.features)}
-    for name in _RECORDED:
+    for name in (*_RECORDED, *_ADDED):
         record[name] = getattr(run, name)
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(record, indent=2) + "\n")
@@ -248,6 +289,7 @@ _RECORDED = (
     "prior",
     "target",
 )
+_ADDED = ("budget", "search_data", "acceptance")  # Absent from the records of 0.1.
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
@@ -283,7 +325,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         table=ErrorTable.load(folder, features),
         folder=folder,
         problem=problem,
+        snapshot=read_snapshot(folder),
         **{name: record[name] for name in _RECORDED},
+        **{name: record[name] for name in _ADDED if name in record},
     )
 
 
@@ -295,8 +339,6 @@ def _summary(run: Run) -> str:
     rate = run.failure_rate
     if rate is not None:
         lines.append(f"  failure rate {rate}")
-    elif run.prior and run.stopped == "stop_after":
-        lines.append("  failure rate not given: the run was stopped by its own counterexamples")
     elif not run.prior:
         lines.append(
             "  failure rate not given: this search goes where failures are; "
@@ -315,6 +357,10 @@ def _summary(run: Run) -> str:
         if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
             number, message = raised.index[0], raised["message"].iloc[0]
             lines.append(f"               first in row {number}: {message}")
+    if run.acceptance is not None:
+        lines.append(
+            f"  constraint   let through {100 * run.acceptance:.3g} % of what was proposed"
+        )
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
     lines.append(
         f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "

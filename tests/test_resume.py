@@ -1,0 +1,142 @@
+"""A run that was stopped or cut off goes on as if it had not been."""
+
+import dataclasses
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax import search
+from verifai_jax.snapshot import STATE
+
+SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1), "kind": vj.Categorical("slow", "fast")}
+
+
+def ramp(features, key):
+    slope = features["a"] + 0.3 * features["b"] ** 2 + 0.1 * features["kind"]
+    return vj.Trace({"x": slope * jnp.linspace(0, 1, 5)}, dt=0.25)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return vj.Problem("ramp", space=SPACE, system=ramp, spec="always[0, 1] x <= 1.1")
+
+
+def same(one, other):
+    return one.table.all.equals(other.table.all)
+
+
+@pytest.mark.parametrize("name", ["uniform", "cross_entropy", "gradient"])
+def test_in_memory(problem, name):
+    whole = vj.falsify(problem, name, 96, batch=16)
+    part = vj.falsify(problem, name, 32, batch=16)
+    resumed = vj.resume(part, budget=96)
+    assert same(resumed, whole)
+    assert (resumed.stopped, resumed.budget) == ("budget", 96)
+    assert resumed.run_seconds > part.run_seconds
+    # What it goes on from is untouched.
+    assert len(part.table) == 32
+
+
+def test_passive_searches_go_on_within_a_batch(problem):
+    whole = vj.falsify(problem, "halton", 64, batch=16)
+    part = vj.falsify(problem, "halton", 25, batch=16)
+    assert same(vj.resume(part, budget=64), whole)
+
+
+@pytest.mark.parametrize("name", ["cross_entropy", "gradient"])
+def test_from_a_folder_after_a_kill(problem, name, tmp_path):
+    whole = vj.falsify(problem, name, 96, batch=16)
+    vj.falsify(problem, name, 64, batch=16, folder=tmp_path / "run")
+    # A process that dies has rows that its last saved state does not know of.
+    earlier = vj.falsify(problem, name, 32, batch=16, folder=tmp_path / "earlier")
+    shutil.copy(earlier.folder / STATE, tmp_path / "run" / STATE)
+    resumed = vj.resume(tmp_path / "run", problem, budget=96)
+    assert same(resumed, whole)
+    assert same(vj.load(tmp_path / "run", problem), whole)
+    # And again, from what that has left.
+    longer = vj.resume(tmp_path / "run", problem, budget=112)
+    assert same(longer, vj.falsify(problem, name, 112, batch=16))
+
+
+def test_before_any_state_was_saved(problem, tmp_path):
+    whole = vj.falsify(problem, "halton", 48, batch=16, folder=tmp_path / "run")
+    (tmp_path / "run" / STATE).unlink()
+    record = tmp_path / "run" / "run.json"
+    record.write_text(record.read_text().replace('"stopped": "budget"', '"stopped": "running"'))
+    assert same(vj.resume(tmp_path / "run", problem), whole)
+
+
+def test_a_saved_run_can_be_resumed(problem, tmp_path):
+    part = vj.falsify(problem, "cross_entropy", 32, batch=16)
+    part.save(tmp_path)
+    resumed = vj.resume(tmp_path, problem, budget=64)
+    assert same(resumed, vj.falsify(problem, "cross_entropy", 64, batch=16))
+
+
+@dataclasses.dataclass(frozen=True)
+class Own(search.Uniform):
+    """A search that verifai_jax does not know by name."""
+
+
+class TestRefused:
+    def test_a_spent_budget(self, problem):
+        run = vj.falsify(problem, "halton", 16, batch=16)
+        with pytest.raises(ValueError, match="has 16 simulations already; resume it with a larger"):
+            vj.resume(run)
+
+    def test_without_its_problem(self, problem, tmp_path):
+        vj.falsify(problem, "halton", 16, batch=16, folder=tmp_path / "run")
+        with pytest.raises(ValueError, match="needs its problem"):
+            vj.resume(tmp_path / "run", budget=32)
+
+    def test_another_search(self, problem):
+        run = vj.falsify(problem, "halton", 16, batch=16)
+        with pytest.raises(vj.RunError, match="the saved state is not one of search CrossEntropy"):
+            vj.resume(run, search=search.CrossEntropy(), budget=32)
+
+    def test_a_search_of_ones_own_has_to_be_given(self, problem):
+        run = vj.falsify(problem, Own(), 16, batch=16)
+        with pytest.raises(ValueError, match="is none of .*; give it"):
+            vj.resume(run, budget=32)
+        resumed = vj.resume(run, search=Own(), budget=32)
+        assert same(resumed, vj.falsify(problem, Own(), 32, batch=16))
+
+    def test_a_search_without_the_base(self, problem):
+        with pytest.raises(TypeError, match="search must be a name or a search"):
+            vj.falsify(problem, search.CrossEntropy)
+
+
+class TestWarmStart:
+    def test_a_search_starts_where_the_table_says(self, problem):
+        earlier = vj.falsify(problem, "uniform", 256, batch=64)
+        assert len(earlier.table.counterexamples) > 5
+        cold = vj.falsify(problem, "cross_entropy", 16, batch=16)
+        for start in (earlier, earlier.table, earlier.table.all):
+            warm = vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=start)
+            assert len(warm.table.counterexamples) >= 6 > len(cold.table.counterexamples)
+        assert len(warm.table) == 16
+
+    def test_a_gradient_search_starts_from_the_nearest(self, problem):
+        earlier = vj.falsify(problem, "uniform", 64, batch=64)
+        warm = vj.falsify(problem, "gradient", 8, batch=8, warm_start=earlier)
+        nearest = earlier.table.safe.nsmallest(8, "rho")
+        np.testing.assert_allclose(warm.table.all["rho"], nearest["rho"], atol=1e-5)
+
+    def test_rows_without_a_verdict_do_not_count(self, problem):
+        earlier = vj.falsify(problem, "uniform", 32, batch=16).table.all.copy()
+        earlier.loc[5, ["rho", "status"]] = [np.nan, "nonfinite"]
+        run = vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=earlier)
+        assert np.all(np.isfinite(run.table.all["rho"]))
+        nothing = earlier.loc[earlier["status"] != "ok"]
+        cold = vj.falsify(problem, "cross_entropy", 16, batch=16)
+        assert same(vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=nothing), cold)
+
+    def test_bad_tables(self, problem):
+        table = vj.falsify(problem, "uniform", 16, batch=16).table.all
+        with pytest.raises(ValueError, match="unknown column of warm_start 'kind'"):
+            vj.falsify(problem, warm_start=table.drop(columns="kind"))
+        with pytest.raises(TypeError, match="a run, an error table or a DataFrame; got 3"):
+            vj.falsify(problem, warm_start=3)

@@ -1,0 +1,176 @@
+"""The state of a run between its rounds, and one round: propose, simulate, judge, tell, store.
+
+A round leaves everything in step: the table, the search and the counts. What `snapshot` gives after
+a round is enough to go on from there, whatever happened since.
+"""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.engine import Engine, Evaluation, engine_for
+from verifai_jax.host import HostEngine
+from verifai_jax.problem import Problem
+from verifai_jax.proposals import Proposals, units
+from verifai_jax.rulebook import Objective
+from verifai_jax.run import run_keys
+from verifai_jax.search import Search
+from verifai_jax.snapshot import write_snapshot
+from verifai_jax.table import ErrorTable
+from verifai_jax.trace import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
+MOST_WARM = 2048
+"""Rows of an earlier table at most that a search starts with; the worst of a longer one."""
+
+
+class Rounds:
+    """The rounds of one run; `compile` first, then `advance` as often as wanted.
+
+    `found` counts the counterexamples and `judged` the simulations with a verdict; `best` is the
+    least robustness.
+    """
+
+    def __init__(
+        self, problem: Problem, search: Search, batch: int, seed: int, table: ErrorTable
+    ) -> None:
+        self.problem, self.search, self.batch, self.table = problem, search, batch, table
+        self.engine = (
+            HostEngine(problem)
+            if problem.black_box
+            else engine_for(problem, batch, gradient=search.wants_gradient)
+        )
+        self.search_key, self.simulation_key = run_keys(seed)
+        self.found = self.judged = 0
+        self.best = float("nan")
+        self.compile_seconds = 0.0
+        self.snapshot: dict[str, Any] = {}
+        self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
+        self._proposals: Any = None
+        self._saved = time.perf_counter()
+
+    def compile(self) -> None:
+        """Compile the engine and the search."""
+        self.engine.compile()
+        self._proposals = Proposals(self.search, self.problem.space, self.batch, self.search_key)
+        self._keep()
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether a finite search has come to its end."""
+        return self._proposals.exhausted
+
+    @property
+    def acceptance(self) -> float | None:
+        """Share of proposed points that the constraint let through; None without one."""
+        if getattr(self.problem.space, "where", None) is None or self._proposals is None:
+            return None
+        return self._proposals.accepted / max(self._proposals.asked, 1)
+
+    def advance(self, most: int) -> None:
+        """Ask, evaluate, tell and store at most `most` simulations."""
+        first = len(self.table)
+        points = self._proposals.next(most)
+        n = len(points)
+        if n:
+            temperature = self._proposals.temperature
+            evaluation = self.engine.evaluate(points, self.simulation_key, first, temperature)
+            violated = self._violated(evaluation, points, first)
+        else:
+            d = points.shape[1]
+            nothing = np.zeros((0, len(self.problem.formulas)), np.float32)
+            gradient = np.zeros((0, d), np.float32) if self.search.wants_gradient else None
+            evaluation = Evaluation(nothing, np.zeros(0, np.int32), {}, gradient)
+            violated = np.zeros(0, bool)
+        rho = np.min(evaluation.rho, axis=1, initial=np.inf)
+        proper = evaluation.status == Status.OK
+        told = rho
+        if self._objective is not None:
+            broken = evaluation.rho < 0
+            told = self._objective(evaluation.rho, broken).astype(np.float32)
+        self._proposals.tell(told, proper, evaluation.gradient)
+        if n:
+            self.table.append(self._columns(evaluation, rho, violated))
+            self.found += int(np.sum(violated))
+            self.judged += int(np.sum(proper))
+            self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
+        self._keep()
+
+    def warm(self, table: "pd.DataFrame") -> None:
+        """Let the search learn from the rows of an earlier table."""
+        proper = table.loc[table["status"] == "ok"] if "status" in table else table
+        proper = proper.loc[np.isfinite(proper["rho"].to_numpy(np.float64))]
+        if len(proper) > MOST_WARM:
+            proper = proper.loc[proper["rho"].nsmallest(MOST_WARM).index.sort_values()]
+        if not len(proper):
+            return
+        rho = proper["rho"].to_numpy(np.float32)
+        names = [f"rho.{name}" for name in self.problem.formulas]
+        if self._objective is not None and all(name in proper for name in names):
+            each = proper[names].to_numpy(np.float64)
+            rho = self._objective(each, each < 0).astype(np.float32)
+        self._proposals.warm(units(self.problem.space, proper), rho)
+        self._keep()
+
+    def save(self, folder: Path, seldom: bool = False) -> None:
+        """Write the snapshot to `folder`; if `seldom`, only when the last one is a second old."""
+        now = time.perf_counter()
+        if seldom and now - self._saved < 1.0:
+            return
+        self._saved = now
+        write_snapshot(self.snapshot, folder)
+
+    def resume(self, snapshot: dict[str, Any]) -> None:
+        """Go on where `snapshot` was taken; the table must hold its rows already.
+
+        **Raises:** `ValueError` for a snapshot of another search, space or batch size.
+        """
+        self._proposals.restore(snapshot)
+        if self._objective is not None:
+            names = self._objective.state
+            self._objective.state = {name: snapshot[f"objective.{name}"] for name in names}
+        table = self.table.all
+        proper = table["status"] == "ok"
+        self.judged = int(proper.sum())
+        self.found = int((proper & table["violated"]).sum())
+        self.best = float(np.fmin.reduce(table["rho"].to_numpy(), initial=np.nan))
+        self._keep()
+
+    def _keep(self) -> None:
+        """Take the snapshot: nothing is copied, as nothing in it is ever written to."""
+        objective = {} if self._objective is None else self._objective.state
+        self.snapshot = {
+            **self._proposals.snapshot(),
+            **{f"objective.{name}": value for name, value in objective.items()},
+            "rows": np.array(len(self.table)),
+        }
+
+    def _violated(self, evaluation: Evaluation, points: Any, first: int) -> np.ndarray:
+        violated = np.any(evaluation.rho < 0, axis=1)
+        proper = evaluation.status == Status.OK
+        undecided = proper & ~violated & np.any(evaluation.rho == 0, axis=1)
+        if undecided.any():
+            # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
+            holds = evaluation.holds
+            if holds is None:
+                assert isinstance(self.engine, Engine)
+                compiled = self.engine.compile_seconds
+                holds = self.engine.verdicts(points, self.simulation_key, first)
+                self.compile_seconds += self.engine.compile_seconds - compiled
+            violated |= undecided & ~np.all(holds, axis=1)
+        return violated
+
+    def _columns(self, evaluation: Evaluation, rho: Any, violated: Any) -> dict[str, Any]:
+        columns: dict[str, Any] = {**self.problem.space.rows(evaluation.features), "rho": rho}
+        if len(self.problem.formulas) > 1:
+            for i, name in enumerate(self.problem.formulas):
+                columns[f"rho.{name}"] = evaluation.rho[:, i]
+        columns |= {"violated": violated, "status": STATUS_NAMES[evaluation.status]}
+        if evaluation.messages is not None:
+            columns["message"] = np.array(evaluation.messages, dtype=object)
+        return columns
