@@ -9,8 +9,9 @@ of the state, one for the initial state, and a controller.
 
 Features, all optional, with CartPole-v1's values where missing: `x0` and `theta0` (initial
 position in m and angle in rad), `x_dot0`, `theta_dot0` (m/s, rad/s), `masscart`, `masspole` (kg),
-`length` (m, half the pole's), `force_mag` (N), and a `push` (N) against the cart that begins at
-`push_time` (s) and lasts 0.1 s.
+`length` (m, half the pole's), `force_mag` (N), a `push` (N) against the cart that begins at
+`push_time` (s) and lasts 0.1 s, a `wind` (a function of time in s, in N) against the cart, and which
+`controller` drives it (see `either`).
 """
 
 import math
@@ -90,6 +91,8 @@ def dynamics(time: Scalar, state: State, force: Scalar, features: Features) -> S
     polemass_length = masspole * length
     if "push" in features:
         force = force + features["push"] * pushed(time, feature(features, "push_time"))
+    if "wind" in features:
+        force = force + features["wind"](time)
     sin, cos = sin_cos(state.theta)
     temp = (force + polemass_length * (state.theta_dot * state.theta_dot) * sin) / total_mass
     theta_acc = (GRAVITY * sin - cos * temp) / (
@@ -167,6 +170,18 @@ def neural(
         if action == "expected":
             return largest * jnp.tanh(preference / 2)
         return largest * (sign if straight_through else _sign)(preference)
+
+    return control
+
+
+def either(*controllers: Controller) -> Controller:
+    """The controller whose place the feature `controller` names: a `Categorical` of as many."""
+    if not controllers:
+        raise ValueError("either needs at least one controller; got none")
+
+    def control(time: Scalar, state: State, features: Features) -> Scalar:
+        forces = [one(time, state, features) for one in controllers]
+        return jnp.select([features["controller"] == i for i in range(len(forces))], forces)
 
     return control
 

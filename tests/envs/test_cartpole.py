@@ -203,3 +203,22 @@ def test_neural_refuses_what_it_cannot_use():
     policy = load_policy(cp.POLICY_FILE)
     with pytest.raises(ValueError, match="has 2 discrete actions; got 4 and Discrete"):
         cp.neural(replace(policy, action=Discrete(3)))
+
+
+def test_wind_is_a_force_on_the_cart():
+    blown = cp.cartpole(lambda time, state, f: 0.0 * state.x, duration=0.2)
+    pushed = cp.cartpole(lambda time, state, f: 2.0 * time + 0.0 * state.x, duration=0.2)
+    one = blown({"theta0": 0.02, "wind": lambda time: 2.0 * time}, KEY)
+    other = pushed({"theta0": 0.02}, KEY)
+    np.testing.assert_allclose(one.signals["theta"], other.signals["theta"], rtol=1e-6)
+    assert abs(one.signals["theta"][-1] - blown({"theta0": 0.02}, KEY).signals["theta"][-1]) > 1e-4
+
+
+def test_either_controller():
+    both = cp.cartpole(cp.either(cp.linear(), cp.neural()), duration=0.2)
+    for place, alone in enumerate((cp.linear(), cp.neural())):
+        one = both({"theta0": 0.05, "controller": jnp.int32(place)}, KEY)
+        other = cp.cartpole(alone, duration=0.2)({"theta0": 0.05}, KEY)
+        np.testing.assert_array_equal(one.signals["theta"], other.signals["theta"])
+    with pytest.raises(ValueError, match="at least one controller"):
+        cp.either()
