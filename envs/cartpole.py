@@ -10,8 +10,8 @@ of the state, one for the initial state, and a controller.
 Features, all optional, with CartPole-v1's values where missing: `x0` and `theta0` (initial
 position in m and angle in rad), `x_dot0`, `theta_dot0` (m/s, rad/s), `masscart`, `masspole` (kg),
 `length` (m, half the pole's), `force_mag` (N), a `push` (N) against the cart that begins at
-`push_time` (s) and lasts 0.1 s, a `wind` (a function of time in s, in N) against the cart, and which
-`controller` drives it (see `either`).
+`push_time` (s) and lasts 0.1 s, a `wind` (a function of time in s, in N) against the cart, and
+which `controller` drives it (see `either`).
 """
 
 import math

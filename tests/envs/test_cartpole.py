@@ -208,7 +208,8 @@ def test_neural_refuses_what_it_cannot_use():
 def test_wind_is_a_force_on_the_cart():
     blown = cp.cartpole(lambda time, state, f: 0.0 * state.x, duration=0.2)
     pushed = cp.cartpole(lambda time, state, f: 2.0 * time + 0.0 * state.x, duration=0.2)
-    one = blown({"theta0": 0.02, "wind": lambda time: 2.0 * time}, KEY)
+    wind = jax.tree_util.Partial(lambda time: 2.0 * time)
+    one = blown({"theta0": 0.02, "wind": wind}, KEY)
     other = pushed({"theta0": 0.02}, KEY)
     np.testing.assert_allclose(one.signals["theta"], other.signals["theta"], rtol=1e-6)
     assert abs(one.signals["theta"][-1] - blown({"theta0": 0.02}, KEY).signals["theta"][-1]) > 1e-4
