@@ -134,20 +134,29 @@ class Region:
                 found.append(replace(self, allowed=_put(self.allowed, j, None)))
         return found
 
-    def rounded(self, values: Float[np.ndarray, "n k"], integer: Sequence[bool]) -> "Region":
+    def rounded(
+        self,
+        values: Float[np.ndarray, "n k"],
+        codes: Int[np.ndarray, "n m"],
+        integer: Sequence[bool],
+    ) -> "Region":
         """The region in short numbers, which covers the same of these rows.
 
         - `integer`: for each ordered column, whether it holds whole numbers only.
         """
         region = self
         for j in range(len(self.above)):
-            seen = np.unique(values[~np.isnan(values[:, j]), j])
-            ends = [
-                end if np.isinf(end) else _between_values(end, seen, integer[j])
-                for end in (self.above[j], self.upto[j])
-            ]
-            above, upto = _put(region.above, j, ends[0]), _put(region.upto, j, ends[1])
-            region = replace(region, above=above, upto=upto)
+            for ends in ("above", "upto"):
+                end = getattr(region, ends)[j]
+                if np.isinf(end):
+                    continue
+                open_end = -np.inf if ends == "above" else np.inf
+                without = replace(region, **{ends: _put(getattr(region, ends), j, open_end)})
+                # Only rows that fulfil all else can tell where the bound is.
+                seen = np.unique(values[without.covers(values, codes), j])
+                seen = seen[~np.isnan(seen)]
+                moved = _between_values(end, seen, integer[j])
+                region = replace(region, **{ends: _put(getattr(region, ends), j, moved)})
         return region
 
     def conditions(
