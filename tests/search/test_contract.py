@@ -17,7 +17,9 @@ from verifai_jax.search import (
 )
 from verifai_jax.testing import check_batch_independence, check_search
 
-SEARCHES = [Uniform(), Halton(), CrossEntropy(), Gradient()]
+# These have a contract test for every cube in a file of their own.
+ELSEWHERE = ("sobol", "grid", "ce_compat")
+SEARCHES = [named(name) for name in names() if name not in ELSEWHERE]
 CUBES = {
     "empty": Cube(()),
     "continuous": Cube((0, 0, 0)),
@@ -97,7 +99,7 @@ def test_useless_batches_leave_a_search_alive(search, spoil):
 
 class TestNames:
     def test_all(self):
-        assert names() == ("uniform", "halton", "cross_entropy", "gradient")
+        assert {"uniform", "halton", "cross_entropy", "gradient"} < set(names())
         for name in names():
             assert named(name) == type(named(name))()
         assert named("cross_entropy", elite=0.3) == CrossEntropy(elite=0.3)

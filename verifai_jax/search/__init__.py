@@ -13,16 +13,22 @@ from verifai_jax.errors import check_names, unknown_name
 from verifai_jax.search.base import Cube as Cube
 from verifai_jax.search.base import Evaluated as Evaluated
 from verifai_jax.search.base import Search as Search
+from verifai_jax.search.ce_compat import CECompat as CECompat
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
 from verifai_jax.search.gradient import Gradient as Gradient
+from verifai_jax.search.grid import Grid as Grid
 from verifai_jax.search.halton import Halton as Halton
+from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
 
 _SEARCHES: dict[str, type[Search]] = {
     "uniform": Uniform,
     "halton": Halton,
+    "sobol": Sobol,
+    "grid": Grid,
     "cross_entropy": CrossEntropy,
+    "ce_compat": CECompat,
     "gradient": Gradient,
 }
 
