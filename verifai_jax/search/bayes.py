@@ -1,0 +1,366 @@
+"""Bayesian optimization: a Gaussian process guesses the robustness, and says how sure it is.
+
+Each round asks for a batch of points that might fail, by one of two rules.
+
+- Thompson sampling: each point minimizes a function drawn from the posterior (Thompson 1933; in
+  batches Hernandez-Lobato et al., Parallel and distributed Thompson sampling for large-scale
+  accelerated exploration of chemical space, ICML 2017). The functions are whole ones, so the minima
+  are sought in two steps: over candidates that all share, then around each function's best.
+- Expected improvement, with local penalization of the points already chosen for the batch
+  (Gonzalez, Dai, Hennig, Lawrence, Batch Bayesian optimization via local penalization,
+  AISTATS 2016).
+
+All failures are equally good: below zero the target is flat. Above it is logarithmic in the
+robustness over its median, so that a few huge values do not hide the rest.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import log_ndtr, ndtr, ndtri
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+
+from verifai_jax.search.base import Cube, Evaluated, Search, check_count, check_fraction
+from verifai_jax.search.gaussian_process import (
+    GaussianProcess,
+    Hyper,
+    Observations,
+    Posterior,
+)
+from verifai_jax.search.halton import halton_points
+
+MOST_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
+WAVES = 256  # random waves of such a function
+FIT_POINTS, FIT_STEPS = 192, 12
+PARENTS = 8  # best points around which candidates are drawn
+KNOWN = 1 - 1e-5  # correlation with an observation, above which a point need not be simulated
+LARGEST = 1e30  # robustness
+
+
+class BayesState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    asked: UInt32[Array, ""]  # points, in all
+    explored: UInt32[Array, ""]  # points of the prior among them
+    told: UInt32[Array, ""]  # rows, in all
+    u: Float[Array, "capacity d"]
+    score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
+    luck: Float[Array, " capacity"]  # says which points are kept
+    seen: Int[Array, ""]  # points with a verdict, in all
+    fitted: Int[Array, ""]  # of which the last fit knew
+    hyper: Hyper
+
+
+@dataclass(frozen=True)
+class Bayes(Search):
+    """Gaussian process on the robustness; asks where it may be negative.
+
+    **Arguments:**
+
+    - `acquisition`: `"thompson"` or `"expected_improvement"`.
+    - `capacity`: points that the process knows at most. When there are more it keeps the best half
+      (of equally good ones a random choice) and a random choice of all others.
+    - `candidates`: points among which each step of the acquisition chooses.
+    - `initial`: points of the prior before the process has a say.
+    - `exploration`: share of the points that are drawn from the prior, for ever.
+
+    Hyper-parameters are fitted again, from the last ones on, when there are a fifth more points.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    acquisition: str = "thompson"
+    capacity: int = 512
+    candidates: int = 512
+    initial: int = 12
+    exploration: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.acquisition not in ("thompson", "expected_improvement"):
+            raise ValueError(
+                "acquisition must be 'thompson' or 'expected_improvement'; "
+                f"got {self.acquisition!r}"
+            )
+        check_count("capacity", self.capacity, 16)
+        check_count("candidates", self.candidates, 32)
+        check_count("initial", self.initial, 2)
+        check_fraction("exploration", self.exploration)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BayesState:
+        return BayesState(
+            key=key,
+            round=jnp.uint32(0),
+            asked=jnp.uint32(0),
+            explored=jnp.uint32(0),
+            told=jnp.uint32(0),
+            u=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(self.capacity, jnp.inf, jnp.float32),
+            luck=jnp.zeros(self.capacity, jnp.float32),
+            seen=jnp.int32(0),
+            fitted=jnp.int32(0),
+            hyper=_process(cube).first(),
+        )
+
+    def ask(
+        self, state: BayesState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], BayesState]:
+        key = jax.random.fold_in(state.key, state.round)
+        row = jnp.arange(batch, dtype=jnp.uint32)
+        present = jnp.isfinite(state.score)
+        spread = jnp.max(state.score, where=present, initial=0.0) > jnp.min(
+            state.score, where=present, initial=jnp.inf
+        )
+        # Without a difference between points there is nothing to learn from them.
+        informed = spread & (state.seen >= self.initial)
+        # Every tenth point, say, whatever the batch is; in integers, which do not drift.
+        share = np.uint32(np.ceil(1000 * self.exploration))
+        due = (state.asked % 1000 + row) % 1000 * share % 1000 < share
+        prior = ~informed | due
+        number = state.explored + jnp.cumsum(prior).astype(jnp.uint32)
+        # The candidates are further points of the same sequence, far ahead.
+        half = max(self.candidates // 2, batch)
+        ahead = np.uint32(2**24) + state.round * np.uint32(half)
+        ahead = ahead + jnp.arange(half, dtype=jnp.uint32)
+        points = halton_points(jnp.concatenate([number, ahead]), cube.dim, state.key)
+        fresh, anywhere = points[:batch], points[batch:]
+        asked = state._replace(
+            round=state.round + 1, asked=state.asked + np.uint32(batch), explored=number[-1]
+        )
+        if cube.dim == 0:
+            return fresh, asked
+
+        def propose() -> Float[Array, "batch d"]:
+            return self._propose(key, state, cube, batch, anywhere)
+
+        chosen = jax.lax.cond(informed, propose, lambda: fresh)
+        # In a small space several functions have the same minimum: one simulation will do.
+        mark = chosen @ jnp.cos(jnp.arange(1, cube.dim + 1, dtype=jnp.float32))
+        again = jnp.any(jnp.tril(mark[:, None] == mark[None], -1), axis=1)
+        chosen = jnp.where(again[:, None], anywhere[:batch], chosen)
+        return jnp.where(prior[:, None], fresh, chosen), asked
+
+    def tell(self, state: BayesState, cube: Cube, evaluated: Evaluated) -> BayesState:
+        usable = evaluated.counted & (evaluated.rho < jnp.inf)
+        score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
+        number = state.told + jnp.arange(len(score), dtype=jnp.uint32)
+        # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
+        luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
+        u = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
+        score = jnp.concatenate([score, state.score])
+        luck = jnp.concatenate([luck, state.luck])
+        kept = _kept(score, luck, self.capacity)
+        state = state._replace(
+            told=state.told + np.uint32(len(usable)),
+            u=u[kept],
+            score=score[kept],
+            luck=luck[kept],
+            seen=state.seen + jnp.sum(usable, dtype=jnp.int32),
+        )
+        due = (state.seen >= self.initial) & (5 * (state.seen - state.fitted) >= state.fitted)
+        hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
+        return state._replace(hyper=hyper, fitted=jnp.where(due, state.seen, state.fitted))
+
+    def _fit(self, state: BayesState, cube: Cube) -> Hyper:
+        some = _kept(state.score, state.luck, min(FIT_POINTS, self.capacity))
+        seen = _observations(state, cube)
+        return _process(cube).fit(
+            state.hyper, jax.tree.map(lambda leaf: leaf[some], seen), FIT_STEPS
+        )
+
+    def _propose(
+        self,
+        key: Key[Array, ""],
+        state: BayesState,
+        cube: Cube,
+        batch: int,
+        anywhere: Float[Array, "half d"],
+    ) -> Float[Array, "batch d"]:
+        """Points that the acquisition likes best."""
+        posterior = _process(cube).condition(state.hyper, _observations(state, cube))
+        drawing, placing = jax.random.split(key)
+        half, d = anywhere.shape
+        if self.acquisition == "thompson":
+            paths = min(batch, MOST_PATHS)
+            each = -(-batch // paths)  # points from each path
+            steps = (paths * each, max(self.candidates // (paths * each), 4))
+        else:
+            paths, each, steps = 0, 0, (PARENTS, max(half // PARENTS, 1))
+        # Half of the candidates are anywhere, half of them around the best points, far and near.
+        children = steps[0] * steps[1]
+        random = jax.random.uniform(placing, (half + 2 * children, 3 + 2 * d), jnp.float32)
+        first, later = random[:half], random[half:].reshape(2, *steps, 3 + 2 * d)
+        _, best = jax.lax.top_k(-state.score, PARENTS)
+        parent = best[jnp.minimum((first[:, 0] * PARENTS).astype(jnp.int32), PARENTS - 1)]
+        near = _near(state.u[parent], first, cube, jnp.array([0.5, 0.01]))
+        shared = jnp.concatenate([anywhere, near])
+        if self.acquisition == "thompson":
+            return _minima(drawing, posterior, cube, shared, later, paths)[:batch]
+        return _improving(posterior, cube, shared, later[0], batch)
+
+
+# How far around its best candidate a function's minimum is sought, in two steps: most and least.
+CLOSER = ((0.2, 0.02), (0.04, 0.004))
+
+
+def _minima(
+    key: Key[Array, ""],
+    posterior: Posterior,
+    cube: Cube,
+    shared: Float[Array, "m d"],
+    random: Float[Array, "2 parents children r"],
+    count: int,
+) -> Float[Array, "parents d"]:
+    """Minima of `count` functions drawn from the posterior, several of each."""
+    process = _process(cube)
+    paths = process.paths(posterior, key, count, WAVES)
+    parents, children = random.shape[1:3]
+    each = parents // count
+
+    def basis(u: Float[Array, "m d"]) -> tuple[Array, Array]:
+        basis = process.basis(posterior, paths, _encoded(u, cube))
+        # Simulated already: to be chosen only if there is nothing else.
+        return basis, 100.0 * _known(posterior, basis[:, WAVES:])
+
+    shared = _snapped(shared, cube)
+    terms, penalty = basis(shared)
+    value, place = jax.lax.top_k(-(terms @ paths.weights + penalty[:, None]).T, each)
+
+    def closer(
+        carry: tuple[Float[Array, "parents d"], Float[Array, " parents"]],
+        step: tuple[Float[Array, " 2"], Float[Array, "parents children r"]],
+    ) -> tuple:
+        best, least = carry
+        parent = jnp.repeat(best, children, axis=0)
+        u = _near(parent, step[1].reshape(len(parent), -1), cube, step[0])
+        u = _snapped(u, cube)
+        terms, penalty = basis(u)
+        value = jnp.einsum("pcf,fp->pc", terms.reshape(count, each * children, -1), paths.weights)
+        value = (value.reshape(-1) + penalty).reshape(parents, children)
+        chosen = jnp.argmin(value, axis=1)[:, None]
+        found = jnp.take_along_axis(value, chosen, 1)[:, 0]
+        u = jnp.take_along_axis(u.reshape(parents, children, -1), chosen[:, :, None], 1)[:, 0]
+        better = found < least
+        return (jnp.where(better[:, None], u, best), jnp.where(better, found, least)), None
+
+    begin = (shared[place.reshape(-1)], -value.reshape(-1))
+    (best, _), _ = jax.lax.scan(closer, begin, (jnp.array(CLOSER), random))
+    return best
+
+
+def _improving(
+    posterior: Posterior,
+    cube: Cube,
+    shared: Float[Array, "m d"],
+    random: Float[Array, "parents children r"],
+    batch: int,
+) -> Float[Array, "batch d"]:
+    """Points with the largest expected improvement, each away from those before it."""
+    process = _process(cube)
+    least = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
+
+    def merit(u: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
+        mean, std = process.predict(posterior, _encoded(u, cube))
+        z = (least - mean) / std
+        density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+        gain = std * (z * ndtr(z) + density)
+        # Far below zero the difference above is rounding errors; order by the distance instead.
+        return jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2), mean, std
+
+    shared = _snapped(shared, cube)
+    worth, mean, std = merit(shared)
+    _, best = jax.lax.top_k(worth, random.shape[0])
+    parent = jnp.repeat(shared[best], random.shape[1], axis=0)
+    near = _near(parent, random.reshape(len(parent), -1), cube, jnp.array(CLOSER[0]))
+    near = _snapped(near, cube)
+    u = jnp.concatenate([shared, near])
+    worth, mean, std = (
+        jnp.concatenate([one, two])
+        for one, two in zip((worth, mean, std), merit(near), strict=True)
+    )
+    x = _encoded(u, cube)
+    slope = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
+    steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(slope**2, axis=1))), 1e-3)
+    codes = np.array(process.unordered)
+
+    def choose(worth: Float[Array, " m"], _: None) -> tuple[Array, Array]:
+        best = jnp.argmax(worth)
+        # Codes that differ are as far apart as the cube is wide.
+        apart = jnp.where(codes, x != x[best], x - x[best])
+        distance = jnp.sqrt(jnp.sum(apart**2, axis=1))
+        # Probability that no point so good lies between there and the one chosen.
+        z = (steepest * distance - mean[best] + least) / std[best]
+        return (worth + log_ndtr(z)).at[best].set(-jnp.inf), best
+
+    _, chosen = jax.lax.scan(choose, worth, None, length=batch)
+    return u[chosen]
+
+
+def _near(
+    parent: Float[Array, "n d"],
+    random: Float[Array, "n r"],
+    cube: Cube,
+    scales: Float[Array, " 2"],
+) -> Float[Array, "n d"]:
+    """Points around others: some coordinates moved by a step between two scales."""
+    d = cube.dim
+    step = scales[0] * (scales[1] / scales[0]) ** random[:, 1:2]
+    # From all coordinates to one on average, and always one.
+    share = float(d) ** -random[:, 2:3]
+    pick, noise = random[:, 3 : 3 + d], random[:, 3 + d :]
+    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
+    moved = jnp.clip(parent + step * ndtri(jnp.maximum(noise, np.float32(2**-25))), 0.0, 1.0)
+    # An unordered choice has no neighbours: any other.
+    codes = np.array(_process(cube).unordered)
+    return jnp.where(moves, jnp.where(codes, noise, moved), parent)
+
+
+def _known(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
+    return jnp.max(cross, axis=1) > KNOWN * jnp.exp(posterior.hyper.variance)
+
+
+def _process(cube: Cube) -> GaussianProcess:
+    return GaussianProcess(
+        tuple(
+            level > 0 and not ordered
+            for level, ordered in zip(cube.levels, cube.ordered, strict=True)
+        )
+    )
+
+
+def _snapped(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
+    """With discrete coordinates in the middles of their cells."""
+    if len(cube.discrete) == 0:
+        return u
+    return u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
+
+
+def _encoded(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
+    """As the process wants them: middles of ordered cells, numbers of unordered ones."""
+    if len(cube.discrete) == 0:
+        return u
+    cells = cube.cells(u)
+    codes = ~np.array(cube.ordered)[cube.discrete]
+    return u.at[:, cube.discrete].set(jnp.where(codes, cells, cube.centres(cells)))
+
+
+def _observations(state: BayesState, cube: Cube) -> Observations:
+    """What the process is told: a logarithm of the robustness, with mean 0 and deviation 1."""
+    mask = jnp.isfinite(state.score)
+    score = jnp.where(mask, state.score, 0.0)
+    positive = jnp.sort(jnp.where(score > 0, score, jnp.inf))
+    median = positive[jnp.sum(score > 0) // 2]
+    y = jnp.log1p(score / jnp.where(jnp.isfinite(median), median, 1.0))
+    count = jnp.maximum(jnp.sum(mask), 1)
+    y = y - jnp.sum(y, where=mask) / count
+    std = jnp.sqrt(jnp.sum(y**2, where=mask) / count)
+    return Observations(_encoded(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
+
+
+def _kept(score: Float[Array, " n"], luck: Float[Array, " n"], count: int) -> Int[Array, " count"]:
+    """Which rows to keep: the best half and the luckiest others; rows that are there come first."""
+    rank = jnp.argsort(jnp.lexsort((luck, score)))
+    best = (rank < count // 2) & jnp.isfinite(score)
+    return jnp.argsort(jnp.where(best, -1.0, jnp.where(jnp.isfinite(score), luck, 2.0)))[:count]
