@@ -1,0 +1,114 @@
+"""Importances of features whose influence is known."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from verifai_jax.analysis.importance import importance
+
+
+def table(n=3000, seed=0):
+    """Robustness x + 2 [colour is red], which fails below 0.3; y, lanes and z do nothing."""
+    g = np.random.default_rng(seed)
+    frame = pd.DataFrame(
+        {
+            "y": g.random(n),
+            "x": g.random(n),
+            "colour": g.choice(["red", "blue", "green"], n),
+            "lanes": g.integers(0, 4, n),
+            "same": 1.0,
+        }
+    )
+    frame["rho"] = frame.x + 2 * (frame.colour == "red") - 0.3
+    return frame.assign(violated=frame.rho < 0, status="ok")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return importance(table())
+
+
+def test_influence_is_found(found):
+    assert set(found.ranked[:2]) == {"x", "colour"}
+    rest = found.table.loc[["y", "lanes", "same"], ["failing", "rho"]]
+    assert rest.abs().to_numpy().max() < 0.02
+    assert found.table.loc["x", "failing"] > 0.2
+    assert found.trusted("failing")
+    assert found.trusted("rho")
+    assert found.scores["failing"] > 0.98
+    words = str(found).splitlines()
+    assert words[0].startswith("failing depends on x (")
+    assert words[1].startswith("robustness depends on colour (")
+    assert "lanes" not in str(found)
+
+
+def test_loss_is_what_theory_says(found):
+    """Shuffling a feature of an additive model costs R^2 twice its share of the variance."""
+    share = (4 * 2 / 9) / (4 * 2 / 9 + 1 / 12)
+    assert found.table.loc["colour", "rho"] == pytest.approx(2 * share, rel=0.1)
+    assert found.table.loc["x", "rho"] == pytest.approx(2 * (1 - share), rel=0.25)
+    low, high = found.table.loc["colour", ["rho_low", "rho_high"]]
+    assert low < found.table.loc["colour", "rho"] < high
+
+
+def test_rare_failures_are_learned():
+    frame = table(20000)
+    frame["violated"] = (frame.x > 0.97) & (frame.colour == "blue")
+    assert frame["violated"].mean() < 0.015
+    found = importance(frame)
+    assert found.ranked[:2] == ["x", "colour"]
+    assert found.scores["failing"] > 0.95
+
+
+def test_noise_means_nothing():
+    g = np.random.default_rng(5)
+    frame = table(1000)
+    frame["rho"] = g.normal(size=1000)
+    frame["violated"] = g.random(1000) < 0.4
+    found = importance(frame)
+    assert not found.trusted("failing")
+    assert not found.trusted("rho")
+    assert str(found).count("importances mean nothing") == 2
+
+
+def test_without_failures_only_the_robustness_is_explained():
+    frame = table(500).assign(violated=False)
+    found = importance(frame)
+    assert found.missing == {"failing": "no failing row"}
+    assert "failing" not in found.table
+    assert found.ranked[0] == "colour"
+    assert str(found).startswith("failing: no failing row\nrobustness depends on colour")
+    few = importance(frame.assign(violated=np.arange(500) < 3))
+    assert few.missing == {"failing": "only 3 failing rows"}
+
+
+def test_absence_is_information():
+    frame = table(2000)
+    frame.loc[frame.x > 0.5, "x"] = np.nan
+    frame["violated"] = frame.x.isna()
+    frame.loc[frame.lanes == 3, "colour"] = None
+    assert importance(frame).ranked[0] == "x"
+
+
+def test_the_same_seed_gives_the_same_table(found):
+    assert importance(table()).table.equals(found.table)
+    assert not importance(table(), seed=1).table.equals(found.table)
+
+
+def test_refusals():
+    with pytest.raises(
+        ValueError,
+        match="no importance can be learned from 'table': failing: no failing row; "
+        "robustness: it is 1 in every row",
+    ):
+        importance(table(100).assign(rho=1.0, violated=False))
+    with pytest.raises(ValueError, match="repeats must be a whole number of at least 2"):
+        importance(table(100), repeats=1)
+
+
+def test_picture(found, tmp_path):
+    from PIL import Image
+
+    found.plot(tmp_path / "it.png")
+    with Image.open(tmp_path / "it.png") as image:
+        assert image.size[0] > 300
