@@ -100,6 +100,8 @@ class Coverage:
             shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
             more = self.untried_count - len(shown)
             lines.append("never tried: " + "; ".join(shown) + (f"; and {more:,} more" * (more > 0)))
+        if getattr(self.samples.space, "where", None) is not None:
+            lines.append("what the constraint of the space forbids counts as not covered")
         return "\n".join(lines)
 
 

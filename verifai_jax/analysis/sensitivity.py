@@ -139,7 +139,7 @@ def coordinates_of(problem: Problem) -> Coordinates:
     if len(names) != len(levels):
         names = tuple(f"u[{i}]" for i in range(len(levels)))
     return Coordinates(
-        tuple(getattr(space, "names", None) or names),
+        tuple(getattr(space, "coordinates", None) or names),
         levels,
         tuple(getattr(space, "ordered", None) or (True,) * len(levels)),
         tuple(getattr(space, "weights", None) or (None,) * len(levels)),
