@@ -7,6 +7,12 @@ from verifai_jax.analysis.gradients import gradient_sensitivity as gradient_sens
 from verifai_jax.analysis.importance import Importance as Importance
 from verifai_jax.analysis.importance import importance as importance
 from verifai_jax.analysis.morris import morris as morris
+from verifai_jax.analysis.neighbours import Neighbours as Neighbours
+from verifai_jax.analysis.neighbours import k_closest as k_closest
+from verifai_jax.analysis.neighbours import nearest as nearest
+from verifai_jax.analysis.neighbours import random_rows as random_rows
+from verifai_jax.analysis.pca import Components as Components
+from verifai_jax.analysis.pca import pca as pca
 from verifai_jax.analysis.rules import Rule as Rule
 from verifai_jax.analysis.rules import Rules as Rules
 from verifai_jax.analysis.rules import rules as rules

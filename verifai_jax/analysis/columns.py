@@ -10,7 +10,7 @@ import numpy as np
 
 from verifai_jax.errors import check_names
 from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Struct
-from verifai_jax.features.domain import Domain
+from verifai_jax.features.domain import Domain, as_scalar
 from verifai_jax.table import RESERVED
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class Column:
         found = [places.get(value, places.get(str(value), -2)) for value in values.tolist()]
         codes = np.array([*found, -1], np.int64)[kinds]
         if (codes == -2).any():
-            stray = entries.iloc[int(np.argmax(codes == -2))]
+            stray = as_scalar(entries.iloc[int(np.argmax(codes == -2))])
             raise ValueError(
                 f"column {self.name!r} holds {stray!r}, which is none of its choices "
                 f"{', '.join(map(repr, self.choices))}"

@@ -16,8 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.analysis.columns import Column, describe_columns, feature_columns
 from verifai_jax.errors import check_names
@@ -169,6 +171,27 @@ class Samples:
             raise ValueError(_nothing(self.table, which))
         return replace(self, frame=self.table.loc[chosen], which=which)
 
+    def at(self, rows: "Sequence[int] | Int[np.ndarray, ' k']") -> "pd.DataFrame":
+        """Rows of the table by their numbers, in this order.
+
+        **Raises:** `IndexError` for a row number that is not in the table.
+        """
+        numbers = np.asarray(rows).reshape(-1)
+        places = self.table.index.get_indexer(numbers)
+        if (places < 0).any():
+            stray = numbers[np.argmin(places)]
+            raise IndexError(f"row {stray} is not in the table of {len(self.table):,} rows")
+        return self.table.iloc[places]
+
+    @property
+    def kind(self) -> str:
+        """What the rows are, in words: `"12 counterexamples of cart-pole"`."""
+        what = {"failed": "rows without a verdict", "all": "rows", "safe": "safe rows"}
+        one = len(self) == 1
+        words = what.get(self.which, self.which)
+        words = words.replace("rows", "row").removesuffix("s") if one else words
+        return f"{len(self):,} {words} of {self.name}"
+
     def values(self) -> Float[np.ndarray, "n k"]:
         """Ordered columns as they are; NaN where absent."""
         names = [column.name for column in self.ordered]
@@ -214,8 +237,7 @@ class Samples:
 
     def codes(self) -> Int[np.ndarray, "n m"]:
         """Unordered columns as places in their `choices`; -1 where absent."""
-        codes = [column.codes(self.frame[column.name]) for column in self.unordered]
-        return np.stack(codes, axis=1) if codes else np.zeros((len(self), 0), np.int64)
+        return self.place()[1]
 
     def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:
         """All columns, so that Euclidean distances treat ordered and unordered ones alike.
@@ -224,7 +246,37 @@ class Samples:
         differences, and 1 for each unordered column in which they differ. Where only one of two
         has an item, its columns count 0.75 to 1 each; where neither has it, 0.
         """
-        return embed(self, self.frame, scale)
+        coordinates, codes = self.place(scale)
+        parts = [coordinates]
+        for column, code in zip(self.unordered, codes.T, strict=True):
+            # Two different rows of the unit matrix are the square root of two apart.
+            parts.append((np.eye(len(column.choices) + 1) / np.sqrt(2))[code])
+        return np.concatenate(parts, axis=1)
+
+    def place(
+        self, scale: Scale = "range", frame: "pd.DataFrame | None" = None
+    ) -> tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]]:
+        """Coordinates of the ordered columns and codes of the unordered ones; see `distances`.
+
+        - `frame`: other rows, to be placed among these.
+        """
+        offset, width = self.scaling(scale)
+        middles: Any = np.full(len(self.ordered), 0.5)
+        if scale in ("raw", "standard"):
+            middles = self.matrix(scale).mean(axis=0)
+        rows: Any = self.frame if frame is None else frame
+        parts = []
+        for j, column in enumerate(self.ordered):
+            scaled = (rows[column.name].to_numpy(np.float64) - offset[j]) / width[j]
+            absent = np.isnan(scaled)
+            parts.append(np.where(absent, middles[j], scaled))
+            if _has_absent(self.table[column.name]):
+                parts.append(_ABSENT * absent)
+        coordinates = np.stack(parts, axis=1) if parts else np.zeros((len(rows), 0))
+        codes = [column.codes(rows[column.name]) for column in self.unordered]
+        return coordinates, (
+            np.stack(codes, axis=1) if codes else np.zeros((len(rows), 0), np.int64)
+        )
 
     def need_ordered(self, purpose: str) -> None:
         """Raise `ValueError` unless there is an ordered column; `purpose` begins the message."""
@@ -244,31 +296,19 @@ class Samples:
 
     def __repr__(self) -> str:
         return (
-            f"Samples({len(self)} {'rows' if self.which == 'all' else self.which} of {self.name}: "
+            f"Samples({self.kind}: "
             f"ordered {_listed([c.name for c in self.ordered])}; "
             f"unordered {_listed([c.name for c in self.unordered])})"
         )
 
 
-def embed(samples: Samples, frame: "pd.DataFrame", scale: Scale) -> Float[np.ndarray, "n d"]:
-    """Other rows in the coordinates of `samples.points(scale)`."""
-    parts = []
-    offset, width = samples.scaling(scale)
-    middles: Any = np.full(len(samples.ordered), 0.5)
-    if scale == "raw" or scale == "standard":
-        middles = samples.matrix(scale).mean(axis=0)
-    for j, column in enumerate(samples.ordered):
-        entries: Any = frame[column.name]
-        scaled = (entries.to_numpy(np.float64) - offset[j]) / width[j]
-        absent = np.isnan(scaled)
-        parts.append(np.where(absent, middles[j], scaled))
-        if _has_absent(samples.table[column.name]):
-            parts.append(_ABSENT * absent)
-    for column in samples.unordered:
-        # Two different rows of the unit matrix are the square root of two apart.
-        unit = np.eye(len(column.choices) + 1) / np.sqrt(2)
-        parts += list(unit[column.codes(frame[column.name])].T)
-    return np.stack(parts, axis=1) if parts else np.zeros((len(frame), 0))
+def distances(
+    rows: tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]],
+    one: tuple[Float[np.ndarray, " p"], Int[np.ndarray, " m"]],
+) -> Float[np.ndarray, " n"]:
+    """Distances of rows from one row, both as `Samples.place` gives them; see `points`."""
+    squared = ((rows[0] - one[0]) ** 2).sum(axis=1) + (rows[1] != one[1]).sum(axis=1)
+    return np.sqrt(squared)
 
 
 def whole(value: Any, what: str, least: int = 1) -> int:
@@ -280,6 +320,20 @@ def whole(value: Any, what: str, least: int = 1) -> int:
     if number is None or isinstance(value, bool) or number < least:
         raise ValueError(f"{what} must be a whole number of at least {least}; got {value!r}")
     return number
+
+
+def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.Generator:
+    """A NumPy generator from a seed or a `jax.random` key; the same one for the same seed.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if isinstance(seed, jax.Array):
+        keyed = jnp.issubdtype(seed.dtype, jax.dtypes.prng_key)
+        data = np.asarray(jax.random.key_data(seed) if keyed else seed)
+        return np.random.default_rng([int(word) for word in data.ravel()])
+    return np.random.default_rng(whole(seed, "the seed", least=0))
 
 
 def _described(
@@ -305,7 +359,7 @@ def _verdicts(table: "pd.DataFrame") -> tuple[np.ndarray, np.ndarray]:
         violated = np.asarray(table["violated"], bool)
     elif "rho" in table:
         rho = np.asarray(table["rho"], np.float64)
-        judged &= ~np.isnan(rho)
+        judged = judged & ~np.isnan(rho)
         violated = rho < 0
     else:
         violated = np.ones(len(table), bool)

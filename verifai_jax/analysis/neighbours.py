@@ -1,0 +1,158 @@
+"""Rows that are near: to each other, or to given features; and rows drawn at random.
+
+    k_closest(run, 5)                      the tightest group of five counterexamples
+    nearest(run, {"x": 0.1, "alg": "sac"}, 5)
+    random_rows(run, 5, seed=0)
+
+Distances are those of `Samples.points`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, Key
+
+from verifai_jax.analysis.drawing import draw_rows
+from verifai_jax.analysis.samples import Samples, Scale, Which, distances, generator, whole
+from verifai_jax.analysis.tightest import tightest
+from verifai_jax.errors import check_names
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem import Problem
+from verifai_jax.report.style import BOUND, new_figure, show_or_save, tidy
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Rows chosen from `samples`.
+
+    **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
+    in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
+    which they lie, None if that is no row.
+    """
+
+    samples: Samples
+    rows: Int[np.ndarray, " k"]
+    distances: Float[np.ndarray, " k"]
+    centre: int | None
+    how: str
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """The rows of the error table, with their `distance`."""
+        return self.samples.at(self.rows).assign(distance=self.distances)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the rows among the others, over the two features that vary most; the figure."""
+        figure = new_figure(figsize=(5.2, 4.2))
+        axes = figure.subplots()
+        draw_rows(axes, self.samples, self.rows, color=BOUND, label=f"{len(self.rows)} rows")
+        tidy(axes)
+        figure.suptitle(f"{self.how}, {self.samples.kind}", fontsize=10)
+        return show_or_save(figure, path)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __str__(self) -> str:
+        shown = ", ".join(map(str, self.rows[:12].tolist())) + ", ..." * (len(self.rows) > 12)
+        reach = np.max(self.distances, initial=0)
+        far = f"; the farthest is {reach:.3g} away" if np.isfinite(reach) and reach > 0 else ""
+        return f"{self.how}, {self.samples.kind}: rows {shown}{far}"
+
+
+def k_closest(
+    source: Any,
+    k: int | None,
+    columns: Sequence[str] | None = None,
+    which: Which = "counterexamples",
+    scale: Scale = "range",
+    space: Problem | FeatureSpace | None = None,
+) -> Neighbours:
+    """The tightest group: a row and its `k - 1` nearest, whose distances to it sum up to least.
+
+    - `source`, `columns`, `which`, `space`: as in `Samples.of`. Unordered columns count 1 where
+      they differ; VerifAI leaves them out and includes `rho`: name the columns for that.
+    - `k`: how many; None or more than there are gives all.
+    - `scale`: as in `Samples.scaling`; `"rows"` is VerifAI's.
+
+    Takes about `n log n` steps over up to 20 ordered columns, `n^2` over more; see `tightest.py`.
+    **Raises:** `ValueError` for a `k` below 1.
+    """
+    samples = Samples.of(source, which, columns, space)
+    n = len(samples)
+    k = n if k is None else min(whole(k, "k"), n)
+    rows = samples.place(scale)
+    centre = tightest(*rows, k) if k < n else _middle(rows)
+    far = distances(rows, (rows[0][centre], rows[1][centre]))
+    # The centre comes first, also among rows that equal it.
+    far[centre] = -1
+    group = np.argsort(far, kind="stable")[:k]
+    far[centre] = 0
+    how = f"The {k} closest" if k < n else f"All {n}"
+    return Neighbours(samples, samples.rows[group], far[group], int(samples.rows[centre]), how)
+
+
+def _middle(rows: tuple[np.ndarray, np.ndarray]) -> int:
+    # All rows are the group of each of them: the one nearest to their mean may stand for it.
+    return int(np.argmin(((rows[0] - rows[0].mean(axis=0)) ** 2).sum(axis=1)))
+
+
+def nearest(
+    source: Any,
+    point: "Mapping[str, Any] | pd.Series | int",
+    k: int = 1,
+    columns: Sequence[str] | None = None,
+    which: Which = "counterexamples",
+    scale: Scale = "range",
+    space: Problem | FeatureSpace | None = None,
+) -> Neighbours:
+    """The `k` rows nearest to a point, the nearest first.
+
+    - `point`: features (a mapping with all analysed columns, or a row of a table), or the number of
+      a row of the table, which need not be among those looked at.
+
+    **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or none of the choices;
+    `IndexError` for a row number that is not in the table.
+    """
+    import pandas as pd
+
+    samples = Samples.of(source, which, columns, space)
+    k = min(whole(k, "k"), len(samples))
+    if isinstance(point, int | np.integer):
+        frame = samples.at([int(point)])
+        what = f"row {int(point)}"
+    else:
+        values = dict(point.items())
+        check_names("feature", samples.names, map(str, values))
+        frame = pd.DataFrame([{name: values[name] for name in samples.names}])
+        what = "the point"
+    coordinates, codes = samples.place(scale, frame)
+    far = distances(samples.place(scale), (coordinates[0], codes[0]))
+    group = np.argsort(far, kind="stable")[:k]
+    centre = int(point) if isinstance(point, int | np.integer) else None
+    return Neighbours(
+        samples, samples.rows[group], far[group], centre, f"The {k} nearest to {what}"
+    )
+
+
+def random_rows(
+    source: Any,
+    k: int,
+    seed: "int | Key[jax.Array, '']",
+    which: Which = "counterexamples",
+    columns: Sequence[str] | None = None,
+    space: Problem | FeatureSpace | None = None,
+) -> Neighbours:
+    """`k` different rows, each as likely as any other; all of them if there are no more."""
+    samples = Samples.of(source, which, columns, space)
+    k = min(whole(k, "k"), len(samples))
+    chosen = generator(seed).permutation(len(samples))[:k]
+    return Neighbours(samples, samples.rows[chosen], np.full(k, np.nan), None, f"{k} at random")
