@@ -25,6 +25,9 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     size, levels = domain.size, np.array(domain.levels, int)
     assert size == len(levels), "size must be the number of levels"
     assert np.all(levels >= 0), f"levels must not be negative; got {levels.tolist()}"
+    for what in ("ordered", "weights", "coordinates"):
+        given = domain.coordinates("value") if what == "coordinates" else getattr(domain, what)
+        assert len(given) == size, f"{what} must have {size} entries, as levels; got {given}"
     u = jax.random.uniform(jax.random.key(seed), (samples, size), jnp.float32)
     u = jnp.concatenate([u, jnp.zeros((1, size)), jnp.ones((1, size))])
 

@@ -87,6 +87,10 @@ class Categorical(Domain):
     def levels(self) -> tuple[int, ...]:
         return (len(self.choices),)
 
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        return (False,)
+
     def from_unit(self, u: Float[Array, "1"]) -> Any:
         index = cell(u[0], len(self.choices))
         if not self.numeric:

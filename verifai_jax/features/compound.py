@@ -47,6 +47,29 @@ class Struct(Domain):
     def levels(self) -> tuple[int, ...]:
         return tuple(level for _, domain in self.fields for level in domain.levels)
 
+    @cached_property
+    def ordered(self) -> tuple[bool, ...]:
+        return tuple(is_ordered for _, domain in self.fields for is_ordered in domain.ordered)
+
+    @cached_property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        return tuple(weights for _, domain in self.fields for weights in domain.weights)
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        found, start = [], 0
+        for _, domain in self.fields:
+            found += [start + i for i in domain.lengths]
+            start += domain.size
+        return tuple(found)
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            coordinate
+            for field, domain in self.fields
+            for coordinate in domain.coordinates(_dotted(name, field))
+        )
+
     def __getitem__(self, name: str) -> Domain:
         check_names("feature", [name], self.names)
         return dict(self.fields)[name]
@@ -149,6 +172,26 @@ class Array(Domain):
     @cached_property
     def levels(self) -> tuple[int, ...]:
         return self.domain.levels * self.length
+
+    @cached_property
+    def ordered(self) -> tuple[bool, ...]:
+        return self.domain.ordered * self.length
+
+    @cached_property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        return self.domain.weights * self.length
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        size = self.domain.size
+        return tuple(i * size + j for i in range(self.length) for j in self.domain.lengths)
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            coordinate
+            for item in indexed(name, self.length)
+            for coordinate in self.domain.coordinates(item)
+        )
 
     def from_unit(self, u: Float[jax.Array, " size"]) -> Any:
         return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))

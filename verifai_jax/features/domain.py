@@ -38,7 +38,10 @@ class Domain(abc.ABC):
     @property
     @abc.abstractmethod
     def levels(self) -> tuple[int, ...]:
-        """For each unit coordinate: 0 if continuous, or the number of its equally wide cells."""
+        """For each unit coordinate: 0 if continuous, or the number of its cells.
+
+        Cells are equally wide unless `weights` says otherwise.
+        """
 
     @abc.abstractmethod
     def from_unit(self, u: Float[Array, " size"]) -> Any:
@@ -81,6 +84,28 @@ class Domain(abc.ABC):
     def size(self) -> int:
         """Number of unit coordinates."""
         return len(self.levels)
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        """For each unit coordinate: whether neighbouring points or cells mean similar values."""
+        return (True,) * self.size
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        """For each unit coordinate: the probabilities of its cells, which are their widths.
+
+        None where they are equal, or where the coordinate is continuous.
+        """
+        return (None,) * self.size
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Indices of the unit coordinates that are lengths of arrays, on which others depend."""
+        return ()
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        """What each unit coordinate of the feature called `name` is called."""
+        return self.columns(name)
 
 
 def cell(u: Float[Array, "*shape"], count: int) -> Any:
