@@ -74,12 +74,14 @@ def test_noise_means_nothing():
 def test_without_failures_only_the_robustness_is_explained():
     frame = table(500).assign(violated=False)
     found = importance(frame)
-    assert found.missing == {"failing": "no failing row"}
+    assert found.missing == {"failing": "no failing row, too few to learn from"}
     assert "failing" not in found.table
     assert found.ranked[0] == "colour"
-    assert str(found).startswith("failing: no failing row\nrobustness depends on colour")
+    assert str(found).startswith(
+        "failing: no failing row, too few to learn from\nrobustness depends on colour"
+    )
     few = importance(frame.assign(violated=np.arange(500) < 3))
-    assert few.missing == {"failing": "only 3 failing rows"}
+    assert few.missing == {"failing": "3 failing rows, too few to learn from"}
 
 
 def test_absence_is_information():
@@ -98,8 +100,8 @@ def test_the_same_seed_gives_the_same_table(found):
 def test_refusals():
     with pytest.raises(
         ValueError,
-        match="no importance can be learned from 'table': failing: no failing row; "
-        "robustness: it is 1 in every row",
+        match="no importance can be learned from 'table': failing: no failing row, too few to "
+        "learn from; robustness: it is 1 in every row",
     ):
         importance(table(100).assign(rho=1.0, violated=False))
     with pytest.raises(ValueError, match="repeats must be a whole number of at least 2"):

@@ -187,7 +187,7 @@ def test_what_precision_means_depends_on_the_search():
 def test_refusals():
     table = frame(100)
     table["violated"] = False
-    with pytest.raises(ValueError, match="none of 100 rows fails; search longer"):
+    with pytest.raises(ValueError, match="no row of 100 fails; search longer"):
         rules(table)
     table["violated"] = True
     with pytest.raises(ValueError, match="all of 100 rows fail; simulate more of the space"):

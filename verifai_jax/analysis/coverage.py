@@ -335,7 +335,7 @@ def _words(row: dict[Any, Any]) -> str:
 
 def _evenness(discrepancy: float) -> str:
     if discrepancy < 0.5:
-        return f"more evenly than uniform samples (discrepancy {discrepancy:.2g} of theirs)"
+        return f"more evenly than uniform samples (discrepancy {discrepancy:.2g} times theirs)"
     if discrepancy <= 3:
-        return f"as evenly as uniform samples (discrepancy {discrepancy:.2g} of theirs)"
-    return f"crowded (discrepancy {discrepancy:.3g} times that of uniform samples)"
+        return f"as evenly as uniform samples (discrepancy {discrepancy:.2g} times theirs)"
+    return f"more crowded than uniform samples (discrepancy {discrepancy:.3g} times theirs)"

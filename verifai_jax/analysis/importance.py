@@ -161,9 +161,12 @@ def _unlearnable(target: str, values: Any) -> str:
         fewest = int(min(values.sum(), (~values).sum()))
         if fewest < 2 * FEWEST:
             kind = "failing" if values.sum() <= (~values).sum() else "safe"
-            return f"only {fewest} {kind} rows" if fewest else f"no {kind} row"
+            return (
+                f"{fewest or 'no'} {kind} {'row' if fewest < 2 else 'rows'}, too few to learn from"
+            )
     elif len(values) < 4 * FEWEST:
-        return f"only {len(values)} rows with a robustness"
+        rows = "row" if len(values) == 1 else "rows"
+        return f"{len(values)} {rows} with a robustness, too few to learn from"
     elif np.ptp(values) == 0:
         return f"it is {values[0]:.4g} in every row"
     return ""

@@ -46,12 +46,7 @@ def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float 
     Unordered values are spread a little around their place.
     """
     columns = {column.name: column for column in samples.columns}
-    x = _positions(samples, columns[across], seed=0)
-    if up == across:
-        # A single feature: the robustness is the other axis.
-        y = samples.rho if np.isfinite(samples.rho).any() else np.zeros(len(samples))
-    else:
-        y = _positions(samples, columns[up], seed=1)
+    x, y = places(samples, across, up)
     for part, color, dot in (
         (~samples.failing, SAFE, size * 0.6),
         (samples.failing, FAILING, size),
@@ -65,10 +60,21 @@ def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float 
         column = columns[name]
         if not column.ordered and (name == across or up != across):
             step = -(-len(column.choices) // MOST_LABELS)
-            places = np.arange(0, len(column.choices), max(step, 1))
-            axis.set_ticks(places, [str(column.choices[i])[:16] for i in places])
+            ticks = np.arange(0, len(column.choices), max(step, 1))
+            axis.set_ticks(ticks, [str(column.choices[i])[:16] for i in ticks])
         elif column.integer and (name == across or up != across):
             axis.get_major_locator().set_params(integer=True)
+
+
+def places(
+    samples: Samples, across: str, up: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Where the rows are drawn; over a single feature the robustness is the other axis."""
+    columns = {column.name: column for column in samples.columns}
+    x = _positions(samples, columns[across], seed=0)
+    if up != across:
+        return x, _positions(samples, columns[up], seed=1)
+    return x, samples.rho if np.isfinite(samples.rho).any() else np.zeros(len(samples))
 
 
 def draw_rule(

@@ -204,7 +204,7 @@ def check_both(samples: Samples, purpose: str) -> None:
     failures = int(samples.failing.sum())
     if failures == 0:
         raise ValueError(
-            f"{purpose}, and none of {len(samples):,} rows fails; search longer or with an active "
+            f"{purpose}, and no row of {len(samples):,} fails; search longer or with an active "
             "search, or look at the robustness: importance(run)"
         )
     if failures == len(samples):
