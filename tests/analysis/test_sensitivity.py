@@ -7,7 +7,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.analysis.gradients import gradient_sensitivity
-from verifai_jax.analysis.morris import morris
+from verifai_jax.analysis.morris import _steps, morris
+from verifai_jax.analysis.sensitivity import Coordinates
 from verifai_jax.analysis.sobol import NOISE, sobol_indices
 
 
@@ -229,3 +230,22 @@ def test_pictures(ishigami, mixed, tmp_path):
         found.plot(path)
         with Image.open(path) as image:
             assert image.size[0] > 300
+
+
+def test_steps_of_discrete_coordinates():
+    space = Coordinates(
+        ("c", "n", "one"), (3, 5, 1), (False, True, True), ((0.5, 0.3, 0.2), None, None)
+    )
+    start, stop, step = _steps(np.array([3, 5, 1]), space, np.random.default_rng(0), 6000)
+    pairs, counts = np.unique(np.stack([start[:, 0], stop[:, 0]]), axis=1, return_counts=True)
+    # Every choice is left for every other one equally often, never for itself.
+    assert pairs.T.tolist() == [[0, 1], [0, 2], [1, 0], [1, 2], [2, 0], [2, 1]]
+    np.testing.assert_allclose(counts, 1000, rtol=0.15)
+    assert (step[:, 0] == 1).all()
+    # Whole numbers move by half of the range, inside of it.
+    assert (abs(stop[:, 1] - start[:, 1]) == 2).all()
+    np.testing.assert_array_equal(step[:, 1], (stop[:, 1] - start[:, 1]) / 4)
+    assert set(stop[:, 1]) | set(start[:, 1]) == set(range(5))
+    assert (step[:, 2] == 0).all()
+    middles = space.centres(np.array([[0, 2, 0], [2, 0, 0]]), np.array([3, 5, 1]))
+    np.testing.assert_allclose(middles, [[0.25, 0.5, 0.5], [0.9, 0.1, 0.5]])
