@@ -1,0 +1,237 @@
+"""Bandits: each coordinate is a bandit of its own, whose arms are intervals.
+
+An arm is drawn the more, the higher its upper confidence bound is: its mean reward plus a bonus
+that shrinks as it is drawn (UCB1: Auer, Cesa-Bianchi, Fischer, Finite-time analysis of the
+multiarmed bandit problem, Machine Learning 47, 2002). VerifAI has such a search; this one works in
+batches and learns before the first failure:
+
+- rewards come from ranks: the best point of those remembered has 1, points outside of the best
+  share have 0, and all failures are equally good. So any robustness will do;
+- only the last points are remembered (sliding-window UCB: Garivier, Moulines, On upper-confidence
+  bound policies for switching bandits, 2011), as what a coordinate is worth changes while the
+  others learn;
+- arms split: under each of them is another bandit, whose arms start at the mean of their parent's
+  (UCT: Kocsis, Szepesvari, 2006). Where points are few the bonus is large and the draws are even,
+  so that splitting sharpens the search exactly where it has gone to;
+- within a batch each draw counts at once, without its reward. In the limit of small draws the
+  bounds of all arms that are drawn become equal, at a level that bisection finds. The shares of
+  the arms make a density, and the rows are a Latin hypercube in it.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key, UInt32
+
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
+
+BISECTIONS = 20
+
+
+class BanditState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    u: Float[Array, "window d"]  # the newest first
+    score: Float[Array, " window"]  # robustness, 0 for all failures; infinite where no point is
+
+
+@dataclass(frozen=True)
+class Bandit(Search):
+    """Upper confidence bounds over buckets of each coordinate, and buckets of those buckets.
+
+    Ordered cells of discrete coordinates are grouped into buckets; unordered ones are an arm each.
+
+    **Arguments:**
+
+    - `buckets`: how many a coordinate has, and each bucket again.
+    - `depth`: how often buckets are split, the first time included.
+    - `optimism`: factor on the bonus; the larger, the more even the draws.
+    - `best`: share of the remembered points that gets rewards.
+    - `window`: how many points are remembered; at least two batches.
+    - `exploration`: share of points drawn from the prior, for ever.
+
+    **Raises:** `ValueError` for values out of range, and for more than 10 000 buckets in all.
+    """
+
+    buckets: int = 5
+    depth: int = 2
+    optimism: float = 0.6
+    best: float = 0.25
+    window: int = 512
+    exploration: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_count("buckets", self.buckets, 2)
+        check_count("depth", self.depth)
+        check_positive("optimism", self.optimism)
+        check_fraction("best", self.best)
+        check_count("window", self.window)
+        check_fraction("exploration", self.exploration)
+        if self.buckets**self.depth > 10_000:
+            raise ValueError(
+                "buckets**depth must be at most 10000; got "
+                f"buckets={self.buckets}, depth={self.depth}"
+            )
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BanditState:
+        window = max(self.window, 2 * batch)
+        return BanditState(
+            key=key,
+            round=jnp.uint32(0),
+            u=jnp.full((window, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(window, jnp.inf, jnp.float32),
+        )
+
+    def ask(
+        self, state: BanditState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], BanditState]:
+        key = jax.random.fold_in(state.key, state.round)
+        random = jax.random.uniform(key, (batch, 1 + 2 * cube.dim), jnp.float32)
+        chance, order, prior = jnp.split(random, [1, 1 + cube.dim], axis=1)
+        # A Latin hypercube: in each coordinate one row in each of `batch` equal parts.
+        even = (jnp.argsort(order, axis=0) + prior) / batch
+        reward = self._rewards(state.score)
+        u = jnp.zeros((batch, cube.dim), jnp.float32)
+        for places, edges, branching in self._bandits(cube):
+            part = _draw(
+                self._density(state, reward, places, edges, branching, batch),
+                edges,
+                even[:, places],
+            )
+            u = u.at[:, places].set(part)
+        u = jnp.where(chance < self.exploration, prior, u)
+        u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
+        return u, state._replace(round=state.round + 1)
+
+    def tell(self, state: BanditState, cube: Cube, evaluated: Evaluated) -> BanditState:
+        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        u = jnp.where(usable[:, None], evaluated.u, 0.5)
+        u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
+        score = jnp.concatenate([new, state.score])
+        # Points without a verdict push none out.
+        kept = jnp.argsort(jnp.isinf(score), stable=True)[: len(state.score)]
+        return state._replace(u=jnp.concatenate([u, state.u])[kept], score=score[kept])
+
+    def _rewards(self, score: Float[Array, " window"]) -> Float[Array, " window"]:
+        """From 1 for the best to 0 beyond the best share; equal scores share their ranks."""
+        ranked = jnp.sort(score)
+        below = jnp.searchsorted(ranked, score, side="left")
+        upto = jnp.searchsorted(ranked, score, side="right")
+        rewarded = self.best * jnp.maximum(jnp.sum(jnp.isfinite(score)), 1)
+        return jnp.clip(1 - (below + upto) / (2 * rewarded), 0.0, 1.0)
+
+    def _bandits(
+        self, cube: Cube
+    ) -> list[tuple[np.ndarray, Float[np.ndarray, "d leaves+1"], tuple[int, ...]]]:
+        """Groups of coordinates, the edges of their finest buckets, and how these branch."""
+        cells = dict(zip(cube.discrete.tolist(), cube.probabilities, strict=True))
+        choices = [i for i in cells if not cube.ordered[i]]
+        others = [i for i in range(cube.dim) if i not in choices]
+        groups = []
+        most = max((cube.levels[i] for i in choices), default=0)
+        for places, branching in ((others, (self.buckets,) * self.depth), (choices, (most,))):
+            if not places:
+                continue
+            leaves = int(np.prod(branching))
+            edges = np.tile(np.linspace(0, 1, leaves + 1), (len(places), 1))
+            for row, i in zip(edges, places, strict=True):
+                if i in cells:
+                    # Cell c is in leaf c * leaves // n (or, a choice, in leaf c).
+                    n = cube.levels[i]
+                    first = np.arange(leaves + 1)
+                    first = np.minimum(first, n) if i in choices else -(-first * n // leaves)
+                    row[:] = np.concatenate([[0], np.cumsum(cells[i])])[first]
+            groups.append((np.array(places), edges.astype(np.float32), branching))
+        return groups
+
+    def _density(
+        self,
+        state: BanditState,
+        reward: Float[Array, " window"],
+        places: np.ndarray,
+        edges: Float[np.ndarray, "d leaves+1"],
+        branching: tuple[int, ...],
+        batch: int,
+    ) -> Float[Array, "d leaves"]:
+        """The share of the next batch that each leaf gets."""
+        d, leaves = len(places), edges.shape[1] - 1
+        find = jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"), (0, 1), 1)
+        leaf = find(jnp.asarray(edges[:, 1:-1]), state.u[:, places])
+        seen = jnp.isfinite(state.score).astype(jnp.float32)
+        sums = jnp.zeros((d, leaves, 2), jnp.float32)
+        sums = sums.at[np.arange(d), leaf].add(jnp.stack([seen, reward], axis=1)[:, None])
+        share = jnp.ones((d, 1), jnp.float32)
+        total = jnp.broadcast_to(jnp.sum(seen), (d, 1))
+        mean = jnp.broadcast_to(jnp.sum(reward), (d, 1)) / jnp.maximum(total, 1.0)
+        for level, branches in enumerate(branching):
+            shape = (d, int(np.prod(branching[:level])), branches)
+            node = jnp.sum(sums.reshape(*shape, -1, 2), axis=3)
+            exists = np.sum(np.diff(edges).reshape(*shape, -1), axis=3) > 0
+            # An arm starts with one draw that had its parent's mean.
+            count = node[..., 0] + 1
+            means = (node[..., 1] + mean[..., None]) / count
+            budget = jnp.maximum(batch * share, 1.0)
+            bonus = self.optimism**2 * jnp.log(1 + total + budget)
+            split = _fill(means, count, exists, budget[..., None], bonus[..., None])
+            share = (share[..., None] * split).reshape(d, -1)
+            total, mean = node[..., 0].reshape(d, -1), means.reshape(d, -1)
+        return share
+
+
+def _fill(
+    mean: Float[Array, "*nodes arms"],
+    count: Float[Array, "*nodes arms"],
+    exists: Bool[np.ndarray, "*nodes arms"],
+    budget: Float[Array, "*nodes 1"],
+    bonus: Float[Array, "*nodes 1"],
+) -> Float[Array, "*nodes arms"]:
+    """Shares of `budget` draws that go one by one to the arm with the highest bound.
+
+    The bound of an arm after `n` more draws is `mean + sqrt(bonus / (count + n))`, so that it gets
+    `bonus / (level - mean)^2 - count` draws until its bound is down at `level`.
+    """
+
+    def draws(level: Array) -> Array:
+        gap = jnp.maximum(level - mean, 1e-6)
+        return jnp.where(exists, jnp.maximum(bonus / gap**2 - count, 0.0), 0.0)
+
+    def halve(_: int, limits: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = limits
+        level = (low + high) / 2
+        more = jnp.sum(draws(level), axis=-1, keepdims=True) > budget
+        return jnp.where(more, level, low), jnp.where(more, high, level)
+
+    highest = jnp.max(mean + jnp.sqrt(bonus / count), axis=-1, keepdims=True)
+    low, _ = jax.lax.fori_loop(0, BISECTIONS, halve, (jnp.zeros_like(highest), highest))
+    filled = draws(low)
+    total = jnp.sum(filled, axis=-1, keepdims=True)
+    # A node without arms has no share to give.
+    return filled / jnp.where(total > 0, total, 1.0)
+
+
+def _draw(
+    density: Float[Array, "d leaves"],
+    edges: Float[np.ndarray, "d leaves+1"],
+    even: Float[Array, "n d"],
+) -> Float[Array, "n d"]:
+    """The density's quantiles; it is constant in each leaf."""
+    limits = jnp.cumsum(density, axis=1)
+    limits = limits / limits[:, -1:]
+    find = jax.vmap(lambda limit, x: jnp.searchsorted(limit, x, side="right"), (0, 1), 1)
+    leaf = jnp.minimum(find(limits, even), density.shape[1] - 1)
+    d = np.arange(len(edges))
+    low = jnp.where(leaf > 0, limits[d, leaf - 1], 0.0)
+    inside = (even - low) / jnp.maximum(limits[d, leaf] - low, 1e-12)
+    left, right = jnp.asarray(edges)[d, leaf], jnp.asarray(edges)[d, leaf + 1]
+    return jnp.clip(left + jnp.clip(inside, 0.0, 1.0) * (right - left), 0.0, 1.0)
