@@ -81,8 +81,8 @@ class Coverage:
         expected = "expected_pairs" if len(self.table) > 1 else "expected"
         what = "pairs of cells" if len(self.table) > 1 else "cells"
         lines = [
-            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {self.occupied:.0%} of "
-            f"all {what} ({self.table[expected].mean():.0%} if they were uniform), "
+            f"{len(self.samples):,} rows of {self.samples.name!r} lie in "
+            f"{100 * self.occupied:.0f} % of all {what} ({100 * self.table[expected].mean():.0f} % if they were uniform), "
             + _evenness(self.discrepancy)
         ]
         if self.hole is not None:
@@ -95,7 +95,7 @@ class Coverage:
         shares = self.table["occupied"].to_numpy(float)
         if shares.min() < 1:
             worst = self.table.index[int(shares.argmin())]
-            lines.append(f"least covered feature: {worst}, {shares.min():.0%} of its cells")
+            lines.append(f"least covered feature: {worst}, {100 * shares.min():.0f} % of its cells")
         if self.untried_count:
             shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
             more = self.untried_count - len(shown)

@@ -60,7 +60,8 @@ class Rule:
         return " and ".join(map(str, self.conditions)) or "everywhere"
 
     def __str__(self) -> str:
-        return f"{self.words}: covers {self.coverage:.0%} of the failures, {_told(self.precision)}"
+        covered = f"covers {100 * self.coverage:.0f} % of the failures"
+        return f"{self.words}: {covered}, {_told(self.precision)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +69,8 @@ class Rules:
     """What `rules` found, the most telling rule first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together; `held_out`: whether
-    they were measured on rows kept aside; `measured`: how many rows that is; `prior`: whether the
-    rows are independent samples of the feature space, None if not known; `samples`: all rows with
-    a verdict.
+    they were measured on rows kept aside; `measured`: how many rows that is; `doubt`: why
+    precision is no rate of failure, empty where it is; `samples`: all rows with a verdict.
     """
 
     rules: tuple[Rule, ...]
@@ -78,7 +78,7 @@ class Rules:
     precision: Rate | None
     held_out: bool
     measured: int
-    prior: bool | None
+    doubt: str
     samples: Samples
 
     def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
@@ -116,7 +116,9 @@ class Rules:
             )
         lines = [str(rule) for rule in self.rules]
         if len(self.rules) > 1:
-            lines.append(f"together: {self.coverage:.0%} of the failures, {_told(self.precision)}")
+            lines.append(
+                f"together: {100 * self.coverage:.0f} % of the failures, {_told(self.precision)}"
+            )
         lines.append(self.basis)
         return "\n".join(lines)
 
@@ -129,14 +131,9 @@ class Rules:
             else f"measured on the {self.measured:,} rows that the rules were made from, so too "
             "good: there are too few to keep some aside"
         )
-        if self.prior:
-            return f"({measured}; precision is the rate of failure inside)"
-        why = (
-            "this search does not sample the prior"
-            if self.prior is False
-            else ("the rows may not be samples of the prior")
-        )
-        return f"({measured}; precision is no rate of failure: {why})"
+        if self.doubt:
+            return f"({measured}; precision is no rate of failure: {self.doubt})"
+        return f"({measured}; precision is the rate of failure inside)"
 
 
 _COLUMNS = ("rule", "coverage", "precision", "low", "high", "failures", "rows")
@@ -195,8 +192,26 @@ def rules(
         for region, covered in zip(regions, inside, strict=True)
     )
     coverage, precision = _measured(inside.any(axis=0), failing[measured])
-    prior = source.prior if isinstance(source, Run) else None
-    return Rules(found, coverage, precision, bool(aside.any()), int(measured.sum()), prior, samples)
+    return Rules(
+        rules=found,
+        coverage=coverage,
+        precision=precision,
+        held_out=bool(aside.any()),
+        measured=int(measured.sum()),
+        doubt=_doubt(source),
+        samples=samples,
+    )
+
+
+def _doubt(source: Any) -> str:
+    """Why the share of failures among rows is not their probability; empty where it is."""
+    if not isinstance(source, Run):
+        return "the rows may not be samples of the prior"
+    if not source.prior:
+        return "this search does not sample the prior"
+    if source.stopped == "stop_after":
+        return "the run was stopped by its own counterexamples"
+    return ""
 
 
 def check_both(samples: Samples, purpose: str) -> None:

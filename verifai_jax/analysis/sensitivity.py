@@ -191,10 +191,9 @@ def ranked(names: tuple[str, ...], columns: dict[str, Any], by: str) -> "pd.Data
 
 def _words(method: str, row: Any) -> str:
     if "total" in row:
-        return (
-            f"{row['total']:6.1%} in all ({row['total_low']:.1%} to {row['total_high']:.1%}), "
-            f"{max(row['first'], 0):6.1%} alone"
-        )
+        between = f"{100 * row['total_low']:.1f} to {100 * row['total_high']:.1f} %"
+        alone = f"{100 * max(row['first'], 0):5.1f} % alone"
+        return f"{100 * row['total']:5.1f} % of the variance in all ({between}), {alone}"
     if "mu_star" in row:
         way = "" if np.isnan(row["mu"]) else f", {'up' if row['mu'] > 0 else 'down'} on average"
         return (
@@ -206,7 +205,5 @@ def _words(method: str, row: Any) -> str:
     slope = f"typical slope {row['typical']:.3g}"
     if row["bound"] >= 1:
         return f"no bound below 100 %: mean squared slope {row['mean_squared']:.3g}, {slope}"
-    return (
-        f"at most {row['bound']:.1%} of the variance ({row['low']:.1%} to {row['high']:.1%}), "
-        f"{slope}"
-    )
+    between = f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %"
+    return f"at most {100 * row['bound']:.1f} % of the variance ({between}), {slope}"
