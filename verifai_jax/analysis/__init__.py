@@ -13,6 +13,8 @@ from verifai_jax.analysis.neighbours import nearest as nearest
 from verifai_jax.analysis.neighbours import random_rows as random_rows
 from verifai_jax.analysis.pca import Components as Components
 from verifai_jax.analysis.pca import pca as pca
+from verifai_jax.analysis.recurrent import Recurrent as Recurrent
+from verifai_jax.analysis.recurrent import recurrent as recurrent
 from verifai_jax.analysis.rules import Rule as Rule
 from verifai_jax.analysis.rules import Rules as Rules
 from verifai_jax.analysis.rules import rules as rules

@@ -25,7 +25,8 @@ class Column:
     or sorted; `low` and `high`: bounds in the feature space, infinite where there are none or no
     space is known; `near` and `far`: the finite range that is scaled to `[0, 1]`, which is the
     bounds, or else the least and the greatest entry of the whole table; `integer`: only whole
-    numbers; `known`: whether the feature space says all this.
+    numbers; `known`: whether the feature space says all this; `prior`: probabilities of the
+    `choices` where the space knows them; `uniform`: whether an ordered one has a uniform prior.
     """
 
     name: str
@@ -37,6 +38,8 @@ class Column:
     integer: bool = False
     choices: tuple[Any, ...] = ()
     known: bool = False
+    prior: tuple[float, ...] | None = None
+    uniform: bool = False
 
     def codes(self, entries: Any) -> np.ndarray:
         """Places of the entries `[n]` (a Series) in `choices`, as int64; -1 for an absent one.
@@ -91,7 +94,9 @@ def _column(entries: Any, name: str, known: Mapping[str, Any]) -> Column:
         choices = known.get("choices")
         if choices is None:
             choices = tuple(sorted(entries.dropna().unique().tolist(), key=_sorting))
-        return Column(name, ordered=False, choices=choices, known=bool(known))
+        # Where items can be absent, an entry is less likely than its choice.
+        prior = None if entries.isna().any() else known.get("prior")
+        return Column(name, ordered=False, choices=choices, known=bool(known), prior=prior)
     if not numbers:
         entries = pd.to_numeric(entries)
     present = entries.dropna().to_numpy(np.float64)
@@ -112,6 +117,7 @@ def _column(entries: Any, name: str, known: Mapping[str, Any]) -> Column:
         far=float(far),
         integer=bool(integer),
         known=bool(known),
+        uniform=known.get("uniform", False) and len(present) == len(entries),
     )
 
 
@@ -137,14 +143,24 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
             found |= item
         return found
     if isinstance(domain, Categorical):
-        return {name: {"ordered": False, "choices": _shown(domain)}}
+        count, weights = len(domain.choices), domain.weights[0]
+        prior = tuple(float(weight) for weight in weights) if weights else (1 / count,) * count
+        return {name: {"ordered": False, "choices": _shown(domain), "prior": prior}}
     if isinstance(domain, DiscreteBox):
         ends = (domain.low, domain.high)
-        return {name: {"ordered": True, "bounds": ends, "range": ends, "integer": True}}
+        return {
+            name: {"ordered": True, "bounds": ends, "range": ends, "integer": True, "uniform": True}
+        }
     if isinstance(domain, Box):
         ends = zip(np.ravel(domain.low), np.ravel(domain.high), strict=True)
         return {
-            column: {"ordered": True, "bounds": end, "range": end, "integer": False}
+            column: {
+                "ordered": True,
+                "bounds": end,
+                "range": end,
+                "integer": False,
+                "uniform": True,
+            }
             for column, end in zip(domain.columns(name), ends, strict=True)
         }
     return _of_other_domain(domain, name)

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.analysis.columns import Column, describe_columns, feature_columns
+from verifai_jax.analysis.verdicts import chosen, nothing, verdicts
 from verifai_jax.errors import check_names
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
@@ -116,10 +117,10 @@ class Samples:
             table_of = source.table if isinstance(source, Run) else source
             features = table_of.features
         described = _described(table, features if columns is None else columns, space)
-        chosen = _chosen(table, which)
-        if not chosen.any():
-            raise ValueError(_nothing(table, which))
-        return cls(table.loc[chosen], described, which, name, table, space)
+        rows = chosen(table, which)
+        if not rows.any():
+            raise ValueError(nothing(table, which))
+        return cls(table.loc[rows], described, which, name, table, space)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -147,7 +148,7 @@ class Samples:
     @cached_property
     def failing(self) -> Bool[np.ndarray, " n"]:
         """Which of the rows looked at are counterexamples."""
-        return _verdicts(self.table)[0][self.table.index.get_indexer(self.frame.index)]
+        return verdicts(self.table)[0][self.table.index.get_indexer(self.frame.index)]
 
     @cached_property
     def rho(self) -> Float[np.ndarray, " n"]:
@@ -166,10 +167,10 @@ class Samples:
 
         **Raises:** `ValueError` if there are no such rows.
         """
-        chosen = _chosen(self.table, which)
-        if not chosen.any():
-            raise ValueError(_nothing(self.table, which))
-        return replace(self, frame=self.table.loc[chosen], which=which)
+        rows = chosen(self.table, which)
+        if not rows.any():
+            raise ValueError(nothing(self.table, which))
+        return replace(self, frame=self.table.loc[rows], which=which)
 
     def at(self, rows: "Sequence[int] | Int[np.ndarray, ' k']") -> "pd.DataFrame":
         """Rows of the table by their numbers, in this order.
@@ -348,43 +349,6 @@ def _described(
         raise ValueError("there is no column to analyse: no feature varies")
     check_names("column", names, map(str, table.columns))
     return describe_columns(table, names, space)
-
-
-def _verdicts(table: "pd.DataFrame") -> tuple[np.ndarray, np.ndarray]:
-    """Which rows violate the property, and which keep it."""
-    judged = np.ones(len(table), bool)
-    if "status" in table:
-        judged = np.asarray(table["status"] == "ok", bool)
-    if "violated" in table:
-        violated = np.asarray(table["violated"], bool)
-    elif "rho" in table:
-        rho = np.asarray(table["rho"], np.float64)
-        judged = judged & ~np.isnan(rho)
-        violated = rho < 0
-    else:
-        violated = np.ones(len(table), bool)
-    return judged & violated, judged & ~violated
-
-
-def _chosen(table: "pd.DataFrame", which: str) -> np.ndarray:
-    violating, safe = _verdicts(table)
-    if which == "counterexamples":
-        return violating
-    if which == "safe":
-        return safe
-    return violating | safe if which == "all" else ~(violating | safe)
-
-
-def _nothing(table: "pd.DataFrame", which: str) -> str:
-    if not len(table):
-        return "the table is empty: there are no simulations to analyse"
-    violating, safe = (int(part.sum()) for part in _verdicts(table))
-    what = {"safe": "safe rows", "failed": "rows without a verdict", "all": "rows with a verdict"}
-    return (
-        f"no {what.get(which, which)} among {len(table):,} simulations ({violating:,} "
-        f"counterexamples, {safe:,} safe, {len(table) - violating - safe:,} without a verdict); "
-        "which=... looks at other rows"
-    )
 
 
 def _statistics(values: np.ndarray, scale: str) -> tuple[float, float]:
