@@ -80,10 +80,10 @@ class Coverage:
 
         expected = "expected_pairs" if len(self.table) > 1 else "expected"
         what = "pairs of cells" if len(self.table) > 1 else "cells"
+        share, uniform = self.occupied, float(np.nanmean(self.table[expected].to_numpy(float)))
         lines = [
-            f"{len(self.samples):,} rows of {self.samples.name!r} lie in "
-            f"{100 * self.occupied:.0f} % of all {what} ({100 * self.table[expected].mean():.0f} % if they were uniform), "
-            + _evenness(self.discrepancy)
+            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {100 * share:.0f} % of all "
+            f"{what} ({100 * uniform:.0f} % if they were uniform), {_evenness(self.discrepancy)}"
         ]
         if self.hole is not None:
             where = told(dict(list(self.hole.items())[:MOST_NAMED]))
