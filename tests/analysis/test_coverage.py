@@ -55,7 +55,7 @@ def test_holes_in_many_dimensions_are_those_of_brute_force():
     unit = (points - points.min(axis=0)) / np.ptp(points, axis=0)
     probes = qmc.Sobol(9, rng=0).random(1024)
     distances = np.linalg.norm(probes[:, None] - unit, axis=2).min(axis=1)
-    assert found.dispersion == pytest.approx(distances.max(), abs=1e-6)
+    assert found.dispersion == pytest.approx(distances.max(), abs=1e-4)
 
 
 def test_what_was_never_tried_is_listed():

@@ -82,8 +82,9 @@ class Coverage:
         what = "pairs of cells" if len(self.table) > 1 else "cells"
         share, uniform = self.occupied, float(np.nanmean(self.table[expected].to_numpy(float)))
         lines = [
-            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {100 * share:.0f} % of all "
-            f"{what} ({100 * uniform:.0f} % if they were uniform), {_evenness(self.discrepancy)}"
+            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {100 * share:.0f} % of "
+            f"all {what} ({100 * uniform:.0f} % if they were uniform), "
+            + _evenness(self.discrepancy)
         ]
         if self.hole is not None:
             where = told(dict(list(self.hole.items())[:MOST_NAMED]))
@@ -214,10 +215,11 @@ def _largest_hole(
     else:
         # Trees do not prune in many dimensions; one matrix product a block does it.
         nearest = np.full(len(probes), np.inf)
-        own = np.sum(probes**2, axis=1)
+        single = probes.astype(np.float32)
+        own = np.sum(single**2, axis=1)
         for begin in range(0, len(points), BLOCK):
-            block = points[begin : begin + BLOCK]
-            squares = own[:, None] + np.sum(block**2, axis=1) - 2 * probes @ block.T
+            block = points[begin : begin + BLOCK].astype(np.float32)
+            squares = own[:, None] + np.sum(block**2, axis=1) - 2 * single @ block.T
             nearest = np.minimum(nearest, squares.min(axis=1))
         distance = np.sqrt(np.maximum(nearest, 0))
     place = int(np.argmax(distance))

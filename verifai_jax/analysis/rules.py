@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 FEWEST = 10
 """Failing rows, and safe rows, from which on some are kept aside."""
 MOST_ONE_HOT = 30
+MOST_ENTRIES = 500_000
+"""Rows times columns that a tree is made from; regions are scored on all rows."""
 WORTH = 1.02
-"""By how much a cut must raise the score of a rule."""
+"""By how much a condition must raise the score of a rule."""
 
 
 @dataclass(frozen=True)
@@ -284,11 +286,11 @@ def _chosen(
 
 
 def _simplified(region: Region, score: Any) -> Region:
-    """The region without conditions that do not raise the score."""
+    """The region without conditions that hardly raise the score."""
     value = score(region)
     while looser := region.loosened():
         best = max(looser, key=score)
-        if score(best) < value:
+        if WORTH * score(best) < value:
             break
         region, value = best, score(best)
     return region
@@ -313,13 +315,14 @@ def _proposals(
     matrix, meanings = _encoded(values, codes, failing, unordered)
     if not matrix.shape[1]:
         return []
-    leaf = int(np.clip(failing.sum() // 10, 1, 5))
+    rows = _few(failing, int(MOST_ENTRIES // matrix.shape[1]))
+    leaf = int(np.clip(failing[rows].sum() // 10, 1, 5))
     found: list[Region] = []
     for weight in (None, "balanced"):
         tree = DecisionTreeClassifier(
             max_depth=depth, min_samples_leaf=leaf, class_weight=weight, random_state=0
         )
-        nodes = tree.fit(matrix, failing).tree_
+        nodes = tree.fit(matrix[rows], failing[rows]).tree_
         stack = [(0, start)]
         while stack:
             node, region = stack.pop()
@@ -331,6 +334,16 @@ def _proposals(
             stack.append((nodes.children_right[node], _part(region, column, edge, upper=True)))
             stack.append((nodes.children_left[node], _part(region, column, edge, upper=False)))
     return found
+
+
+def _few(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
+    """Rows that trees are made from where there are too many: rare verdicts are kept."""
+    if len(failing) <= most:
+        return np.arange(len(failing))
+    parts = []
+    for part in (np.flatnonzero(failing), np.flatnonzero(~failing)):
+        parts.append(part[:: max(1, -(-2 * len(part) // most))])
+    return np.concatenate(parts)
 
 
 def _encoded(
