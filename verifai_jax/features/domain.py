@@ -4,10 +4,11 @@
     DiscreteBox(1, 4)                                   # box.py: an integer
     Categorical("ppo", "sac"), Constant(9.8)            # choice.py
     Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py
+    Array(Box(0, 50), length=(1, 3))                                        # variable.py
+    Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
+    Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.
-Distributions (`Normal`, `LogUniform`, ...) belong in `distributions.py` and functions of time
-(`Signal`) in `signal.py`, when they come.
 """
 
 import abc
@@ -82,6 +83,25 @@ class Domain(abc.ABC):
         """Number of unit coordinates."""
         return len(self.levels)
 
+    @property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        """For each unit coordinate the probabilities of its cells, their widths; None if equal."""
+        return (None,) * self.size
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        """For each unit coordinate whether its values have an order; choices have none."""
+        return (True,) * self.size
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Which unit coordinates are lengths of arrays, on which others depend."""
+        return ()
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        """What each unit coordinate of the feature called `name` is called."""
+        return self.columns(name)
+
 
 def cell(u: Float[Array, "*shape"], count: int) -> Any:
     """Which of `count` equally wide cells holds `u`, as `int32`; 1.0 is in the last one."""
@@ -138,6 +158,11 @@ def as_tuple(value: Any) -> Any:
 def indexed(name: str, count: int) -> tuple[str, ...]:
     """`name[0]`, `name[1]`, ..."""
     return tuple(f"{name}[{i}]" for i in range(count))
+
+
+def dotted(name: str, field: str) -> str:
+    """What a field of the feature called `name` is called."""
+    return f"{name}.{field}" if name else field
 
 
 def listed(choices: Sequence[Any]) -> str:
