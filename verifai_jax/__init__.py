@@ -13,8 +13,13 @@ from verifai_jax.features import Box as Box
 from verifai_jax.features import Categorical as Categorical
 from verifai_jax.features import Constant as Constant
 from verifai_jax.features import DiscreteBox as DiscreteBox
+from verifai_jax.features import Distribution as Distribution
 from verifai_jax.features import FeatureSpace as FeatureSpace
+from verifai_jax.features import LogUniform as LogUniform
+from verifai_jax.features import Normal as Normal
+from verifai_jax.features import Signal as Signal
 from verifai_jax.features import Struct as Struct
+from verifai_jax.features import TruncatedNormal as TruncatedNormal
 from verifai_jax.mtl import FALSE as FALSE
 from verifai_jax.mtl import TRUE as TRUE
 from verifai_jax.mtl import Formula as Formula
@@ -54,5 +59,6 @@ from verifai_jax.systems import sin_cos as sin_cos
 from verifai_jax.table import ErrorTable as ErrorTable
 from verifai_jax.trace import Status as Status
 from verifai_jax.trace import Trace as Trace
+from verifai_jax.waveform import Waveform as Waveform
 
 _claim_cores()

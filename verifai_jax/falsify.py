@@ -287,8 +287,7 @@ def _check_search(problem: Any, search: Any) -> Search:
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
             f"search {search!r} needs one; use one that does not, such as 'cross_entropy'"
         )
-    if hasattr(problem.space, "check_where"):
-        problem.space.check_where()
+    problem.space.check_where()
     search.check(cube_of(problem.space))
     return search
 

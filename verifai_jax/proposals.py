@@ -35,11 +35,11 @@ class ConstraintError(ValueError):
 def cube_of(space: FeatureSpace) -> Cube:
     """The unit cube of a feature space, as searches see it."""
     return Cube(
-        levels=tuple(space.levels),
-        weights=tuple(getattr(space, "weights", ())),
-        ordered=tuple(getattr(space, "ordered", ())),
-        names=tuple(getattr(space, "coordinates", ())),
-        lengths=tuple(getattr(space, "lengths", ())),
+        levels=space.levels,
+        weights=space.weights,
+        ordered=space.ordered,
+        names=space.coordinates,
+        lengths=space.lengths,
     )
 
 
@@ -64,7 +64,7 @@ class Proposals:
         self.total = search.total(self.cube)
         self.asked = self.accepted = 0
         self._program = _program(search, self.cube, batch)
-        self._accepts = None if getattr(space, "where", None) is None else _acceptance(space, batch)
+        self._accepts = None if space.where is None else _acceptance(space, batch)
         self._state = self._program.init(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
@@ -194,7 +194,7 @@ class Proposals:
                 break  # This search proposes the same until it is told something.
             self.asked += int(fresh.sum())
             points = jnp.where(fresh[:, None], others, points)
-            accepted |= self._accepted_rows(points)
+            accepted = accepted | self._accepted_rows(points)
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MOST_REFUSED:
             self._give_up()

@@ -68,7 +68,7 @@ class Rounds:
     @property
     def acceptance(self) -> float | None:
         """Share of proposed points that the constraint let through; None without one."""
-        if getattr(self.problem.space, "where", None) is None or self._proposals is None:
+        if self.problem.space.where is None or self._proposals is None:
             return None
         return self._proposals.accepted / max(self._proposals.asked, 1)
 

@@ -358,9 +358,7 @@ def _summary(run: Run) -> str:
             number, message = raised.index[0], raised["message"].iloc[0]
             lines.append(f"               first in row {number}: {message}")
     if run.acceptance is not None:
-        lines.append(
-            f"  constraint   let through {100 * run.acceptance:.3g} % of what was proposed"
-        )
+        lines.append(f"  constraint   let through {100 * run.acceptance:.3g} % of all proposals")
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
     lines.append(
         f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "

@@ -222,7 +222,7 @@ class TestSpaces:
                 "two features give the table column 'a.b'",
             ),
             (lambda: FeatureSpace({"x": 3}), "x must be a domain"),
-            (lambda: FeatureSpace({"x": Box(0, 1)}, where=lambda f: True), "where"),
+            (lambda: FeatureSpace({"x": Box(0, 1)}, where=True), "where must be a function"),
             (lambda: SPACE["zz"], "unknown feature 'zz'; did you mean"),
             (lambda: SPACE.unflatten(jnp.zeros(3)), r"u must have shape \[12\].*got \[3\]"),
         ],

@@ -1,10 +1,17 @@
 """Feature spaces: what varies from simulation to simulation, and how."""
 
+from verifai_jax.features.arrays import Array as Array
+from verifai_jax.features.arrays import Items as Items
+from verifai_jax.features.arrays import VariableArray as VariableArray
 from verifai_jax.features.box import Box as Box
 from verifai_jax.features.box import DiscreteBox as DiscreteBox
 from verifai_jax.features.choice import Categorical as Categorical
 from verifai_jax.features.choice import Constant as Constant
-from verifai_jax.features.compound import Array as Array
 from verifai_jax.features.compound import Struct as Struct
+from verifai_jax.features.distributions import Distribution as Distribution
+from verifai_jax.features.distributions import LogUniform as LogUniform
+from verifai_jax.features.distributions import Normal as Normal
+from verifai_jax.features.distributions import TruncatedNormal as TruncatedNormal
 from verifai_jax.features.domain import Domain as Domain
+from verifai_jax.features.signal import Signal as Signal
 from verifai_jax.features.space import FeatureSpace as FeatureSpace

@@ -69,6 +69,17 @@ class Box(Domain):
             if max(high - low, abs(low), abs(high)) > MOST_REAL or high - low < LEAST_REAL:
                 raise ValueError(f"a Box must fit into float32, as must its width; {shown}")
 
+    @classmethod
+    def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
+        """VerifAI's notation, an interval for each entry, whose ends may come in any order."""
+        ends = [sorted(interval) for interval in intervals]
+        if not ends or any(len(pair) != 2 for pair in ends):
+            raise ValueError(f"an interval is a pair of numbers; got {intervals!r}")
+        if len(ends) == 1:
+            return cls(*ends[0])
+        low, high = zip(*ends, strict=True)
+        return cls(low, high)
+
     @property
     def levels(self) -> tuple[int, ...]:
         return (0,) * np.size(self.low)
@@ -155,6 +166,12 @@ class DiscreteBox(Domain):
                 f"a DiscreteBox has at most {MOST_LEVELS} values, which a float32 coordinate can "
                 f"tell apart (use a Box and round); {shown}"
             )
+
+    @classmethod
+    def from_interval(cls, one: float, other: float) -> "DiscreteBox":
+        """The integers between two numbers, which may come in any order, as in VerifAI."""
+        low, high = sorted((one, other))
+        return cls(math.ceil(low), math.floor(high))
 
     @property
     def count(self) -> int:

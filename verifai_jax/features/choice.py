@@ -1,6 +1,7 @@
 """Values without an order: one of several choices (`Categorical`), or a single one (`Constant`)."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +15,7 @@ from verifai_jax.features.domain import (
     MOST_LEVELS,
     MOST_REAL,
     Domain,
+    as_number,
     as_numbers,
     as_real,
     as_scalar,
@@ -27,17 +29,20 @@ from verifai_jax.features.domain import (
 
 @dataclass(frozen=True, init=False, repr=False)
 class Categorical(Domain):
-    """One of several choices, equally likely and without an order: `Categorical("ppo", "sac")`.
+    """One of several choices without an order: `Categorical("ppo", "sac", weights=[0.9, 0.1])`.
 
-    Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
-    value is its place in `choices`, an `int32`. The table always shows the choice itself.
+    Equally likely without `weights`, which are their probabilities. Where all choices are numbers
+    the value is the number; otherwise JAX cannot hold it and the value is its place in `choices`,
+    an `int32`. The table always shows the choice itself.
 
-    **Raises:** `ValueError` for no choices, or for the same choice twice.
+    **Raises:** `ValueError` for no choices, the same choice twice, or weights that are not one
+    positive number a choice with the sum one.
     """
 
     choices: tuple[Any, ...]
+    probabilities: tuple[float, ...] | None = None
 
-    def __init__(self, *choices: Any) -> None:
+    def __init__(self, *choices: Any, weights: Sequence[float] | None = None) -> None:
         object.__setattr__(self, "choices", tuple(as_scalar(choice) for choice in choices))
         if not self.choices:
             raise ValueError("a Categorical needs at least one choice; got none")
@@ -61,6 +66,23 @@ class Categorical(Domain):
             if keys & seen:
                 raise ValueError(f"the choice {choice!r} is given twice in {listed(self.choices)}")
             seen |= keys
+        if weights is not None:
+            object.__setattr__(self, "probabilities", self._checked(weights))
+
+    def _checked(self, weights: Sequence[float]) -> tuple[float, ...]:
+        numbers = tuple(as_number(weight, "a weight of a Categorical") for weight in weights)
+        if len(numbers) != len(self.choices):
+            raise ValueError(
+                f"a Categorical with {len(self.choices)} choices needs as many weights; "
+                f"got {len(numbers)}"
+            )
+        if not all(weight > 0 for weight in numbers):
+            raise ValueError(
+                f"weights must be positive (leave out a choice that never comes); got {numbers}"
+            )
+        if abs(math.fsum(numbers) - 1) > 1e-6:
+            raise ValueError(f"weights must sum to one; {numbers} sum to {math.fsum(numbers):g}")
+        return numbers
 
     @cached_property
     def numeric(self) -> bool:
@@ -88,11 +110,24 @@ class Categorical(Domain):
         return (len(self.choices),)
 
     @property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        return (self.probabilities,)
+
+    @property
     def ordered(self) -> tuple[bool, ...]:
         return (False,)
 
+    @cached_property
+    def _edges(self) -> np.ndarray:
+        """Where the cells begin and end, of unequal ones."""
+        assert self.probabilities is not None
+        return np.concatenate([[0], np.cumsum(self.probabilities)]).astype(np.float32)
+
     def from_unit(self, u: Float[Array, "1"]) -> Any:
-        index = cell(u[0], len(self.choices))
+        if self.probabilities is None:
+            index = cell(u[0], len(self.choices))
+        else:
+            index = jnp.searchsorted(self._edges[1:-1], u[0], side="right").astype(jnp.int32)
         if not self.numeric:
             return index
         dtype = u.dtype if self._dtype == np.float64 else self._dtype
@@ -102,7 +137,10 @@ class Categorical(Domain):
         index = jnp.asarray(value)
         if self.numeric:
             index = jnp.argmin(jnp.abs(as_real(index) - self._shown.astype(np.float32)))
-        return centre(index, len(self.choices))
+        if self.probabilities is None:
+            return centre(index, len(self.choices))
+        middles = (self._edges[1:] + self._edges[:-1]) / 2
+        return jnp.reshape(jnp.asarray(middles)[index], (1,)).astype(jnp.result_type(float))
 
     def coerce(self, value: Any) -> Any:
         if self.numeric:
@@ -162,7 +200,10 @@ class Categorical(Domain):
         return place if np.float32(numbers[place]) == np.float32(value) else None
 
     def __repr__(self) -> str:
-        return f"Categorical({listed(self.choices)})"
+        weights = ""
+        if self.probabilities is not None:
+            weights = f", weights=[{', '.join(f'{p:g}' for p in self.probabilities)}]"
+        return f"Categorical({listed(self.choices)}{weights})"
 
 
 @dataclass(frozen=True, repr=False)

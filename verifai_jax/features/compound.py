@@ -1,6 +1,5 @@
-"""Domains made of domains: several under names (`Struct`), several of one kind (`Array`)."""
+"""Domains made of domains: several under names (`Struct`)."""
 
-import operator
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +13,7 @@ from jaxtyping import Float
 
 from verifai_jax.errors import check_names
 from verifai_jax.features.box import Box
-from verifai_jax.features.domain import Domain, indexed
+from verifai_jax.features.domain import Domain, dotted
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -47,15 +46,15 @@ class Struct(Domain):
     def levels(self) -> tuple[int, ...]:
         return tuple(level for _, domain in self.fields for level in domain.levels)
 
-    @cached_property
-    def ordered(self) -> tuple[bool, ...]:
-        return tuple(is_ordered for _, domain in self.fields for is_ordered in domain.ordered)
-
-    @cached_property
+    @property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
         return tuple(weights for _, domain in self.fields for weights in domain.weights)
 
-    @cached_property
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        return tuple(ordered for _, domain in self.fields for ordered in domain.ordered)
+
+    @property
     def lengths(self) -> tuple[int, ...]:
         found, start = [], 0
         for _, domain in self.fields:
@@ -65,9 +64,9 @@ class Struct(Domain):
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         return tuple(
-            coordinate
+            label
             for field, domain in self.fields
-            for coordinate in domain.coordinates(_dotted(name, field))
+            for label in domain.coordinates(dotted(name, field))
         )
 
     def __getitem__(self, name: str) -> Domain:
@@ -102,28 +101,28 @@ class Struct(Domain):
     def check(self, value: Any, name: str) -> None:
         if not isinstance(value, Mapping):
             raise ValueError(f"{name or 'features'} must be a dictionary; got {value!r}")
-        check_names("feature", [_dotted(name, field) for field in value], self._dotted_names(name))
+        check_names("feature", [dotted(name, field) for field in value], self._dotted_names(name))
         for field, domain in self.fields:
             if field not in value:
-                raise ValueError(f"{_dotted(name, field)} is missing; got {', '.join(value)}")
-            domain.check(value[field], _dotted(name, field))
+                raise ValueError(f"{dotted(name, field)} is missing; got {', '.join(value)}")
+            domain.check(value[field], dotted(name, field))
 
     def columns(self, name: str) -> tuple[str, ...]:
         return tuple(
             column
             for field, domain in self.fields
-            for column in domain.columns(_dotted(name, field))
+            for column in domain.columns(dotted(name, field))
         )
 
     def to_columns(self, values: Mapping[str, Any], name: str) -> dict[str, np.ndarray]:
         columns: dict[str, np.ndarray] = {}
         for field, domain in self.fields:
-            columns |= domain.to_columns(values[field], _dotted(name, field))
+            columns |= domain.to_columns(values[field], dotted(name, field))
         return columns
 
     def from_columns(self, row: Mapping[str, Any], name: str) -> dict[str, Any]:
         return {
-            field: domain.from_columns(row, _dotted(name, field)) for field, domain in self.fields
+            field: domain.from_columns(row, dotted(name, field)) for field, domain in self.fields
         }
 
     @cached_property
@@ -140,106 +139,12 @@ class Struct(Domain):
         return tuple(runs)
 
     def _dotted_names(self, name: str) -> list[str]:
-        return [_dotted(name, field) for field, _ in self.fields]
+        return [dotted(name, field) for field, _ in self.fields]
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{name!r}: {domain!r}" for name, domain in self.fields)
         return f"Struct({{{fields}}})"
 
 
-@dataclass(frozen=True, repr=False)
-class Array(Domain):
-    """`length` independent values of one domain: `Array(Box(0, 1), length=3)`.
-
-    A value is stacked along a leading axis: an array `[length]` of a `Box`, a dictionary of such
-    arrays of a `Struct`.
-
-    **Raises:** `ValueError` for a length that is not a positive integer; `TypeError` for something
-    that is no domain.
-    """
-
-    domain: Domain
-    length: int
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.domain, Domain):
-            raise TypeError(f"an Array needs a domain, such as Box(0, 1); got {self.domain!r}")
-        length = self.length
-        if isinstance(length, bool) or not isinstance(length, int | np.integer) or length < 1:
-            raise ValueError(f"the length of an Array must be a positive integer; got {length!r}")
-        object.__setattr__(self, "length", int(length))
-
-    @cached_property
-    def levels(self) -> tuple[int, ...]:
-        return self.domain.levels * self.length
-
-    @cached_property
-    def ordered(self) -> tuple[bool, ...]:
-        return self.domain.ordered * self.length
-
-    @cached_property
-    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        return self.domain.weights * self.length
-
-    @cached_property
-    def lengths(self) -> tuple[int, ...]:
-        size = self.domain.size
-        return tuple(i * size + j for i in range(self.length) for j in self.domain.lengths)
-
-    def coordinates(self, name: str) -> tuple[str, ...]:
-        return tuple(
-            coordinate
-            for item in indexed(name, self.length)
-            for coordinate in self.domain.coordinates(item)
-        )
-
-    def from_unit(self, u: Float[jax.Array, " size"]) -> Any:
-        return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
-
-    def to_unit(self, value: Any) -> Float[jax.Array, " size"]:
-        return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
-
-    def coerce(self, value: Any) -> Any:
-        return self.domain.coerce(value)
-
-    def check(self, value: Any, name: str) -> None:
-        for i in range(self.length):
-            self.domain.check(_element(value, i, self.length, name), f"{name}[{i}]")
-
-    def columns(self, name: str) -> tuple[str, ...]:
-        return tuple(
-            column for item in indexed(name, self.length) for column in self.domain.columns(item)
-        )
-
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
-        columns: dict[str, np.ndarray] = {}
-        for i, item in enumerate(indexed(name, self.length)):
-            element = jax.tree.map(operator.itemgetter((slice(None), i)), values)
-            columns |= self.domain.to_columns(element, item)
-        return columns
-
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
-        items = [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
-
-    def __repr__(self) -> str:
-        return f"Array({self.domain!r}, length={self.length})"
-
-
 def _is_scalar_box(domain: Domain) -> bool:
     return isinstance(domain, Box) and np.ndim(domain.low) == 0
-
-
-def _dotted(name: str, field: str) -> str:
-    return f"{name}.{field}" if name else field
-
-
-def _element(value: Any, i: int, length: int, name: str) -> Any:
-    """Element `i` of a stacked value."""
-    if isinstance(value, Mapping):
-        return {
-            field: _element(leaf, i, length, _dotted(name, field)) for field, leaf in value.items()
-        }
-    if np.ndim(np.asarray(value, dtype=object)) == 0 or len(value) != length:
-        raise ValueError(f"{name} must have {length} entries; got {value!r}")
-    return value[i]

@@ -4,10 +4,11 @@
     DiscreteBox(1, 4)                                   # box.py: an integer
     Categorical("ppo", "sac"), Constant(9.8)            # choice.py
     Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py
+    Array(Box(0, 50), length=(1, 3))                                        # variable.py
+    Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
+    Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.
-Distributions (`Normal`, `LogUniform`, ...) belong in `distributions.py` and functions of time
-(`Signal`) in `signal.py`, when they come.
 """
 
 import abc
@@ -86,21 +87,18 @@ class Domain(abc.ABC):
         return len(self.levels)
 
     @property
-    def ordered(self) -> tuple[bool, ...]:
-        """For each unit coordinate: whether neighbouring points or cells mean similar values."""
-        return (True,) * self.size
-
-    @property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """For each unit coordinate: the probabilities of its cells, which are their widths.
-
-        None where they are equal, or where the coordinate is continuous.
-        """
+        """For each unit coordinate the probabilities of its cells, their widths; None if equal."""
         return (None,) * self.size
 
     @property
+    def ordered(self) -> tuple[bool, ...]:
+        """For each unit coordinate whether its values have an order; choices have none."""
+        return (True,) * self.size
+
+    @property
     def lengths(self) -> tuple[int, ...]:
-        """Indices of the unit coordinates that are lengths of arrays, on which others depend."""
+        """Which unit coordinates are lengths of arrays, on which others depend."""
         return ()
 
     def coordinates(self, name: str) -> tuple[str, ...]:
@@ -163,6 +161,11 @@ def as_tuple(value: Any) -> Any:
 def indexed(name: str, count: int) -> tuple[str, ...]:
     """`name[0]`, `name[1]`, ..."""
     return tuple(f"{name}[{i}]" for i in range(count))
+
+
+def dotted(name: str, field: str) -> str:
+    """What a field of the feature called `name` is called."""
+    return f"{name}.{field}" if name else field
 
 
 def listed(choices: Sequence[Any]) -> str:

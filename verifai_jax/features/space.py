@@ -1,38 +1,53 @@
 """The feature space: all that varies, in the order written, over one unit cube.
 
-    space = FeatureSpace({"x0": Box(-0.05, 0.05), "alg": Categorical("ppo", "sac")})
-    features = space.unflatten(u)                        # u[dim] -> {"x0": ..., "alg": ...}
-    table = space.rows(jax.vmap(space.unflatten)(us))    # us[n, dim] -> columns [n]
-    space.from_row(table.loc[7])                         # what was simulated in row 7
-
-Constraints between features (`where`) will live here too.
+space = FeatureSpace({"x0": Box(-0.05, 0.05), "alg": Categorical("ppo", "sac")})
+features = space.unflatten(u)                        # u[dim] -> {"x0": ..., "alg": ...}
+table = space.rows(jax.vmap(space.unflatten)(us))    # us[n, dim] -> columns [n]
+space.from_row(table.loc[7])                         # what was simulated in row 7
+FeatureSpace({...}, where=lambda f: f["x"] < f["y"])                 # a constraint
+space.only("x0", nominal={"alg": "ppo"})                             # a view
 """
 
 import html
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.errors import check_names, unknown_name
+from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.domain import Domain, as_real
+from verifai_jax.features.fixed import Fixed
+from verifai_jax.features.plain import from_plain, to_plain
+from verifai_jax.features.signal import Signal
 
 
 class FeatureSpace:
     """Named domains over `dim` unit coordinates; uniform coordinates are the prior on features.
 
-    **Arguments:** `domains`: name -> `Domain`, in the order in which coordinates and columns come.
+    **Arguments:**
+
+    - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
+    - `where`: a constraint between features, a JAX function from features to one truth value. The
+      prior is then that of the domains given that it holds, and only such points are simulated.
 
     **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
-    `TypeError` for a value that is no domain.
+    `TypeError` for a value that is no domain, or a `where` that is no function.
     """
 
-    def __init__(self, domains: Mapping[str, Domain]) -> None:
+    def __init__(
+        self, domains: Mapping[str, Domain], where: Callable[[Any], Any] | None = None
+    ) -> None:
         self.root = Struct(domains)
+        if where is not None and not callable(where):
+            raise TypeError(f"where must be a function of the features; got {where!r}")
+        self.where = where
         seen: set[str] = set()
         for column in self.columns:
             if column in seen:
@@ -48,6 +63,26 @@ class FeatureSpace:
     def levels(self) -> tuple[int, ...]:
         """For each coordinate: 0 if continuous, or the number of its cells."""
         return self.root.levels
+
+    @cached_property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        """For each coordinate the probabilities of its cells; None where they are equal."""
+        return self.root.weights
+
+    @cached_property
+    def ordered(self) -> tuple[bool, ...]:
+        """For each coordinate whether its values have an order."""
+        return self.root.ordered
+
+    @cached_property
+    def lengths(self) -> tuple[int, ...]:
+        """Which coordinates are lengths of arrays, on which others depend."""
+        return self.root.lengths
+
+    @cached_property
+    def coordinates(self) -> tuple[str, ...]:
+        """What each coordinate is called, such as `x0`, `cars.length`, `cars[0].x`."""
+        return self.root.coordinates("")
 
     @property
     def ordered(self) -> tuple[bool, ...]:
@@ -108,12 +143,145 @@ class FeatureSpace:
         return self.root.coerce(self._completed(features))
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features, of which constant ones may be left out.
+        """Check concrete features, of which constant and fixed ones may be left out.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
-        its domain.
+        its domain, and for features that break the constraint.
         """
-        self.root.check(self._completed(features), "")
+        complete = self._completed(features)
+        self.root.check(complete, "")
+        if self.where is not None and not bool(self.accepts(self.root.coerce(complete))):
+            raise ValueError(
+                f"the features break the constraint {_source(self.where)} of this space; "
+                f"got {dict(features)!r}"
+            )
+
+    def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
+        """Whether the constraint holds; True without one. Pure JAX."""
+        return jnp.asarray(True if self.where is None else self.where(features))
+
+    def check_where(self, seed: int = 0) -> float:
+        """The share of the prior that the constraint accepts, measured; 1 without one.
+
+        **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
+        accepts none of 65 536 samples.
+        """
+        return 1.0 if self.where is None else acceptance_rate(self, seed)
+
+    def sample(self, key: Key[Array, ""], count: int) -> dict[str, Any]:
+        """`count` features drawn from the prior, stacked along a leading axis; for people.
+
+        **Raises:** as `check_where`.
+        """
+        self.check_where()
+        found, have = [], 0
+        many = jax.jit(jax.vmap(lambda u: (self.unflatten(u), self.accepts(self.unflatten(u)))))
+        while have < count:
+            key, now = jax.random.split(key)
+            features, accepted = many(jax.random.uniform(now, (max(count, 64), self.dim)))
+            kept = np.flatnonzero(accepted)[: count - have]
+            found.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], features))
+            have += len(kept)
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+
+    def distance(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> Float[Array, ""]:
+        """How far two features lie apart: Euclidean over the unit coordinates.
+
+        That is by probability in continuous coordinates, by difference of places (from 0 to 1)
+        in integers and lengths, and 0 or 1 between choices; an absent item counts as one in the
+        middle of its domain. Pure JAX on what `unflatten` gives; a metric.
+        """
+        levels, ordered = np.array(self.levels, int), np.array(self.ordered, bool)
+        scale = np.where(levels > 1, levels / np.maximum(levels - 1, 1), 1.0)
+        gap = jnp.abs(self.root.to_unit(one) - self.root.to_unit(other))
+        gap = jnp.where((levels > 0) & ~ordered, (gap > 0).astype(gap.dtype), gap * scale)
+        # The square root has no slope at zero, where two points are the same.
+        square = jnp.sum(gap * gap)
+        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+    def fixed(self, **values: Any) -> "FeatureSpace":
+        """The same space with these features held at a value; they keep their table columns.
+
+        **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
+        """
+        check_names("feature", values, self.domains)
+        domains = {
+            name: Fixed(_varied(domain), values[name], name) if name in values else domain
+            for name, domain in self.root.fields
+        }
+        return FeatureSpace(domains, self.where)
+
+    def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "FeatureSpace":
+        """The same space with these features varied alone, the others held at `nominal`.
+
+        **Raises:** `ValueError` for no or an unknown feature, or one without a nominal value.
+        """
+        if not features:
+            raise ValueError("name at least one feature that varies")
+        check_names("feature", features, self.domains)
+        others = [
+            name
+            for name, domain in self.root.fields
+            if name not in features and not isinstance(domain, Constant | Fixed)
+        ]
+        missing = [name for name in others if name not in (nominal or {})]
+        if missing:
+            raise ValueError(
+                f"features that do not vary need a nominal value; {', '.join(missing)} "
+                f"{'has' if len(missing) == 1 else 'have'} none"
+            )
+        return self.fixed(**{name: (nominal or {})[name] for name in others})
+
+    def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[Any], Any]]":
+        """From coarse to fine: the space with finer signals, and a map of features to it.
+
+        Only signals that are features themselves are refined; see `Signal.refined`.
+        """
+        domains = {
+            name: domain.refined(factor) if isinstance(domain, Signal) else domain
+            for name, domain in self.root.fields
+        }
+
+        def refine(features: Mapping[str, Any]) -> dict[str, Any]:
+            return {
+                name: value.refined(factor) if isinstance(domains[name], Signal) else value
+                for name, value in features.items()
+            }
+
+        return FeatureSpace(domains, self.where), refine
+
+    def to_json(self) -> dict[str, Any]:
+        """The space as plain data; of a constraint only that there is one, and its name.
+
+        **Raises:** `ValueError` for domains of the user's own.
+        """
+        where = None if self.where is None else _source(self.where)
+        return {"features": to_plain(self.root)["fields"], "where": where}
+
+    @classmethod
+    def from_json(
+        cls,
+        data: Mapping[str, Any],
+        where: Callable[[Any], Any] | None = None,
+        distributions: Mapping[str, Any] | None = None,
+    ) -> "FeatureSpace":
+        """The space that `to_json` described; code is given, never read.
+
+        - `where`: the constraint, if the space has one.
+        - `distributions`: those with functions of their own, by name.
+
+        **Raises:** `ValueError` for data that describes no space, or code that is missing.
+        """
+        if not isinstance(data, Mapping) or "features" not in data:
+            raise ValueError(f"this describes no feature space: {data!r}")
+        if data.get("where") is not None and where is None:
+            raise ValueError(
+                f"the constraint {data['where']} of this space is code, which JSON does not hold; "
+                "give it: from_json(data, where=...)"
+            )
+        root = from_plain({"kind": "Struct", "fields": data["features"]}, distributions)
+        assert isinstance(root, Struct)
+        return cls(dict(root.fields), where)
 
     def rows(self, features: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
@@ -145,24 +313,26 @@ class FeatureSpace:
     def _completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
         if not isinstance(features, Mapping):
             return features
-        constants = {n: d.value for n, d in self.root.fields if isinstance(d, Constant)}
+        constants = {n: d.value for n, d in self.root.fields if isinstance(d, Constant | Fixed)}
         return {**constants, **features}
 
     def __getitem__(self, name: str) -> Domain:
         return self.root[name]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, FeatureSpace) and self.root == other.root
+        same = isinstance(other, FeatureSpace) and self.root == other.root
+        return same and self.where == other.where  # pyright: ignore[reportAttributeAccessIssue]
 
     def __hash__(self) -> int:
-        return hash(self.root)
+        return hash((self.root, self.where))
 
     def __repr__(self) -> str:
         fields = [f"{name!r}: {domain!r}" for name, domain in self.root.fields]
-        line = f"FeatureSpace({{{', '.join(fields)}}})"
+        where = "" if self.where is None else f", where={_source(self.where)}"
+        line = f"FeatureSpace({{{', '.join(fields)}}}{where})"
         if len(line) <= 88:
             return line
-        return "FeatureSpace({\n" + "".join(f"    {field},\n" for field in fields) + "})"
+        return "FeatureSpace({\n" + "".join(f"    {field},\n" for field in fields) + f"}}{where})"
 
     def _repr_html_(self) -> str:
         header, *rows = self._summary()
@@ -184,4 +354,16 @@ class FeatureSpace:
             counts = [(domain.size - discrete, "continuous"), (discrete, "discrete")]
             shown = ", ".join(f"{count} {kind}" for count, kind in counts if count)
             rows.append((name, repr(domain), shown or "none"))
+        if self.where is not None:
+            rows.append(("where", _source(self.where), ""))
         return rows
+
+
+def _varied(domain: Domain) -> Domain:
+    return domain.domain if isinstance(domain, Fixed) else domain
+
+
+def _source(where: Callable[[Any], Any]) -> str:
+    """What a constraint is called."""
+    name = getattr(where, "__name__", type(where).__name__)
+    return "where" if name == "<lambda>" else name

@@ -27,6 +27,7 @@ from verifai_jax.systems.structure import (
     outline,
 )
 from verifai_jax.trace import Status, Trace
+from verifai_jax.waveform import bound
 
 Time = Float[Array, ""]
 
@@ -53,7 +54,11 @@ class Ode:
         return self.steps * self.dt
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
-        """Simulate once; `features` and `key` reach the functions given to `ode` untouched."""
+        """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
+
+        Only a waveform without a duration is given that of the simulation.
+        """
+        features = bound(features, self.duration)
         return _Rollout(self, features).trace(floating(self.initial(features, key), "initial"))
 
 

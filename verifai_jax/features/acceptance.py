@@ -1,0 +1,50 @@
+"""How much of a space its constraint accepts, and what is wrong with one that accepts nothing."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+SAMPLES = 65_536
+BLOCK = 4096
+ENOUGH = 1000
+"""Accepted samples after which the rate is known well enough."""
+
+
+def acceptance_rate(space: Any, seed: int = 0) -> float:
+    """The share of the prior's samples that `space.where` accepts.
+
+    **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
+    accepts none of the samples.
+    """
+    point = jax.ShapeDtypeStruct((space.dim,), jnp.float32)
+    try:
+        answer = jax.eval_shape(lambda u: space.accepts(space.unflatten(u)), point)
+    except jax.errors.ConcretizationTypeError as error:
+        raise ValueError(
+            "where is traced by JAX, so it cannot use `and`, `or`, `not` or `if` on features: use "
+            f"&, |, ~ and jnp.where ({type(error).__name__})"
+        ) from error
+    except Exception as error:
+        raise ValueError(
+            f"where raised {type(error).__name__} for the features {list(space.domains)}: {error}"
+        ) from error
+    if answer.shape != () or answer.dtype != jnp.bool_:
+        raise ValueError(
+            f"where must return one truth value; got shape {list(answer.shape)} of {answer.dtype}"
+        )
+    accepts = jax.jit(jax.vmap(lambda u: space.accepts(space.unflatten(u))))
+    accepted = tried = 0
+    random = np.random.default_rng(seed)
+    while tried < SAMPLES and accepted < ENOUGH:
+        accepted += int(np.sum(accepts(random.random((BLOCK, space.dim), np.float32))))
+        tried += BLOCK
+    if not accepted:
+        most = -np.log(0.05) / tried
+        raise ValueError(
+            f"where accepted none of {tried} samples of the space, so fewer than {100 * most:.2g} "
+            "% of it are allowed (95 % confidence): make the domains narrower, or check the "
+            "condition"
+        )
+    return accepted / tried

@@ -1,0 +1,296 @@
+"""Several features of one kind: a fixed number of them, or one that varies (`Array`)."""
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.features.domain import Domain, as_numbers, cell, centre, dotted, indexed
+from verifai_jax.waveform import Waveform
+
+
+@dataclass(frozen=True, repr=False)
+class Array(Domain):
+    """`length` independent values of one domain: `Array(Box(0, 1), length=3)`.
+
+    A value is stacked along a leading axis: an array `[length]` of a `Box`, a dictionary of such
+    arrays of a `Struct`. With `length=(1, 3)` the number varies too, see `VariableArray`.
+
+    **Raises:** `ValueError` for a length that is not a positive integer; `TypeError` for something
+    that is no domain.
+    """
+
+    domain: Domain
+    length: int
+
+    def __new__(cls, domain: Domain, length: Any) -> Any:
+        if isinstance(length, tuple | list):
+            return VariableArray(domain, *_ends(domain, length))
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        _check_domain(self.domain)
+        length = self.length
+        if isinstance(length, bool) or not isinstance(length, int | np.integer) or length < 1:
+            raise ValueError(f"the length of an Array must be a positive integer; got {length!r}")
+        object.__setattr__(self, "length", int(length))
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        return self.domain.levels * self.length
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        return self.domain.weights * self.length
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        return self.domain.ordered * self.length
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        return _repeated(self.domain, self.length)
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            label for item in indexed(name, self.length) for label in self.domain.coordinates(item)
+        )
+
+    def from_unit(self, u: Float[jax.Array, " size"]) -> Any:
+        return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
+
+    def to_unit(self, value: Any) -> Float[jax.Array, " size"]:
+        return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
+
+    def coerce(self, value: Any) -> Any:
+        return self.domain.coerce(value)
+
+    def check(self, value: Any, name: str) -> None:
+        for i in range(self.length):
+            self.domain.check(_element(value, i, self.length, name), f"{name}[{i}]")
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return tuple(
+            column for item in indexed(name, self.length) for column in self.domain.columns(item)
+        )
+
+    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+        columns: dict[str, np.ndarray] = {}
+        for i, item in enumerate(indexed(name, self.length)):
+            element = jax.tree.map(operator.itemgetter((slice(None), i)), values)
+            columns |= self.domain.to_columns(element, item)
+        return columns
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+        items = [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+
+    def __repr__(self) -> str:
+        return f"Array({self.domain!r}, length={self.length})"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Items:
+    """The value of an array of variable length: all places, of which the first `length` count.
+
+    `values` is stacked along a leading axis as in an `Array` of the greatest length, so that every
+    simulation has the same shapes. `features["cars"]["x"]` are the `x` of all places; multiply by
+    `mask`, or use `jnp.where`. Places behind the length hold the middle of the item's domain.
+    """
+
+    values: Any
+    length: Int[jax.Array, "*n"]
+
+    @property
+    def mask(self) -> Bool[jax.Array, "*n places"]:
+        """Which places count."""
+        places = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
+        return jnp.arange(places) < jnp.asarray(self.length)[..., None]
+
+    def __getitem__(self, name: Any) -> Any:
+        return self.values[name]
+
+
+@dataclass(frozen=True, repr=False)
+class VariableArray(Domain):
+    """From `least` to `most` values of one domain: `Array(domain, length=(1, 3))`.
+
+    A value is an `Items`; a person may write a list of as many items as there are. The first
+    coordinate is the length, each equally likely (none if `least == most`). In a table the column
+    `cars.length` says how many; the entries of absent items are empty (NaN or None).
+    """
+
+    domain: Domain
+    least: int
+    most: int
+
+    @property
+    def _varies(self) -> bool:
+        return self.most > self.least
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:
+        length = (self.most - self.least + 1,) if self._varies else ()
+        return length + self.domain.levels * self.most
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
+        return (None,) * self._varies + self.domain.weights * self.most
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        return (True,) * self._varies + self.domain.ordered * self.most
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        inner = _repeated(self.domain, self.most)
+        return (0,) * self._varies + tuple(self._varies + i for i in inner)
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        items = indexed(name, self.most)
+        labels = tuple(label for item in items for label in self.domain.coordinates(item))
+        return (f"{name}.length",) * self._varies + labels
+
+    def from_unit(self, u: Float[jax.Array, " size"]) -> Items:
+        length = self.least + (cell(u[0], self.levels[0]) if self._varies else jnp.int32(0))
+        units = u[int(self._varies) :].reshape(self.most, self.domain.size)
+        present = jnp.arange(self.most) < length
+        units = jnp.where(present[:, None], units, 0.5)
+        return Items(jax.vmap(self.domain.from_unit)(units), length)
+
+    def to_unit(self, value: Items) -> Float[jax.Array, " size"]:
+        units = jax.vmap(self.domain.to_unit, axis_size=self.most)(value.values)
+        present = jnp.arange(self.most) < value.length
+        units = jnp.ravel(jnp.where(present[:, None], units, self._absent_unit))
+        if not self._varies:
+            return units
+        return jnp.concatenate([centre(value.length - self.least, self.levels[0]), units])
+
+    def coerce(self, value: Any) -> Items:
+        if isinstance(value, Items):
+            length = jnp.asarray(value.length, jnp.int32)
+            return Items(self.domain.coerce(value.values), length)
+        items = [self.domain.coerce(item) for item in _listed(value, "the array")]
+        length = jnp.asarray(len(items), jnp.int32)
+        items += [self._absent] * (self.most - len(items))
+        return Items(jax.tree.map(lambda *leaves: jnp.stack(leaves), *items), length)
+
+    def check(self, value: Any, name: str) -> None:
+        if isinstance(value, Items):
+            length = int(value.length)
+            items = [
+                jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], value.values)
+                for i in range(min(length, self.most))
+            ]
+        else:
+            items = _listed(value, name)
+            length = len(items)
+        if not self.least <= length <= self.most:
+            raise ValueError(f"{name} must have {self.least} to {self.most} items; got {length}")
+        for i, item in enumerate(items):
+            self.domain.check(item, f"{name}[{i}]")
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        items = indexed(name, self.most)
+        columns = tuple(column for item in items for column in self.domain.columns(item))
+        return (f"{name}.length",) * self._varies + columns
+
+    def to_columns(self, values: Items, name: str) -> dict[str, np.ndarray]:
+        length = np.asarray(values.length)
+        columns: dict[str, np.ndarray] = {f"{name}.length": length} if self._varies else {}
+        for i, item in enumerate(indexed(name, self.most)):
+            element = jax.tree.map(operator.itemgetter((slice(None), i)), values.values)
+            for column, entries in self.domain.to_columns(element, item).items():
+                columns[column] = entries if i < self.least else _emptied(entries, length <= i)
+        return columns
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Items:
+        length = self.least
+        if self._varies:
+            number = as_numbers(row[f"{name}.length"], f"{name}.length").item()
+            if number not in range(self.least, self.most + 1):
+                raise ValueError(
+                    f"{name}.length must be an integer from {self.least} to {self.most}; "
+                    f"got {number!r}"
+                )
+            length = int(number)
+        items = [
+            self.domain.from_columns(row, item) if i < length else self._absent
+            for i, item in enumerate(indexed(name, self.most))
+        ]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+        return Items(stacked, jnp.asarray(length, jnp.int32))
+
+    @property
+    def _absent(self) -> Any:
+        """What a place behind the length holds."""
+        return self.domain.from_unit(jnp.full(self.domain.size, 0.5))
+
+    @property
+    def _absent_unit(self) -> Float[jax.Array, " size"]:
+        return self.domain.to_unit(self._absent)
+
+    def __repr__(self) -> str:
+        return f"Array({self.domain!r}, length=({self.least}, {self.most}))"
+
+
+def _check_domain(domain: Any) -> None:
+    if not isinstance(domain, Domain):
+        raise TypeError(f"an Array needs a domain, such as Box(0, 1); got {domain!r}")
+
+
+def _ends(domain: Any, length: Any) -> tuple[int, int]:
+    _check_domain(domain)
+    whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in length)
+    if len(length) != 2 or not whole:
+        raise ValueError(f"a variable length is a pair of integers, (least, most); got {length!r}")
+    least, most = int(length[0]), int(length[1])
+    if not (0 <= least <= most and most >= 1):
+        raise ValueError(
+            f"a variable length needs 0 <= least <= most and most >= 1; got {length!r}"
+        )
+    return least, most
+
+
+def _repeated(domain: Domain, count: int) -> tuple[int, ...]:
+    return tuple(i * domain.size + place for i in range(count) for place in domain.lengths)
+
+
+def _emptied(entries: np.ndarray, absent: np.ndarray) -> np.ndarray:
+    """Entries of which some are absent, of one dtype whether or not there are such."""
+    if entries.dtype.kind in "iub":
+        entries = entries.astype(np.float64)
+    return np.where(absent, np.nan if entries.dtype.kind == "f" else None, entries).astype(
+        entries.dtype
+    )
+
+
+def _listed(value: Any, name: str) -> list[Any]:
+    """The items that a person wrote: one by one, or stacked as in an `Array`."""
+    if isinstance(value, Mapping):
+        leaves = list(value.values())
+        count = len(leaves[0]) if leaves and isinstance(leaves[0], Sequence | np.ndarray) else -1
+        return [_element(value, i, count, name) for i in range(count)]
+    if isinstance(value, str) or np.ndim(np.asarray(value, dtype=object)) == 0:
+        raise ValueError(f"{name} must be a list of items; got {value!r}")
+    return list(value)
+
+
+def _element(value: Any, i: int, length: int, name: str) -> Any:
+    """Element `i` of a stacked value."""
+    if isinstance(value, Mapping):
+        return {
+            field: _element(leaf, i, length, dotted(name, field)) for field, leaf in value.items()
+        }
+    if isinstance(value, Items | Waveform):
+        return jax.tree.map(operator.itemgetter(i), value)
+    if np.ndim(np.asarray(value, dtype=object)) == 0 or len(value) != length:
+        raise ValueError(f"{name} must have {length} entries; got {value!r}")
+    return value[i]

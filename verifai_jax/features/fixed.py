@@ -1,0 +1,76 @@
+"""A feature held at one value: what a view of a space makes of those that it does not vary."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.features.domain import Domain, as_scalar
+
+
+@dataclass(frozen=True, init=False, repr=False)
+class Fixed(Domain):
+    """A domain at one of its values: it keeps its table columns and has no coordinates.
+
+    **Arguments:** `domain`, and `value` in it, as a person writes it; `name` of the feature, for
+    messages.
+
+    **Raises:** `ValueError` for a value outside the domain.
+    """
+
+    domain: Domain
+    row: tuple[tuple[str, Any], ...]  # The value as a row of a table, which can be compared.
+
+    def __init__(self, domain: Domain, value: Any, name: str = "value") -> None:
+        domain.check(value, name)
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], domain.coerce(value))
+        columns = domain.to_columns(batch, "")
+        row = tuple((column, as_scalar(entries[0])) for column, entries in columns.items())
+        object.__setattr__(self, "domain", domain)
+        object.__setattr__(self, "row", row)
+
+    @property
+    def value(self) -> Any:
+        """What a system sees."""
+        return self.domain.from_columns(dict(self.row), "")
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        return ()
+
+    def coordinates(self, name: str) -> tuple[str, ...]:
+        return ()
+
+    def from_unit(self, u: Float[Array, "0"]) -> Any:
+        def cast(leaf: Any) -> Any:
+            real = jnp.issubdtype(leaf.dtype, jnp.floating)
+            return leaf.astype(u.dtype) if real else leaf
+
+        return jax.tree.map(cast, self.value)
+
+    def to_unit(self, value: Any) -> Float[Array, "0"]:
+        return jnp.zeros(0, jnp.result_type(float))
+
+    def coerce(self, value: Any) -> Any:
+        return self.domain.coerce(value)
+
+    def check(self, value: Any, name: str) -> None:
+        self.domain.check(value, name)
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        return self.domain.columns(name)
+
+    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+        return self.domain.to_columns(values, name)
+
+    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+        return self.domain.from_columns(row, name)
+
+    def __repr__(self) -> str:
+        values = [value for _, value in self.row]
+        shown = [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values[:6]]
+        return f"{', '.join(shown)}{', ...' * (len(values) > 6)}, fixed in {self.domain!r}"

@@ -1,0 +1,114 @@
+"""Domains as plain data, for JSON: `to_plain(domain)` and back.
+
+Data holds a `kind`, one of the names below, and the arguments of that domain. Code, that is the
+functions of a `Distribution`, is not data: it has to be given again by name.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from verifai_jax.errors import unknown_name
+from verifai_jax.features.arrays import Array, VariableArray
+from verifai_jax.features.box import Box, DiscreteBox
+from verifai_jax.features.choice import Categorical, Constant
+from verifai_jax.features.compound import Struct
+from verifai_jax.features.distributions import Distribution, LogUniform, Normal, TruncatedNormal
+from verifai_jax.features.domain import Domain
+from verifai_jax.features.fixed import Fixed
+from verifai_jax.features.signal import Signal
+
+FIELDS: dict[type[Domain], tuple[str, ...]] = {
+    Box: ("low", "high"),
+    DiscreteBox: ("low", "high"),
+    Normal: ("mean", "std"),
+    TruncatedNormal: ("mean", "std", "low", "high"),
+    LogUniform: ("low", "high"),
+    Constant: ("value",),
+    Signal: ("domain", "knots", "hold", "duration"),
+    Array: ("domain", "length"),
+}
+KINDS: dict[str, Any] = {kind.__name__: kind for kind in FIELDS}
+
+
+def to_plain(domain: Domain) -> dict[str, Any]:
+    """A domain as dictionaries, lists, texts and numbers.
+
+    **Raises:** `ValueError` for a domain of the user's own, or choices that are no plain data.
+    """
+    match domain:
+        case Struct():
+            fields = [[name, to_plain(field)] for name, field in domain.fields]
+            return {"kind": "Struct", "fields": fields}
+        case VariableArray():
+            length = [domain.least, domain.most]
+            return {"kind": "Array", "domain": to_plain(domain.domain), "length": length}
+        case Categorical():
+            for choice in domain.choices:
+                if not isinstance(choice, bool | int | float | str):
+                    raise ValueError(f"the choice {choice!r} is no plain data")
+            weights = None if domain.probabilities is None else list(domain.probabilities)
+            return {"kind": "Categorical", "choices": list(domain.choices), "weights": weights}
+        case Fixed():
+            row = [list(entry) for entry in domain.row]
+            return {"kind": "Fixed", "domain": to_plain(domain.domain), "row": row}
+        case Distribution():
+            return {"kind": "Distribution", "name": domain.name}
+    if type(domain) not in FIELDS:
+        raise ValueError(f"{domain!r} is a domain of your own, which JSON cannot describe")
+    data: dict[str, Any] = {"kind": type(domain).__name__}
+    for name in FIELDS[type(domain)]:
+        value = getattr(domain, name)
+        data[name] = to_plain(value) if isinstance(value, Domain) else _lists(value)
+    return data
+
+
+def from_plain(
+    data: Mapping[str, Any], distributions: Mapping[str, Distribution] | None = None
+) -> Domain:
+    """The domain that `to_plain` described.
+
+    - `distributions`: those with functions, by name.
+
+    **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts,
+    or what the domain itself refuses.
+    """
+    given = distributions or {}
+    try:
+        return _built(data, given)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"this describes no domain ({error}): {data!r}") from error
+
+
+def _built(data: Mapping[str, Any], given: Mapping[str, Distribution]) -> Domain:
+    kind = data["kind"]
+    match kind:
+        case "Struct":
+            return Struct({name: from_plain(field, given) for name, field in data["fields"]})
+        case "Array":
+            length: Any = data["length"]
+            length = tuple(length) if isinstance(length, list) else length
+            return Array(from_plain(data["domain"], given), length)
+        case "Categorical":
+            return Categorical(*data["choices"], weights=data["weights"])
+        case "Fixed":
+            domain = from_plain(data["domain"], given)
+            return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
+        case "Distribution":
+            if data["name"] not in given:
+                raise ValueError(
+                    f"the functions of Distribution {data['name']!r} are code, which JSON does "
+                    "not hold; give it: from_json(data, distributions={...})"
+                )
+            return given[data["name"]]
+    if kind not in KINDS:
+        others = ("Struct", "Categorical", "Fixed", "Distribution")
+        raise unknown_name("kind of domain", kind, (*KINDS, *others))
+    arguments = {
+        name: from_plain(data[name], given) if name == "domain" else data[name]
+        for name in FIELDS[KINDS[kind]]
+    }
+    return KINDS[kind](**arguments)
+
+
+def _lists(value: Any) -> Any:
+    return [_lists(entry) for entry in value] if isinstance(value, tuple) else value
