@@ -39,10 +39,7 @@ class Domain(abc.ABC):
     @property
     @abc.abstractmethod
     def levels(self) -> tuple[int, ...]:
-        """For each unit coordinate: 0 if continuous, or the number of its cells.
-
-        Cells are equally wide unless `weights` says otherwise.
-        """
+        """For each unit coordinate: 0 if continuous, or the number of its equally wide cells."""
 
     @abc.abstractmethod
     def from_unit(self, u: Float[Array, " size"]) -> Any:

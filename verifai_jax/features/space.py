@@ -61,7 +61,7 @@ class FeatureSpace:
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        """For each coordinate: 0 if continuous, or the number of its cells."""
+        """For each coordinate: 0 if continuous, or the number of its equally wide cells."""
         return self.root.levels
 
     @cached_property
@@ -83,26 +83,6 @@ class FeatureSpace:
     def coordinates(self) -> tuple[str, ...]:
         """What each coordinate is called, such as `x0`, `cars.length`, `cars[0].x`."""
         return self.root.coordinates("")
-
-    @property
-    def ordered(self) -> tuple[bool, ...]:
-        """For each coordinate: whether neighbouring points or cells mean similar values."""
-        return self.root.ordered
-
-    @property
-    def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """For each coordinate: the probabilities of its cells; None where they are equal."""
-        return self.root.weights
-
-    @cached_property
-    def coordinates(self) -> tuple[str, ...]:
-        """What each coordinate is called, such as `x0`, `cars.length`, `cars[0].x`."""
-        return self.root.coordinates("")
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Indices of the coordinates that are lengths of arrays, on which others depend."""
-        return self.root.lengths
 
     @property
     def dim(self) -> int:
