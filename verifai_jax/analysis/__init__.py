@@ -11,6 +11,8 @@ from verifai_jax.analysis.neighbours import Neighbours as Neighbours
 from verifai_jax.analysis.neighbours import k_closest as k_closest
 from verifai_jax.analysis.neighbours import nearest as nearest
 from verifai_jax.analysis.neighbours import random_rows as random_rows
+from verifai_jax.analysis.overview import Analysis as Analysis
+from verifai_jax.analysis.overview import analyze as analyze
 from verifai_jax.analysis.pca import Components as Components
 from verifai_jax.analysis.pca import pca as pca
 from verifai_jax.analysis.recurrent import Recurrent as Recurrent

@@ -1,7 +1,8 @@
 """Feature columns as coordinates in `[0, 1]` in which the prior is uniform, one by one.
 
-Where the feature space is known, each column gets its own distribution function, from the columns
-of 4096 points of a Sobol sequence: any domain will do. Otherwise it is uniform over its range.
+Intervals and choices are uniform over their range, as is every column where no space is known. In
+a space with other domains each column gets its own distribution function, from the columns of 4096
+points of a Sobol sequence: any domain will do.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from jaxtyping import Float, Int
 
 from verifai_jax.analysis.columns import Column
 from verifai_jax.analysis.samples import Samples
+from verifai_jax.features import Array, Box, Categorical, Constant, DiscreteBox, Struct
+from verifai_jax.features.domain import Domain
 
 POINTS = 12  # As a power of two.
 
@@ -90,7 +93,7 @@ def marginals(samples: Samples) -> tuple[Marginal, ...]:
 
 
 def _prior(samples: Samples) -> dict[str, Any]:
-    if samples.space is None or not samples.space.dim:
+    if samples.space is None or _uniform(samples.space.root):
         return {}
     import jax
     import jax.numpy as jnp
@@ -98,8 +101,20 @@ def _prior(samples: Samples) -> dict[str, Any]:
     from scipy.stats import qmc
 
     u = qmc.Sobol(samples.space.dim, rng=0).random_base2(POINTS)
-    features = jax.vmap(samples.space.unflatten)(jnp.asarray(u, jnp.float32))
+    # One program: step by step, each of the columns would compile its own.
+    features = jax.jit(jax.vmap(samples.space.unflatten))(jnp.asarray(u, jnp.float32))
     return {name: pd.Series(v) for name, v in samples.space.rows(features).items()}
+
+
+def _uniform(domain: Domain) -> bool:
+    """Whether the values are known to be equally likely over their range."""
+    if isinstance(domain, Struct):
+        return all(_uniform(part) for _, part in domain.fields)
+    if isinstance(domain, Array):
+        return _uniform(domain.domain)
+    if isinstance(domain, Categorical):
+        return all(weights is None for weights in domain.weights)
+    return isinstance(domain, Box | DiscreteBox | Constant)
 
 
 def _marginal(column: Column, prior: Any) -> Marginal:

@@ -1,0 +1,257 @@
+"""All analyses of a run that apply to it, in a few words each.
+
+found = analyze(run)
+print(found)
+found["rules"]                      the result of one of them; None where it was skipped
+found.plot("overview.png")
+found.save("report")                report.md and a picture of each
+"""
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.analysis.clusters import clusters
+from verifai_jax.analysis.coverage import coverage
+from verifai_jax.analysis.importance import importance
+from verifai_jax.analysis.pca import pca
+from verifai_jax.analysis.recurrent import recurrent
+from verifai_jax.analysis.rules import rules
+from verifai_jax.analysis.samples import Samples
+from verifai_jax.errors import unknown_name
+from verifai_jax.run import Run, told
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.table import ErrorTable
+
+FEWEST = 4
+MOST_TO_CLUSTER = 2000
+MOST_NAMED = 6
+MOST_REPRESENTATIVES = 6
+TITLES = {
+    "failures": "Failures",
+    "rules": "Where it fails",
+    "importance": "What it depends on",
+    "clusters": "Kinds of failures",
+    "pca": "Directions in which failures vary",
+    "recurrent": "Recurrent values of failures",
+    "coverage": "Coverage of the space",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """An analysis: `name`, `words` of it, `result`; None where it was skipped."""
+
+    name: str
+    words: str
+    result: Any = None
+
+    @property
+    def title(self) -> str:
+        """Heading of the part in a report."""
+        return TITLES[self.name]
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """What the error table of a run says.
+
+    **Fields:** `name` of the run; `parts` in the order of the report; `samples`: the rows with a
+    verdict, None if there are none.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    samples: Samples | None
+
+    def __getitem__(self, name: str) -> Any:
+        """The result of an analysis by name; None where it was skipped.
+
+        **Raises:** `UnknownNameError` for a name that is not one of the parts'.
+        """
+        for part in self.parts:
+            if part.name == name:
+                return part.result
+        raise unknown_name("analysis", name, [part.name for part in self.parts])
+
+    @property
+    def representatives(self) -> list[int]:
+        """Row numbers of failures that stand for a cluster each, the largest cluster first."""
+        found = self["clusters"] if self.samples is not None else None
+        if found is None:
+            return []
+        column = "representative_" if "representative_" in found.table else "representative"
+        return [int(row) for row in found.table[column][found.table.index >= 0]]
+
+    @property
+    def table(self) -> "pd.DataFrame":
+        """One row a feature: importance, range over the failures, cells covered."""
+        return _features(self)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the failures over the two most important features; returns the figure.
+
+        With the boxes of the rules, the representatives of clusters, and the importances as bars.
+        """
+        from verifai_jax.analysis.overview_plot import plot_overview
+
+        return plot_overview(self, path)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write `report.md` and pictures to a folder; returns the report.
+
+        **Raises:** `FileExistsError` where the folder's name is that of a file.
+        """
+        place = Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        lines = [f"# {self.name}", ""]
+        if self.samples is not None:
+            self.plot(place / "overview.png")
+            lines += ["![overview](overview.png)", ""]
+        for part in self.parts:
+            lines += [f"## {part.title}", "", "```text", part.words, "```", ""]
+            if hasattr(part.result, "plot"):
+                part.result.plot(place / f"{part.name}.png")
+                lines += [f"![{part.title.lower()}]({part.name}.png)", ""]
+        report = place / "report.md"
+        report.write_text("\n".join(lines))
+        return report
+
+    def __str__(self) -> str:
+        lines = [self.name]
+        for part in self.parts:
+            lines += ["", part.title, *(f"  {line}" for line in part.words.splitlines())]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        parts = [f"<h3>{html.escape(self.name)}</h3>"]
+        for part in self.parts:
+            words = html.escape(part.words).replace("\n", "<br>")
+            parts.append(f"<h4>{html.escape(part.title)}</h4><p>{words}</p>")
+            table = getattr(part.result, "table", None)
+            if table is not None and len(table):
+                parts.append(table.head(10).to_html(float_format=lambda x: f"{x:.3g}"))
+        return "\n".join(parts)
+
+
+def analyze(source: "Run | ErrorTable | pd.DataFrame", *, seed: int = 0) -> Analysis:
+    """Apply every analysis of the error table that fits it, and say why others do not.
+
+    - `source`: a run, its table, or a DataFrame with feature columns.
+
+    Failures, rules, importance of features, clusters, principal components, recurrent values,
+    coverage; nothing is simulated. More than 2000 failures are thinned out, by `seed`, before they
+    are clustered.
+
+    **Raises:** `TypeError` for another source.
+    """
+    name = source.name if isinstance(source, Run) else "table"
+    try:
+        samples = Samples.of(source, "all")
+    except ValueError as error:
+        words = f"nothing to analyse: {error}"
+        return Analysis(name, (Part("failures", words),), None)
+    failures = int(samples.failing.sum())
+    parts = [Part("failures", _failures(source, samples))]
+    for analysis, reason, found in (
+        ("rules", _too_few(failures), lambda: rules(source, seed=seed)),
+        ("importance", "", lambda: importance(source, seed=seed)),
+        ("clusters", _too_few(failures), lambda: clusters(_thinned(samples, seed), seed=seed)),
+        ("pca", _too_few(failures), lambda: pca(_failing(samples))),
+        ("recurrent", _no_choices(samples), lambda: recurrent(_failing(samples))),
+        ("coverage", "", lambda: coverage(source, seed=seed)),
+    ):
+        parts.append(_part(analysis, reason, found))
+    return Analysis(name, tuple(parts), samples)
+
+
+def _part(name: str, reason: str, found: Callable[[], Any]) -> Part:
+    if reason:
+        return Part(name, f"skipped: {reason}")
+    try:
+        result = found()
+    except ValueError as error:
+        # Every analysis says what it lacks; here that is a line of the report.
+        return Part(name, f"skipped: {error}")
+    return Part(name, str(result), result)
+
+
+def _failures(source: Any, samples: Samples) -> str:
+    rows, failures = len(samples.table), int(samples.failing.sum())
+    lines = [f"{failures:,} of {rows:,} simulations violate the property"]
+    if len(samples) < rows:
+        lines[0] += f"; {rows - len(samples):,} have no verdict"
+    if isinstance(source, Run):
+        rate = source.failure_rate
+        lines.append(
+            f"failure rate {rate}"
+            if rate is not None
+            else f"failure rate not given: {source.search} stopped by {source.stopped}"
+            if source.prior
+            else "failure rate not given: this search goes where failures are"
+        )
+    if np.isfinite(samples.rho).any():
+        place = samples.worst
+        row = samples.frame.iloc[place]
+        where = told({name: row[name] for name in samples.names[:MOST_NAMED]})
+        more = ", ..." if len(samples.names) > MOST_NAMED else ""
+        lines.append(
+            f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
+            f"robustness {samples.rho[place]:.4g} at {where}{more}"
+        )
+    return "\n".join(lines)
+
+
+def _failing(samples: Samples) -> Samples:
+    return samples.others("counterexamples")
+
+
+def _thinned(samples: Samples, seed: int) -> Samples:
+    from dataclasses import replace
+
+    failing = _failing(samples)
+    if len(failing) <= MOST_TO_CLUSTER:
+        return failing
+    generator = np.random.default_rng(seed)
+    kept = np.sort(generator.choice(len(failing), MOST_TO_CLUSTER, replace=False))
+    return replace(failing, frame=failing.frame.iloc[kept])
+
+
+def _too_few(failures: int) -> str:
+    if not failures:
+        return "no row fails"
+    if failures >= FEWEST:
+        return ""
+    return f"only {failures} rows fail" if failures > 1 else "only one row fails"
+
+
+def _no_choices(samples: Samples) -> str:
+    if not samples.unordered:
+        return "no feature is a choice without an order"
+    return "" if samples.failing.any() else "no row fails"
+
+
+def _features(found: Analysis) -> "pd.DataFrame":
+    import pandas as pd
+
+    names = [] if found.samples is None else list(found.samples.names)
+    table = pd.DataFrame(index=pd.Index(names, name="feature"))
+    if (weighed := found["importance"] if names else None) is not None:
+        for column in weighed.scores:
+            table[column] = weighed.table[column]
+        table = table.loc[weighed.ranked]
+    if found.samples is not None and found.samples.failing.any():
+        failing = found.samples.frame.loc[found.samples.failing]
+        for column in found.samples.ordered:
+            table.loc[column.name, "least_failing"] = failing[column.name].min()
+            table.loc[column.name, "most_failing"] = failing[column.name].max()
+    if names and (covered := found["coverage"]) is not None:
+        table["occupied"] = covered.table["occupied"]
+    return table
