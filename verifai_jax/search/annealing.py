@@ -1,0 +1,262 @@
+"""Simulated annealing as parallel tempering: chains from cold to hot that exchange their points.
+
+Each chain is a Metropolis walk over the cube that has, at temperature T, the density
+exp(-max(rho, 0) / T) (Kirkpatrick, Gelatt, Vecchi, Optimization by simulated annealing, Science
+220, 1983). Pairs of chains exchange their points with the probability that leaves these densities
+as they are (replica exchange: Swendsen, Wang, 1986; Geyer, Markov chain Monte Carlo maximum
+likelihood, 1991), so that what the hot ones find sinks to the cold ones, while a schedule that
+cools down once could only be followed to its end. The hottest chains draw from the prior.
+
+Proposals are symmetric: Gaussian steps, some in all and some in a few coordinates, with a scale
+that follows the acceptance rate of each temperature and a random factor, and steps along the
+difference of two other chains (differential evolution Markov chain: ter Braak, 2006), which know
+the scale and direction of valleys. All failures have the same energy: cold chains wander about the
+failure regions instead of resting at their deepest points.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Float, Int, Key, UInt32
+
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
+
+# More ordered cells than this are stepped over as if continuous.
+MOST_CELLS = 8
+RESAMPLED, NEIGHBOURING = 0.15, 0.2  # shares of the proposals for the cell of a coordinate
+ALONG_OTHERS = 0.7  # share of proposals along differences of other chains
+ACCEPTED = 0.3  # acceptance rate that the scales of the steps aim at
+ADAPTATION = 0.3  # of the logarithm of the scale, by one acceptance
+COPIES = 4  # chains that begin at one point
+LEAST_SCALE, LARGEST_SCALE = 0.01, 0.5
+
+
+class AnnealingState(NamedTuple):
+    key: Key[Array, ""]
+    asks: UInt32[Array, ""]
+    tells: UInt32[Array, ""]
+    u: Float[Array, "chains d"]  # coldest first
+    energy: Float[Array, " chains"]  # infinite where a chain has yet to start
+    rests: Int[Array, " chains"]  # how long a chain has been at its point
+    step: Float[Array, " chains"]  # scale of the steps at this temperature
+    spread: Float[Array, ""]  # of the energy over the prior; 0 until it is known
+
+
+@dataclass(frozen=True)
+class Annealing(Search):
+    """Parallel tempering; each row of the batch is a chain at a temperature of its own.
+
+    **Arguments:**
+
+    - `chains`: least number of chains; more than the batch has rows take turns.
+    - `hottest`, `coldest`: temperatures, geometric in between, in units of the robustness' spread
+      (from the best to the median) where the chains start.
+    - `exploration`: share of chains that draw from the prior, for ever; at least one.
+    - `patience`: proposals in a row that a chain may refuse before it starts again elsewhere.
+
+    **Raises:** `ValueError` for values out of range, `coldest` above `hottest` included.
+    """
+
+    chains: int = 8
+    hottest: float = 0.3
+    coldest: float = 0.01
+    exploration: float = 0.1
+    patience: int = 12
+
+    def __post_init__(self) -> None:
+        check_count("chains", self.chains, 2)
+        check_positive("hottest", self.hottest)
+        check_positive("coldest", self.coldest)
+        if self.coldest > self.hottest:
+            raise ValueError(
+                "coldest must not be above hottest; got "
+                f"coldest={self.coldest!r}, hottest={self.hottest!r}"
+            )
+        check_fraction("exploration", self.exploration)
+        check_count("patience", self.patience)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> AnnealingState:
+        chains = max(self.chains, batch)
+        return AnnealingState(
+            key=key,
+            asks=jnp.uint32(0),
+            tells=jnp.uint32(0),
+            u=jnp.full((chains, cube.dim), 0.5, jnp.float32),
+            energy=jnp.full(chains, jnp.inf, jnp.float32),
+            rests=jnp.zeros(chains, jnp.int32),
+            step=jnp.full(chains, 0.3, jnp.float32),
+            spread=jnp.float32(0),
+        )
+
+    def ask(
+        self, state: AnnealingState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], AnnealingState]:
+        key = jax.random.fold_in(state.key, state.asks)
+        d, k, chains = cube.dim, len(cube.discrete), len(state.energy)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        random = jax.random.uniform(key, (batch, 6 + 3 * d + 2 * k), jnp.float32)
+        row, prior, noise, move, cell, way = jnp.split(
+            random, 6 + np.array([0, d, 2 * d, 3 * d, 3 * d + k]), axis=1
+        )
+        turn = self._turn(state, batch)
+        own = state.u[turn]
+        # One coordinate moves for certain, others all together or a few at a time.
+        certain = jnp.arange(d) == (row[:, :1] * d).astype(jnp.int32)
+        moved = certain | (move < jnp.where(row[:, 1:2] < 0.5, 1.0, max(0.3, 1 / max(d, 1))))
+        scale = state.step[turn][:, None] * 1.5 * 0.03 ** row[:, 2:3]
+        step = scale * ndtri(jnp.maximum(noise, np.float32(2**-25)))
+        one, other = (row[:, 3:5] * chains).astype(jnp.int32).T
+        along = (0.3 + 0.7 * row[:, 2:3]) * (state.u[one] - state.u[other]) + 0.1 * step
+        step = jnp.where(moved, jnp.where(row[:, 5:] < ALONG_OTHERS, along, step), 0.0)
+
+        few = np.array([i for i in cube.discrete if not self._smooth(cube, i)], np.int32)
+        place = np.flatnonzero(np.isin(cube.discrete, few))
+        # Of a cell, the neighbour or any; of a choice, any.
+        width = np.array([cube.ordered[i] / cube.levels[i] for i in few], np.float32)
+        either = np.where(width > 0, RESAMPLED + NEIGHBOURING, RESAMPLED)
+        drawn = cell[:, place] * jnp.where(certain[:, few], either, 1.0)
+        sideways = jnp.where(way[:, place] < 0.5, width, -width)
+        step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
+        u = _reflected(own + step)
+        u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))
+
+        anywhere = jnp.isinf(state.energy[turn]) | (self._coldness(chains) == 0)[turn]
+        return jnp.where(anywhere[:, None], prior, u), state._replace(asks=state.asks + 1)
+
+    def tell(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
+        batch, chains = len(evaluated.rho), len(state.energy)
+        turn = self._turn(state, batch)
+        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        before = state.energy[turn]
+        spread = self._spread(state, turn, new)
+        coldness = self._coldness(chains) / jnp.where(spread > 0, spread, 1.0)
+        sweeps = len(_matchings(chains))
+        key = jax.random.fold_in(jax.random.fold_in(state.key, state.tells), 1)
+        chance = jnp.log(jax.random.uniform(key, (batch + sweeps * chains,), jnp.float32))
+
+        rise = jnp.where(jnp.isinf(before), 0.0, coldness[turn] * (new - before))
+        accepted = usable & (jnp.isinf(before) | (coldness[turn] == 0) | (chance[:batch] < -rise))
+        rests = jnp.where(accepted, 0, state.rests[turn] + usable)
+        # The point that a chain is at is given up after long, the next one is from the prior.
+        energy = jnp.where(accepted, new, jnp.where(rests >= self.patience, jnp.inf, before))
+        rate = jnp.where(usable, ADAPTATION * (accepted - ACCEPTED), 0.0)
+        step = state.step[turn] * jnp.exp(rate)
+        state = state._replace(
+            tells=state.tells + 1,
+            u=state.u.at[turn].set(jnp.where(accepted[:, None], evaluated.u, state.u[turn])),
+            energy=state.energy.at[turn].set(energy),
+            rests=state.rests.at[turn].set(rests.astype(jnp.int32)),
+            step=state.step.at[turn].set(jnp.clip(step, LEAST_SCALE, LARGEST_SCALE)),
+            spread=spread,
+        )
+        state = self._begun(state, batch)
+        place = _exchanged(state.energy, coldness, chance[batch:].reshape(-1, chains))
+        return state._replace(
+            u=state.u[place], energy=state.energy[place], rests=state.rests[place]
+        )
+
+    def warm(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
+        """Put the chains at the best points, the best at the coldest."""
+        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        energy = jnp.concatenate([new, state.energy])
+        u = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
+        best = jnp.argsort(energy)[: len(state.energy)]
+        spread = jnp.where(state.spread == 0, _best_to_median(new), state.spread)
+        return state._replace(u=u[best], energy=energy[best], spread=spread)
+
+    def _begun(self, state: AnnealingState, batch: int) -> AnnealingState:
+        """After the first round, with all chains at the best quarter of its points."""
+        chains = len(state.energy)
+        if chains > batch:
+            return state
+        place = jnp.argsort(state.energy)[np.arange(chains) // COPIES]
+        place = jnp.where(state.tells == 1, place, jnp.arange(chains))
+        return state._replace(u=state.u[place], energy=state.energy[place])
+
+    def _turn(self, state: AnnealingState, batch: int) -> Int[Array, " batch"]:
+        """Which chains the rows of the next `tell` belong to."""
+        chains = len(state.energy)
+        if chains == batch:
+            return jnp.arange(batch, dtype=jnp.int32)
+        number = (state.tells % np.uint32(chains)) * np.uint32(batch)
+        turn = (number + jnp.arange(batch, dtype=jnp.uint32)) % np.uint32(chains)
+        return turn.astype(jnp.int32)
+
+    def _coldness(self, chains: int) -> Float[Array, " chains"]:
+        """Inverse temperatures in units of the inverse spread, zero for the prior."""
+        warm = chains - int(np.ceil(self.exploration * chains))
+        place = np.arange(chains) / max(warm - 1, 1)
+        cold = self.coldest * (self.hottest / self.coldest) ** np.minimum(place, 1)
+        return jnp.asarray(np.where(np.arange(chains) < warm, 1 / cold, 0.0), jnp.float32)
+
+    def _spread(
+        self, state: AnnealingState, turn: Int[Array, " n"], new: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        """Of the energy where the chains start; then it stays, unless it is zero."""
+        energy = state.energy
+        met = jnp.where(jnp.isinf(energy), energy.at[turn].set(new), energy)
+        first = jnp.any(jnp.isinf(energy)) & (state.tells * len(turn) < len(energy))
+        return jnp.where(first | (state.spread == 0), _best_to_median(met), state.spread)
+
+    def _smooth(self, cube: Cube, i: int) -> bool:
+        """Whether steps in this coordinate are those of a continuous one."""
+        return cube.levels[i] == 0 or (cube.ordered[i] and cube.levels[i] > MOST_CELLS)
+
+
+def _best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
+    """Of the finite entries; unlike a standard deviation it is deaf to a few large ones."""
+    known = jnp.sum(jnp.isfinite(energy))
+    ranked = jnp.sort(energy)
+    return jnp.where(known > 0, ranked[jnp.maximum(known - 1, 0) // 2] - ranked[0], 0.0)
+
+
+def _reflected(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Into the cube, back and forth between its sides."""
+    folded = jnp.abs(u - 2 * jnp.round(u / 2))
+    return jnp.clip(folded, 0.0, 1.0)
+
+
+def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
+    """Partners for exchanges: distances halve, so that a point can get anywhere in one go."""
+    place = np.arange(chains, dtype=np.int32)
+    matchings = []
+    for distance in (1 << i for i in reversed(range((chains - 1).bit_length()))):
+        for first in (0, distance):
+            left = (place - first) // distance % 2 == 0
+            partner = np.where(left, place + distance, place - distance)
+            matchings.append(np.where((partner >= 0) & (partner < chains), partner, place))
+    return np.stack(matchings)
+
+
+def _exchanged(
+    energy: Float[Array, " chains"],
+    coldness: Float[Array, " chains"],
+    chance: Float[Array, "matchings chains"],
+) -> Int[Array, " chains"]:
+    """Where each chain gets its point from; chains without a point pass theirs to the hot ones."""
+    place = jnp.arange(len(energy), dtype=jnp.int32)
+
+    def exchange(held: tuple[Array, Array], given: tuple[Array, Array]) -> tuple[Any, None]:
+        energy, source = held
+        partner, chance = given
+        gain = (coldness - coldness[partner]) * (energy - energy[partner])
+        # One chance for both, that of the colder.
+        taken = jnp.where(chance[jnp.minimum(partner, place)] < gain, partner, place)
+        return (energy[taken], source[taken]), None
+
+    start = jnp.minimum(energy, np.float32(1e30)), place
+    (_, source), _ = jax.lax.scan(exchange, start, (jnp.asarray(_matchings(len(energy))), chance))
+    return source

@@ -1,0 +1,209 @@
+"""Epsilon-greedy: mostly go to the surroundings of the best points known, now and then anywhere.
+
+The rule of bandits (Sutton, Barto, Reinforcement Learning, 2nd edition, 2018, section 2.2) with the
+best points in place of the best arm. A greedy draw starts at one of them, takes some coordinates
+from another, as evolution strategies recombine parents (Beyer, Schwefel, 2002), and adds noise
+that is as wide as they lie apart: the search narrows as they come together.
+
+Greed has to pay: the best points are given up for new ones when they stop improving, and also when
+the draws around them are not clearly better than those of the prior, of which half would be better
+than the median. So it is hardly worse than random where the robustness says nothing.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
+
+# More ordered cells than this are moved by noise, as if continuous.
+MOST_CELLS = 8
+SINGLE_STD = 0.1  # of the noise around a single best point, in unit coordinates
+REMEMBERED = 64  # draws of the prior, for the median
+RECOMBINED = 0.3  # share of greedy draws with a second parent
+RESAMPLED = 0.2  # share of choices drawn anew
+NARROWEST_NOISE = 0.4  # the factor on the noise is between this share of `reach` and `reach`
+
+
+class EpsilonGreedyState(NamedTuple):
+    key: Key[Array, ""]
+    asks: UInt32[Array, ""]
+    tells: UInt32[Array, ""]
+    best: Float[Array, "k d"]  # sorted
+    score: Float[Array, " k"]  # robustness, 0 for all failures; infinite where there is no point
+    prior: Float[Array, " remembered"]  # scores of draws from the prior, infinite at first
+    begun: Int[Array, ""]  # draws from the prior since the start, as far as they matter
+    stale: Int[Array, ""]  # points without progress
+    tried: Float[Array, ""]  # greedy draws since the start,
+    better: Float[Array, ""]  # and those better than the prior's median; half of those equal to it
+
+
+@dataclass(frozen=True)
+class EpsilonGreedy(Search):
+    """Draws around the best points so far, and a share `epsilon` from the prior.
+
+    **Arguments:**
+
+    - `epsilon`: share of points drawn from the prior, for ever.
+    - `best`: how many best points are kept, as a share of the batch; at least `least_best`.
+    - `reach`: largest standard deviation of the noise, in units of that of the best points.
+    - `least_std`: the same in unit coordinates, below which no coordinate narrows.
+    - `begin`: draws from the prior from which the best points are first taken.
+    - `patience`: rounds without progress after which it starts afresh; small ones count as parts
+      of rounds of `begin` points.
+    - `doubt`: how many standard errors above chance greedy draws must be, or it starts afresh.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    epsilon: float = 0.1
+    best: float = 0.1
+    least_best: int = 4
+    reach: float = 2.0
+    least_std: float = 0.01
+    begin: int = 16
+    patience: int = 6
+    doubt: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_fraction("epsilon", self.epsilon)
+        check_fraction("best", self.best)
+        check_count("least_best", self.least_best, 2)
+        check_positive("reach", self.reach)
+        check_fraction("least_std", self.least_std)
+        check_count("begin", self.begin)
+        check_count("patience", self.patience)
+        check_positive("doubt", self.doubt)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> EpsilonGreedyState:
+        k = max(self.least_best, int(np.ceil(self.best * batch)))
+        return EpsilonGreedyState(
+            key=key,
+            asks=jnp.uint32(0),
+            tells=jnp.uint32(0),
+            best=jnp.full((k, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(k, jnp.inf, jnp.float32),
+            prior=jnp.full(REMEMBERED, jnp.inf, jnp.float32),
+            begun=jnp.int32(0),
+            stale=jnp.int32(0),
+            tried=jnp.float32(0),
+            better=jnp.float32(0),
+        )
+
+    def ask(
+        self, state: EpsilonGreedyState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], EpsilonGreedyState]:
+        key = jax.random.fold_in(state.key, state.asks)
+        d, k = cube.dim, len(cube.discrete)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        random = jax.random.uniform(key, (batch, 5 + 4 * d + k), jnp.float32)
+        row, prior, noise, inherit, move, choice = jnp.split(
+            random, 5 + np.array([0, d, 2 * d, 3 * d, 4 * d]), axis=1
+        )
+        # Only those that are better than chance are parents; they are sorted.
+        good = (state.score < self._median(state)).astype(jnp.float32)
+        count = jnp.sum(good)
+        parents = jnp.minimum((row[:, :2] * count).astype(jnp.int32), len(good) - 1)
+        one, other = state.best[parents[:, 0]], state.best[parents[:, 1]]
+        recombined = (inherit < 0.5) & (row[:, 2:3] < RECOMBINED)
+        parent = jnp.where(recombined, other, one)
+
+        mean = good @ state.best / jnp.maximum(count, 1.0)
+        std = jnp.sqrt(good @ (state.best - mean) ** 2 / jnp.maximum(count, 1.0))
+        # A single one does not show any.
+        std = jnp.where(count >= 2, jnp.maximum(std, self.least_std), SINGLE_STD)
+        factor = self.reach * NARROWEST_NOISE ** row[:, 3:4]
+        # Half of the draws move a few coordinates only, at least one of them on average.
+        moved = move < jnp.where(row[:, 4:5] < 0.5, 1.0, max(0.3, 1 / max(d, 1)))
+        step = factor * std * ndtri(jnp.maximum(noise, np.float32(2**-25)))
+        u = jnp.clip(parent + jnp.where(moved, step, 0.0), 0.0, 1.0)
+
+        many = np.array(
+            [cube.ordered[i] and cube.levels[i] > MOST_CELLS for i in cube.discrete], bool
+        )
+        cell = jnp.where(many, cube.cells(u), cube.cells(parent))
+        cell = jnp.where((choice < RESAMPLED) & ~many, cube.cells(prior), cell)
+        u = u.at[:, cube.discrete].set(cube.centres(cell))
+        greedy = ~self._exploring(state, batch) & (count > 0)
+        return jnp.where(greedy[:, None], u, prior), state._replace(asks=state.asks + 1)
+
+    def tell(
+        self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
+    ) -> EpsilonGreedyState:
+        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        exploring = self._exploring(state, len(evaluated.rho))
+        score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+
+        # What greed gained over the prior; equally good draws count half.
+        greedy = usable & ~exploring
+        median = self._median(state)
+        gain = jnp.where(score < median, 1.0, jnp.where(score == median, 0.5, 0.0))
+        tried = state.tried + jnp.sum(greedy)
+        better = state.better + jnp.sum(jnp.where(greedy, gain, 0.0))
+        useless = better - tried / 2 < self.doubt * jnp.sqrt(tried) / 2
+        useless &= tried >= self.begin
+        # Whatever the robustness says, close to failures there are others.
+        useless &= state.score[0] > 0
+
+        state = self._learned(state, evaluated.u, score)
+        stale = jnp.where(state.begun < self.begin, 0, state.stale)
+        again = (stale >= self.patience * max(len(score), self.begin)) | useless
+        # The newest draws of the prior first.
+        drawn = jnp.concatenate([jnp.where(exploring, score, jnp.inf), state.prior])
+        newest = jnp.argsort(jnp.isinf(drawn), stable=True)[:REMEMBERED]
+        begun = jnp.minimum(state.begun + jnp.sum(usable & exploring), self.begin)
+        return state._replace(
+            tells=state.tells + 1,
+            score=jnp.where(again, jnp.inf, state.score),
+            prior=drawn[newest],
+            begun=jnp.where(again, 0, begun).astype(jnp.int32),
+            stale=jnp.where(again, 0, stale).astype(jnp.int32),
+            tried=jnp.where(again, 0.0, tried),
+            better=jnp.where(again, 0.0, better),
+        )
+
+    def warm(
+        self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
+    ) -> EpsilonGreedyState:
+        """Take the best points; what the prior gives has to be seen yet."""
+        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        return self._learned(state, evaluated.u, score)._replace(stale=state.stale)
+
+    def _learned(
+        self, state: EpsilonGreedyState, u: Float[Array, "n d"], score: Float[Array, " n"]
+    ) -> EpsilonGreedyState:
+        """The best points with these among them, and whether that was progress."""
+        points = jnp.concatenate([jnp.where(jnp.isinf(score)[:, None], 0.5, u), state.best])
+        # New points come first: of equally good ones the newest are kept.
+        scores = jnp.concatenate([score, state.score])
+        _, best = jax.lax.top_k(-scores, len(state.score))
+        level, before = scores[best[-1]], state.score[-1]
+        progress = jnp.isinf(before) | (level < 0.99 * before)
+        stale = jnp.where(progress, 0, state.stale + len(score)).astype(jnp.int32)
+        return state._replace(best=points[best], score=scores[best], stale=stale)
+
+    def _exploring(self, state: EpsilonGreedyState, batch: int) -> Bool[Array, " batch"]:
+        """Which rows of the next `tell` are from the prior: every tenth, say, or all at first."""
+        number = state.tells * batch + jnp.arange(batch, dtype=jnp.uint32)
+        # In whole numbers, that may wrap around.
+        share = np.uint32(round(self.epsilon * 2**16))
+        due = (number * share) % np.uint32(2**16) + share >= 2**16
+        return due | (state.begun < self.begin)
+
+    def _median(self, state: EpsilonGreedyState) -> Float[Array, ""]:
+        """Of the scores that the prior gives; infinite at first."""
+        known = jnp.sum(jnp.isfinite(state.prior))
+        return jnp.sort(state.prior)[jnp.maximum(known - 1, 0) // 2]
