@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import qmc
+from scipy.stats import norm, qmc
 
 import verifai_jax as vj
 from verifai_jax.analysis.coverage import coverage, pair_counts
@@ -141,3 +141,29 @@ def test_pictures(tmp_path):
         coverage(table[[*columns, "violated", "status"]]).plot(tmp_path / "it.png")
         with Image.open(tmp_path / "it.png") as image:
             assert image.size[0] > 300
+
+
+def test_distributions_are_uniform_in_their_own_coordinates():
+    space = vj.FeatureSpace(
+        {
+            "x": vj.Normal(10, 2),
+            "y": vj.LogUniform(0.01, 100),
+            "c": vj.Categorical("often", "seldom", weights=[0.9, 0.1]),
+        }
+    )
+    g = np.random.default_rng(0)
+    table = judged(
+        x=g.normal(10, 2, 2000),
+        y=10 ** g.uniform(-2, 2, 2000),
+        c=g.choice(["often", "seldom"], 2000, p=[0.9, 0.1]),
+    )
+    found = coverage(Samples.of(table, "all", space=space))
+    assert 0.2 < found.discrepancy < 3
+    assert found.table["occupied"].tolist() == [1, 1, 1]
+    x, y, c = marginals(found.samples)
+    np.testing.assert_allclose(x.unit(found.samples), norm(10, 2).cdf(table.x), atol=2e-3)
+    np.testing.assert_allclose(y.unit(found.samples), (np.log10(table.y) + 2) / 4, atol=2e-3)
+    assert y.value(0.5) == pytest.approx(1, rel=0.01)
+    np.testing.assert_allclose(c.edges, [0, 0.9, 1], atol=1e-3)
+    # By its range alone the logarithmic feature would seem to crowd at its lower end.
+    assert coverage(table).discrepancy > 20

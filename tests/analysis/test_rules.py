@@ -8,7 +8,7 @@ from scipy.stats import binomtest
 import verifai_jax as vj
 from verifai_jax.analysis.columns import Column
 from verifai_jax.analysis.conditions import Between, OneOf, Region, short_number
-from verifai_jax.analysis.rules import rules
+from verifai_jax.analysis.rules import _aside, rules
 
 
 def frame(n=4000, seed=0):
@@ -91,6 +91,27 @@ def test_rare_and_scattered_failures():
     )
     assert len(found.table) == 2
     assert found.table["failures"].sum() <= found.table["rows"].sum()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_numbers_are_those_of_the_rows_kept_aside(seed):
+    table = frame(1500, seed)
+    g = np.random.default_rng(seed)
+    table["violated"] = ((table.x > 0.7) & (table.colour != "red")) ^ (g.random(1500) < 0.1)
+    found = rules(table, seed=seed)
+    failing = table["violated"].to_numpy()
+    aside = table[_aside(failing, 0.4, seed)]
+    assert len(aside) == found.measured
+    assert aside["violated"].mean() == pytest.approx(failing.mean(), abs=0.01)
+    for rule in (*found.rules, found):
+        inside = rule.matches(aside)
+        hits = int((inside & aside["violated"]).sum())
+        assert rule.coverage == hits / aside["violated"].sum()
+        assert (rule.precision.failures, rule.precision.simulations) == (hits, inside.sum())
+    # Nothing is learned from them: with other features there, the rules are the same.
+    other = table.copy()
+    other.loc[aside.index, ["x", "y"]] = -1.0
+    assert [r.words for r in rules(other, seed=seed).rules] == [r.words for r in found.rules]
 
 
 def test_chance_is_not_described():

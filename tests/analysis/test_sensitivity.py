@@ -128,6 +128,7 @@ def test_elementary_effects_of_a_linear_function_are_its_slopes(mixed):
     for name, effect in {"real": 2.0, "kind": 3.0, "whole": 2.0, "none": 0.0}.items():
         assert found.loc[name, "mu_star"] == pytest.approx(effect, abs=1e-4)
     assert found.loc["real", "mu"] == pytest.approx(2.0, abs=1e-4)
+    assert np.isnan(found.loc["kind", "mu"])  # no order, no direction
     assert found.loc["real", "sigma"] < 1e-3
 
 

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.report.style import BOUND, FAILING, new_figure, show_or_save, tidy
 
 if TYPE_CHECKING:
     import pandas as pd
 
-COLORS = (FAILING, "#8d99ae", SAFE)
+SECOND = "#8d99ae"
+"""Colour of what is shown next to failures and to total influence."""
 
 
 def plot_bars(
@@ -23,8 +24,8 @@ def plot_bars(
 ) -> Any:
     """Draw one horizontal bar a row and column; returns the figure.
 
-    - `columns`: column -> its name in the legend; intervals are in `column_low` and `column_high`,
-      or in `low` and `high`.
+    - `columns`: column -> its name in the legend, empty for none; intervals are in `column_low` and
+      `column_high`, or in `low` and `high`.
     """
     figure = new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
     axes = figure.subplots()
@@ -50,7 +51,7 @@ def draw_bars(axes: Any, table: "pd.DataFrame", columns: Mapping[str, str]) -> N
             place + (j - (len(columns) - 1) / 2) * height,
             np.nan_to_num(values),
             height * 0.92,
-            color=COLORS[j],
+            color=SECOND if column in ("first", "rho") else FAILING,
             label=name,
             xerr=reach,
             error_kw={"ecolor": BOUND, "elinewidth": 1, "capsize": 2},
@@ -60,7 +61,7 @@ def draw_bars(axes: Any, table: "pd.DataFrame", columns: Mapping[str, str]) -> N
     axes.axvline(0, color=BOUND, linewidth=0.8)
     tidy(axes)
     axes.grid(visible=False, axis="y")
-    if len(columns) > 1:
+    if any(columns.values()):
         axes.legend(frameon=False, fontsize=8, loc="lower right")
 
 

@@ -56,13 +56,14 @@ def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float 
     axes.set_xlabel(across)
     axes.set_ylabel(up if up != across else "robustness" if np.any(y) else "")
     tidy(axes)
-    for name, axis in ((across, axes.xaxis), (up, axes.yaxis)):
+    drawn = [(across, axes.xaxis), (up, axes.yaxis)][: 1 + (up != across)]
+    for name, axis in drawn:
         column = columns[name]
-        if not column.ordered and (name == across or up != across):
+        if not column.ordered:
             step = -(-len(column.choices) // MOST_LABELS)
             ticks = np.arange(0, len(column.choices), max(step, 1))
             axis.set_ticks(ticks, [str(column.choices[i])[:16] for i in ticks])
-        elif column.integer and (name == across or up != across):
+        elif column.integer:
             axis.get_major_locator().set_params(integer=True)
 
 
