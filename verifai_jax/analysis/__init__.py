@@ -1,8 +1,12 @@
 """What an error table says: components, neighbours, recurrent values, clusters, rules, coverage."""
 
+from verifai_jax.analysis.clusters import Clusters as Clusters
+from verifai_jax.analysis.clusters import clusters as clusters
 from verifai_jax.analysis.columns import Column as Column
 from verifai_jax.analysis.coverage import Coverage as Coverage
 from verifai_jax.analysis.coverage import coverage as coverage
+from verifai_jax.analysis.diverse import Diverse as Diverse
+from verifai_jax.analysis.diverse import diverse as diverse
 from verifai_jax.analysis.gradients import gradient_sensitivity as gradient_sensitivity
 from verifai_jax.analysis.importance import Importance as Importance
 from verifai_jax.analysis.importance import importance as importance

@@ -19,6 +19,7 @@ PALETTE = (
     "#8c6d31",
     "#000000",
 )
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 
 def two_columns(samples: Samples) -> tuple[str, str]:
@@ -26,17 +27,25 @@ def two_columns(samples: Samples) -> tuple[str, str]:
     spread = samples.matrix().std(axis=0)
     ordered = [samples.ordered[j].name for j in np.argsort(-spread, kind="stable")]
     names = [*ordered, *(column.name for column in samples.unordered)]
-    return names[0], names[min(1, len(names) - 1)]
+    return pair(samples, names)
+
+
+def pair(samples: Samples, names: Sequence[str]) -> tuple[str, str]:
+    """The first two of the columns; of a single one with the robustness, if there is any."""
+    if len(names) > 1:
+        return names[0], names[1]
+    return names[0], "rho" if np.isfinite(samples.rho).any() else names[0]
 
 
 def positions(samples: Samples, name: str, frame: Any) -> np.ndarray:
     """Where rows are drawn along a column; a choice by its place, an absent entry nowhere."""
-    column = next(column for column in samples.columns if column.name == name)
-    if column.ordered:
+    place = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
+    if place is None or samples.columns[place].ordered:
         return frame[name].to_numpy(np.float64)
-    codes = column.codes(frame[name])
-    # Rows with the same choice side by side: a fixed shift, not a random one.
-    shift = 0.5 * ((np.arange(len(codes)) * 0.618034) % 1 - 0.5)
+    codes = samples.columns[place].codes(frame[name])
+    # Rows with the same choice lie side by side: shifted by row number, not at random.
+    step = np.sqrt(_PRIMES[place % len(_PRIMES)])
+    shift = 0.5 * (frame.index.to_numpy() * step % 1 - 0.5)
     return np.where(codes < 0, np.nan, codes + shift)
 
 
@@ -47,20 +56,25 @@ def draw_rows(
     color: str,
     label: str,
     names: Sequence[str] | None = None,
-) -> None:
-    """Draw all samples faintly and `rows` (numbers) as rings."""
+) -> np.ndarray:
+    """Draw all samples faintly and `rows` (numbers) as rings; returns their places `[k, 2]`."""
     across, up = names or two_columns(samples)
     everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]
-    for frame, options in (
-        (everything, {"c": "#b8b8b8", "s": 9, "linewidths": 0, "alpha": 0.7, "label": "others"}),
-        (
-            samples.at(rows[:DOTS]),
-            {"facecolors": "none", "edgecolors": color, "s": 36, "label": label},
-        ),
-    ):
-        axes.scatter(positions(samples, across, frame), positions(samples, up, frame), **options)
+    chosen = samples.at(rows[:DOTS])
+    places = np.stack([positions(samples, name, chosen) for name in (across, up)], axis=1)
+    axes.scatter(
+        positions(samples, across, everything),
+        positions(samples, up, everything),
+        c="#b8b8b8",
+        s=9,
+        linewidths=0,
+        alpha=0.7,
+        label="others",
+    )
+    axes.scatter(*places.T, facecolors="none", edgecolors=color, s=36, label=label)
     name_axes(axes, samples, across, up)
     axes.legend(frameon=False, fontsize=8)
+    return places
 
 
 def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
@@ -68,6 +82,6 @@ def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
     columns = {column.name: column for column in samples.columns}
     for name, axis in ((across, axes.xaxis), (up, axes.yaxis)):
         axis.set_label_text(name)
-        if not columns[name].ordered:
+        if name in columns and not columns[name].ordered:
             choices = columns[name].choices
             axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from verifai_jax.analysis.drawing import draw_rows
-from verifai_jax.analysis.samples import Samples, Scale, Which, distances, generator, whole
+from verifai_jax.analysis.samples import Samples, Scale, Which, beside, distances, generator, whole
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.errors import check_names
 from verifai_jax.features import FeatureSpace
@@ -46,8 +46,11 @@ class Neighbours:
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """The rows of the error table, with their `distance`."""
-        return self.samples.at(self.rows).assign(distance=self.distances)
+        """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
+        import pandas as pd
+
+        own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
+        return beside(self.samples.at(self.rows), own)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the rows among the others, over the two features that vary most; the figure."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Key
 
 from verifai_jax.analysis.columns import feature_columns
-from verifai_jax.analysis.samples import Samples, Scale, Which, generator, whole
+from verifai_jax.analysis.samples import Samples, Scale, Which, beside, generator, whole
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
 from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -66,10 +66,10 @@ class Components:
         """A row for each component: its loadings, its deviation and its share of the variance."""
         import pandas as pd
 
-        table = pd.DataFrame(self.directions, columns=list(self.names))
-        table["deviation"], table["share"] = self.deviations, self.shares
-        table.index = pd.RangeIndex(1, len(table) + 1, name="component")
-        return table
+        place = pd.RangeIndex(1, len(self.directions) + 1, name="component")
+        table = pd.DataFrame(self.directions, index=place, columns=list(self.names))
+        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=place)
+        return beside(table, own)
 
     def project(self, rows: "pd.DataFrame | Sequence[int] | None" = None) -> "pd.DataFrame":
         """Coordinates along the components, in scaled units, a column each; 0 is the pivot.

@@ -323,6 +323,11 @@ def whole(value: Any, what: str, least: int = 1) -> int:
     return number
 
 
+def beside(frame: "pd.DataFrame", own: "pd.DataFrame") -> "pd.DataFrame":
+    """The columns of `frame` and, after them, `own` ones, `_` added to a name that is taken."""
+    return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
+
+
 def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.Generator:
     """A NumPy generator from a seed or a `jax.random` key; the same one for the same seed.
 
