@@ -8,7 +8,8 @@ import pytest
 from scipy.stats import norm, qmc
 
 import verifai_jax as vj
-from verifai_jax.analysis.coverage import coverage, pair_counts
+from verifai_jax.analysis.cells import pair_counts
+from verifai_jax.analysis.coverage import coverage
 from verifai_jax.analysis.marginals import marginals
 from verifai_jax.analysis.samples import Samples
 
@@ -167,3 +168,32 @@ def test_distributions_are_uniform_in_their_own_coordinates():
     np.testing.assert_allclose(c.edges, [0, 0.9, 1], atol=1e-3)
     # By its range alone the logarithmic feature would seem to crowd at its lower end.
     assert coverage(table).discrepancy > 20
+
+
+def test_what_a_constraint_forbids_is_no_hole():
+    space = vj.FeatureSpace(
+        {
+            "x": vj.Box(0, 1),
+            "y": vj.Box(0, 1),
+            "k": vj.DiscreteBox(0, 2),
+            "c": vj.Categorical(*"ab"),
+        },
+        where=lambda f: (f["x"] + f["y"] < 1) & ~((f["k"] == 2) & (f["c"] == 1)),
+    )
+    g = np.random.default_rng(0)
+    n = 20000
+    table = judged(x=g.random(n), y=g.random(n), k=g.integers(0, 3, n), c=g.choice(["a", "b"], n))
+    table = table[(table.x + table.y < 1) & ~((table.k == 2) & (table.c == "b"))]
+    found = coverage(Samples.of(table, "all", space=space))
+    assert found.untried_count == 0
+    assert found.table["pairs"].min() > 0.98
+    assert found.dispersion < 0.08
+    assert 0.5 < found.discrepancy < 2
+    assert "fulfil the space's constraint" in str(found)
+    # Half of what is allowed was never tried: the hole is there, and not beyond the constraint.
+    half = table[(table.x < 0.5) & ~((table.k == 1) & (table.c == "a"))]
+    found = coverage(Samples.of(half, "all", space=space))
+    assert found.hole["x"] > 0.7
+    assert found.hole["x"] + found.hole["y"] < 1
+    assert found.untried.to_numpy().tolist() == [["k", 1, "c", "a"]]
+    assert found.table.loc["x", "occupied"] == 0.5

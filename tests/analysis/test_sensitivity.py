@@ -211,8 +211,7 @@ def test_refusals(mixed, ishigami):
     fixed = problem(lambda f, key: f["x"], {"x": vj.Constant(1.0)})
     with pytest.raises(ValueError, match="nothing varies"):
         morris(fixed)
-    space = vj.FeatureSpace({"x": vj.Box(0, 1)})
-    space.where = lambda f: f["x"] > 0.5
+    space = vj.FeatureSpace({"x": vj.Box(0, 1)}, where=lambda f: f["x"] > 0.5)
     tied = problem(lambda f, key: f["x"], space, "tied")
     for analysis in (sobol_indices, morris, gradient_sensitivity):
         with pytest.raises(ValueError, match=r"has a constraint \(where\), so its features depend"):

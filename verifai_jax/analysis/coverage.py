@@ -6,13 +6,15 @@ found.untried               values and pairs of values that no row has
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from verifai_jax.analysis.cells import cut, occupied
+from verifai_jax.analysis.holes import MOST_TREE, alike, largest_hole
 from verifai_jax.analysis.marginals import Marginal, marginals
 from verifai_jax.analysis.samples import Samples, whole
 
@@ -25,18 +27,11 @@ if TYPE_CHECKING:
 MOST_ROWS = 2000
 MOST_ENTRIES = 8e7
 """Rows that the discrepancy is computed from, and what their square times the features may be."""
-MOST_VALUES = 20
-"""Values up to which each one of a discrete feature is a cell of its own."""
-MOST_FEATURES = 60
-"""Features up to which all of their pairs are counted."""
-PROBES = 4096
 REPEATS = 8
-MOST_UNTRIED = 1000
+ALLOWED = 8192
+LEAST_ACCEPTED = 0.005
 MOST_LISTED = 5
 MOST_NAMED = 8
-MOST_TREE = 8  # Dimensions up to which a tree finds neighbours faster than brute force.
-BLOCK = 4096
-REFINED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,8 +96,8 @@ class Coverage:
             shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
             more = self.untried_count - len(shown)
             lines.append("never tried: " + "; ".join(shown) + (f"; and {more:,} more" * (more > 0)))
-        if getattr(self.samples.space, "where", None) is not None:
-            lines.append("what the constraint of the space forbids counts as not covered")
+        if self.samples.space is not None and self.samples.space.where is not None:
+            lines.append("(uniform means samples of the prior that fulfil the space's constraint)")
         return "\n".join(lines)
 
 
@@ -117,17 +112,16 @@ def coverage(
       to fill them; a discrete feature of up to 20 values has a cell for each.
 
     Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares
-    of the ranges in the table where no space is known. A constraint between features is not known
-    here: what it forbids counts as not covered. Absent entries are left out feature by feature, and
-    are in the middle where a point is needed. The discrepancy is of 2000 rows at most, drawn by
-    `seed`, with a discrete value spread over its cell. The hole is the emptiest of 4096 points of a
-    Sobol sequence, searched further around it (of 1024 with more than 8 ordered features).
+    of the ranges in the table where no space is known. With a constraint between features, uniform
+    samples are 8192 that fulfil it, cells without any of them do not count, and the hole is in the
+    midst of one of them; one that less than a two-hundredth fulfils is not looked at. Absent
+    entries are left out feature by feature, and are in the middle where a point is needed. The
+    discrepancy is of 2000 rows at most, drawn by `seed`, with discrete values spread over their
+    cells.
 
     Sources: Hickernell, A generalized discrepancy and quadrature error bound, Mathematics of
     Computation 67 (1998); its mean for uniform samples, `((5/4)^d - (13/12)^d) / n`, follows from
-    the definition. Dispersion: Niederreiter, Random number generation and quasi-Monte Carlo methods
-    (1992). Pairs: t-wise coverage of combinatorial testing (Kuhn, Kacker and Lei, Introduction to
-    combinatorial testing, 2013).
+    the definition. For the others see `cells.py` and `holes.py`.
 
     **Raises:** `ValueError` for no rows, no feature that varies, or fewer than 2 cells.
     """
@@ -136,32 +130,63 @@ def coverage(
     samples = _varying(samples)
     generator = np.random.default_rng(seed)
     parts = marginals(samples)
-    table, untried, missing = _occupied(len(samples), _cells(samples, parts, cells))
+    allowed = _allowed(samples, seed)
+    # With five rows a pair of cells, uniform samples leave one in a hundred and fifty empty.
+    count = int(np.clip(np.sqrt(len(samples) / 5), 2, cells))
+    table, untried, missing = occupied(
+        len(samples),
+        cut(samples, parts, count),
+        None if allowed is None else cut(allowed, parts, count),
+    )
     dispersion = uniform = hole = None
     ordered = parts[: len(samples.ordered)]
     if ordered:
-        points = np.stack([part.unit(samples) for part in ordered], axis=1)
-        dispersion, place = _largest_hole(points, ordered, seed)
-        repeats = REPEATS if len(ordered) <= MOST_TREE else 1
-        others = [
-            _largest_hole(_alike(ordered, generator, len(points)), ordered, seed)[0]
-            for _ in range(repeats)
-        ]
-        uniform = float(np.mean(others))
+        points = _units(samples, ordered)
+        if allowed is None:
+            among = None
+            repeats = REPEATS if len(ordered) <= MOST_TREE else 1
+            others = [alike(ordered, generator, len(points)) for _ in range(repeats)]
+        else:
+            among, other = np.array_split(_units(allowed, ordered), 2)
+            others = [other[: len(points)]]
+        dispersion, place = largest_hole(points, ordered, seed, among)
+        uniform = float(np.mean([largest_hole(p, ordered, seed, among)[0] for p in others]))
         hole = {
             part.column.name: part.value(float(u)) for part, u in zip(ordered, place, strict=True)
         }
-    spread = np.stack([part.unit(samples, generator) for part in parts], axis=1)
     return Coverage(
-        table,
-        untried,
-        missing,
-        _discrepancy(spread, generator),
-        dispersion,
-        uniform,
-        hole,
-        samples,
+        table=table,
+        untried=untried,
+        untried_count=missing,
+        discrepancy=_discrepancy(
+            _units(samples, parts, generator),
+            None if allowed is None else _units(allowed, parts, generator),
+            generator,
+        ),
+        dispersion=dispersion,
+        uniform_dispersion=uniform,
+        hole=hole,
+        samples=samples,
     )
+
+
+def _units(
+    samples: Samples, parts: Sequence[Marginal], generator: Any = None
+) -> Float[np.ndarray, "n d"]:
+    return np.stack([part.unit(samples, generator) for part in parts], axis=1)
+
+
+def _allowed(samples: Samples, seed: int) -> Samples | None:
+    """Samples of the prior that fulfil the constraint of the space; None without one."""
+    space = samples.space
+    if space is None or space.where is None or space.check_where() < LEAST_ACCEPTED:
+        return None
+    import jax
+    import pandas as pd
+
+    key = jax.random.key(seed, impl="threefry2x32")
+    rows = space.rows(space.sample(key, ALLOWED))
+    return replace(samples, frame=pd.DataFrame(rows))
 
 
 def _varying(samples: Samples) -> Samples:
@@ -179,152 +204,22 @@ def _varying(samples: Samples) -> Samples:
     return Samples.of(samples, columns=names)
 
 
-def _discrepancy(unit: Float[np.ndarray, "n d"], generator: Any) -> float:
+def _discrepancy(
+    unit: Float[np.ndarray, "n d"], allowed: Float[np.ndarray, "m d"] | None, generator: Any
+) -> float:
+    """Squared centred discrepancy over that of as many samples of the prior."""
     from scipy.stats import qmc
 
     n, d = unit.shape
     most = int(min(MOST_ROWS, np.sqrt(MOST_ENTRIES / d)))
+    if allowed is not None:
+        most = min(most, len(allowed))
     if n > most:
         unit, n = unit[generator.choice(n, most, replace=False)], most
     expected = ((5 / 4) ** d - (13 / 12) ** d) / n
+    if allowed is not None:
+        expected = qmc.discrepancy(allowed[:n], method="CD")
     return float(qmc.discrepancy(unit, method="CD") / expected)
-
-
-def _largest_hole(
-    points: Float[np.ndarray, "n k"], parts: Sequence[Marginal], seed: int
-) -> tuple[float, Any]:
-    """The greatest distance of a probe to its nearest point, and that probe."""
-    from scipy.spatial import KDTree
-    from scipy.stats import qmc
-
-    k = points.shape[1]
-    probes = qmc.Sobol(k, rng=seed).random(PROBES if k <= MOST_TREE else PROBES // 4)
-    probes = np.stack([part.snapped(probes[:, j]) for j, part in enumerate(parts)], axis=1)
-    if k <= MOST_TREE:
-        tree = KDTree(points)
-        distance = np.asarray(tree.query(probes)[0])
-        best, radius = int(np.argmax(distance)), float(distance.max())
-        for _ in range(REFINED):
-            # Closer and closer around the emptiest place so far, which stays among the probes.
-            radius /= 2
-            near = np.clip(probes[best] + radius * (2 * probes[: PROBES // 4] - 1), 0, 1)
-            near = [part.snapped(near[:, j]) for j, part in enumerate(parts)]
-            probes = np.concatenate([probes[best : best + 1], np.stack(near, axis=1)])
-            distance = np.asarray(tree.query(probes)[0])
-            best = int(np.argmax(distance))
-    else:
-        # Trees do not prune in many dimensions; one matrix product a block does it.
-        nearest = np.full(len(probes), np.inf)
-        single = probes.astype(np.float32)
-        own = np.sum(single**2, axis=1)
-        for begin in range(0, len(points), BLOCK):
-            block = points[begin : begin + BLOCK].astype(np.float32)
-            squares = own[:, None] + np.sum(block**2, axis=1) - 2 * single @ block.T
-            nearest = np.minimum(nearest, squares.min(axis=1))
-        distance = np.sqrt(np.maximum(nearest, 0))
-    place = int(np.argmax(distance))
-    return float(distance[place]), probes[place]
-
-
-def _alike(parts: Sequence[Marginal], generator: Any, n: int) -> Float[np.ndarray, "n k"]:
-    """Uniform samples of the same columns."""
-    return np.stack([part.snapped(generator.random(n)) for part in parts], axis=1)
-
-
-class _Cells(NamedTuple):
-    """One feature cut into cells: the cell of each row (-1 where absent), and their prior."""
-
-    name: str
-    ids: Int[np.ndarray, " n"]
-    prior: Float[np.ndarray, " cells"]
-    marginal: Marginal
-    listed: bool  # Whether each cell is one value.
-
-
-def _cells(samples: Samples, parts: Sequence[Marginal], most: int) -> list[_Cells]:
-    # With five rows a pair of cells, uniform samples leave one in a hundred and fifty empty.
-    count = int(np.clip(np.sqrt(len(samples) / 5), 2, most))
-    found = []
-    for part in parts:
-        name = part.column.name
-        if part.edges is not None and (part.count <= MOST_VALUES or not part.column.ordered):
-            ids, prior = part.cells(samples), np.diff(part.edges)
-            found.append(_Cells(name, ids, prior, part, True))
-        else:
-            ids = np.clip(np.floor(part.unit(samples) * count), 0, count - 1).astype(np.int64)
-            absent = samples.frame[name].isna().to_numpy()
-            prior = np.full(count, 1 / count)
-            found.append(_Cells(name, np.where(absent, -1, ids), prior, part, False))
-    return found
-
-
-def _occupied(n: int, cut: list[_Cells]) -> tuple["pd.DataFrame", "pd.DataFrame", int]:
-    """The tables of features and of what was never tried, and how much that is."""
-    import pandas as pd
-
-    d, most = len(cut), min(len(cut), MOST_FEATURES)
-    counts = np.array([len(cells.prior) for cells in cut])
-    together = pair_counts(np.stack([c.ids for c in cut[:most]], axis=1), counts[:most])
-    edges = np.concatenate([[0], np.cumsum(counts[:most])])
-    columns: dict[str, Any] = {"cells": counts}
-    columns |= {name: np.full(d, np.nan) for name in _SHARES}
-    untried: list[tuple[Any, ...]] = []
-    missing = 0
-    for i, one in enumerate(cut):
-        seen = np.bincount(one.ids[one.ids >= 0], minlength=counts[i])
-        columns["occupied"][i] = np.mean(seen > 0)
-        columns["expected"][i] = np.mean(_chance(one.prior, n))
-        if one.listed:
-            never = np.flatnonzero(seen == 0)
-            missing += len(never)
-            untried += [(one.name, one.marginal.shown(int(cell)), "", "") for cell in never]
-        shares = []
-        for j, other in enumerate(cut[:most]):
-            if i == j or i >= most:
-                continue
-            block = together[edges[i] : edges[i + 1], edges[j] : edges[j + 1]]
-            shares.append(
-                (np.mean(block > 0), np.mean(_chance(np.outer(one.prior, other.prior), n)))
-            )
-            if i < j and one.listed and other.listed:
-                # A value that was never tried is not listed again with all of its partners.
-                alive = np.outer(block.any(axis=1), block.any(axis=0))
-                empty = np.argwhere((block == 0) & alive)
-                missing += len(empty)
-                for a, b in empty[: max(0, MOST_UNTRIED - len(untried))].tolist():
-                    first = (one.name, one.marginal.shown(a))
-                    untried.append((*first, other.name, other.marginal.shown(b)))
-        if shares:
-            columns["pairs"][i], columns["expected_pairs"][i] = np.mean(shares, axis=0)
-    untried.sort(key=lambda entry: entry[2] != "")
-    heads = ["feature", "value", "other", "other_value"]
-    return (
-        pd.DataFrame(columns, index=pd.Index([c.name for c in cut], name="feature")),
-        pd.DataFrame(untried[:MOST_UNTRIED], columns=heads),
-        missing,
-    )
-
-
-_SHARES = ("occupied", "expected", "pairs", "expected_pairs")
-
-
-def _chance(prior: Float[np.ndarray, "*cells"], n: int) -> Float[np.ndarray, "*cells"]:
-    """The probabilities that some of `n` samples of the prior lie in a cell."""
-    return 1 - (1 - prior) ** n
-
-
-def pair_counts(ids: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]) -> Any:
-    """How many rows lie in each two cells of all features, `[sum of counts] * 2`."""
-    edges = np.concatenate([[0], np.cumsum(counts)])[:-1]
-    total = int(counts.sum())
-    together = np.zeros((total, total))
-    for begin in range(0, len(ids), BLOCK):
-        block = ids[begin : begin + BLOCK]
-        unit = np.zeros((len(block), total), np.float32)
-        row, column = np.nonzero(block >= 0)
-        unit[row, edges[column] + block[row, column]] = 1
-        together += unit.T @ unit
-    return together
 
 
 def _words(row: dict[Any, Any]) -> str:
