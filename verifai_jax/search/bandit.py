@@ -67,7 +67,7 @@ class Bandit(Search):
     depth: int = 2
     optimism: float = 0.6
     best: float = 0.25
-    window: int = 512
+    window: int = 256
     exploration: float = 0.1
 
     def __post_init__(self) -> None:
