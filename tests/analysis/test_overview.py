@@ -1,5 +1,6 @@
 """The overview of runs and tables, odd ones among them."""
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -118,11 +119,9 @@ def test_runs_are_described_by_their_search(tmp_path):
         y = jnp.where(broken, jnp.nan, features["a"] - 0.25 + 0 * features["b"])
         return vj.Trace({"y": y[None]}, dt=1.0)
 
-    import jax.numpy as jnp
-
     problem = vj.Problem("slope", {"a": vj.Box(0, 1), "b": vj.Box(0, 1)}, system, "y >= 0")
     run = vj.falsify(problem, "uniform", 256, batch=256)
-    text = str(analyze(run))
+    text = repr(run.analyze())
     assert text.startswith("slope\n")
     assert "have no verdict" in text
     assert "failure rate 2" in text

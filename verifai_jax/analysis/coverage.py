@@ -70,6 +70,9 @@ class Coverage:
 
         return plot_coverage(self, path)
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         from verifai_jax.run import told
 

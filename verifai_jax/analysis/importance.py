@@ -76,6 +76,9 @@ class Importance:
         shown = self.table.head(MOST_SHOWN)
         return plot_bars(shown, columns, title, "loss of score when shuffled", path)
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         lines = []
         for target, what in _WHAT.items():

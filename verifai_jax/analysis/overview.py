@@ -124,6 +124,9 @@ class Analysis:
         report.write_text("\n".join(lines))
         return report
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         lines = [self.name]
         for part in self.parts:

@@ -61,6 +61,9 @@ class Rule:
         """The conditions alone."""
         return " and ".join(map(str, self.conditions)) or "everywhere"
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         covered = f"covers {100 * self.coverage:.0f} % of the failures"
         return f"{self.words}: {covered}, {_told(self.precision)}"
@@ -108,6 +111,9 @@ class Rules:
         from verifai_jax.analysis.panels import plot_rules
 
         return plot_rules(self, path)
+
+    def __repr__(self) -> str:
+        return str(self)
 
     def __str__(self) -> str:
         if not self.rules:

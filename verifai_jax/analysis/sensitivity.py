@@ -61,6 +61,9 @@ class Sensitivity:
         shown = shown.clip(upper=1)
         return plot_bars(shown, {"bound": ""}, title, "upper bound on the total index", path)
 
+    def __repr__(self) -> str:
+        return str(self)
+
     def __str__(self) -> str:
         lines = [
             f"{self.method} of {self.problem!r} from {self.simulations:,} simulations, robustness "
