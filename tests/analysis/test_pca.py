@@ -6,7 +6,7 @@ from sklearn.decomposition import PCA
 
 from verifai_jax.analysis.pca import pca
 from verifai_jax.analysis.samples import Samples
-from verifai_jax.features import Box, Categorical, DiscreteBox, FeatureSpace
+from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace
 
 SPACE = FeatureSpace(
     {
@@ -142,6 +142,32 @@ def test_absent_items_add_nothing():
     np.testing.assert_allclose(found.pivot[2], present.mean())
     drawn = found.generate(0, 200)
     assert 0 < drawn["slope"].isna().mean() < 1
+
+
+def test_generated_samples_keep_lengths_and_constraints():
+    space = FeatureSpace(
+        {"x": Box(0, 1), "y": Box(0, 1), "cars": Array(DiscreteBox(1, 4), length=(1, 3))},
+        where=lambda features: features["x"] < features["y"],
+    )
+    rng = np.random.default_rng(0)
+    low, high = np.sort(rng.uniform(size=(2, 60)), axis=0)
+    length = rng.integers(1, 4, 60)
+    rows = {"x": low, "y": high, "cars.length": length}
+    for i in range(3):
+        rows[f"cars[{i}]"] = np.where(i < length, rng.integers(1, 5, 60), np.nan)
+    frame = pd.DataFrame(rows)
+    free = FeatureSpace(space.domains)
+    found = pca(frame, space=space)
+    assert (found.generate(0, 40)["x"] < found.generate(0, 40)["y"]).all()
+    unconstrained = pca(frame, space=free).generate(0, 40)
+    assert not (unconstrained["x"] < unconstrained["y"]).all()
+    for _, row in found.generate(1, 40).iterrows():
+        space.check(space.from_row(row))
+    # Where no draw can keep it, the row nearest to the draw is taken.
+    narrow = FeatureSpace(space.domains, where=lambda features: features["x"] > 2)
+    taken = pca(frame, space=narrow).generate(0, 5).astype(float)
+    known = frame.astype(float).fillna(-1).to_numpy().tolist()
+    assert all(row in known for row in taken.fillna(-1).to_numpy().tolist())
 
 
 def test_refused():

@@ -12,7 +12,11 @@ from verifai_jax.features import (
     Constant,
     DiscreteBox,
     FeatureSpace,
+    LogUniform,
+    Normal,
+    Signal,
     Struct,
+    TruncatedNormal,
 )
 from verifai_jax.run import Run
 from verifai_jax.table import ErrorTable
@@ -242,3 +246,59 @@ def test_generators():
     assert keyed[0] == keyed[1] != keyed[2]
     with pytest.raises(ValueError, match="the seed must be a whole number of at least 0; got -1"):
         generator(-1)
+
+
+def test_columns_of_every_kind_of_domain():
+    item = Struct({"x": Normal(0, 1), "n": DiscreteBox(1, 9), "g": Categorical(3, 1)})
+    space = FeatureSpace(
+        {
+            "free": Normal(10, 2),
+            "cut": TruncatedNormal(0, 1, -2, 2),
+            "rate": LogUniform(1e-3, 10),
+            "alg": Categorical("ppo", "sac", weights=[0.75, 0.25]),
+            "cars": Array(item, length=(0, 2)),
+            "wind": Signal(Box(-1, 1), knots=2),
+        }
+    )
+    rows = {
+        "free": [9.0, 11.0],
+        "cut": [0.0, 1.0],
+        "rate": [0.1, 1.0],
+        "alg": ["ppo", "sac"],
+        "cars.length": [0, 1],
+        "cars[0].x": [np.nan, 0.5],
+        "cars[0].n": [None, 3],
+        "cars[0].g": [np.nan, 1.0],
+        "cars[1].x": [np.nan, np.nan],
+        "cars[1].n": [None, None],
+        "cars[1].g": [None, None],
+        "wind[0]": [0.0, 0.5],
+        "wind[1]": [0.5, 0.0],
+    }
+    samples = Samples.of(pd.DataFrame(rows), space=space)
+    assert samples.names == space.columns
+    columns = {column.name: column for column in samples.columns}
+    ranges = {name: (c.near, c.far) for name, c in columns.items() if c.ordered}
+    assert ranges.pop("free") == pytest.approx((10 - 3.09 * 2, 10 + 3.09 * 2), abs=0.01)
+    for place in (0, 1):
+        assert ranges.pop(f"cars[{place}].x") == pytest.approx((-3.09, 3.09), abs=0.01)
+    assert columns["free"].low < 2 < 18 < columns["free"].high
+    expected = {
+        "cut": (-2, 2),
+        "rate": (1e-3, 10),
+        "cars.length": (0, 2),
+        "cars[0].n": (1, 9),
+        "cars[1].n": (1, 9),
+        "wind[0]": (-1, 1),
+        "wind[1]": (-1, 1),
+    }
+    assert set(ranges) == set(expected)
+    for name, ends in expected.items():
+        assert ranges[name] == pytest.approx(ends)
+    assert [name for name, column in columns.items() if column.length] == ["cars.length"]
+    assert columns["alg"].prior == pytest.approx((0.75, 0.25))
+    # An item is there only in some simulations: its choices are rarer than their weights.
+    assert columns["cars[0].g"].prior is None
+    assert columns["cars[0].g"].choices == columns["cars[1].g"].choices == (3, 1)
+    assert samples.codes().tolist() == [[0, -1, -1], [1, 1, -1]]
+    assert np.isfinite(samples.points()).all()

@@ -9,8 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.errors import check_names
-from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Struct
-from verifai_jax.features.domain import Domain, as_scalar
+from verifai_jax.features import (
+    Array,
+    Box,
+    Categorical,
+    DiscreteBox,
+    FeatureSpace,
+    Signal,
+    Struct,
+    VariableArray,
+)
+from verifai_jax.features.domain import Domain, as_scalar, indexed
 from verifai_jax.table import RESERVED
 
 if TYPE_CHECKING:
@@ -26,7 +35,8 @@ class Column:
     space is known; `near` and `far`: the finite range that is scaled to `[0, 1]`, which is the
     bounds, or else the least and the greatest entry of the whole table; `integer`: only whole
     numbers; `known`: whether the feature space says all this; `prior`: probabilities of the
-    `choices` where the space knows them; `uniform`: whether an ordered one has a uniform prior.
+    `choices` where the space knows them; `uniform`: whether an ordered one has a uniform prior;
+    `length`: whether it says how many items an array has.
     """
 
     name: str
@@ -40,6 +50,7 @@ class Column:
     known: bool = False
     prior: tuple[float, ...] | None = None
     uniform: bool = False
+    length: bool = False
 
     def codes(self, entries: Any) -> np.ndarray:
         """Places of the entries `[n]` (a Series) in `choices`, as int64; -1 for an absent one.
@@ -118,6 +129,7 @@ def _column(entries: Any, name: str, known: Mapping[str, Any]) -> Column:
         integer=bool(integer),
         known=bool(known),
         uniform=known.get("uniform", False) and len(present) == len(entries),
+        length=known.get("length", False),
     )
 
 
@@ -132,25 +144,20 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
         for field, part in domain.fields:
             found |= _of_domain(part, f"{name}.{field}" if name else field)
         return found
-    if isinstance(domain, Array):
-        # Items are numbered from 0 whatever the length; a column of the length itself, if there
-        # is one, is left to its entries.
-        found, columns = {}, set(domain.columns(name))
-        for i in range(len(columns)):
-            item = _of_domain(domain.domain, f"{name}[{i}]")
-            if not columns.issuperset(item):
-                break
-            found |= item
+    if isinstance(domain, Array | VariableArray | Signal):
+        count = {Array: "length", VariableArray: "most", Signal: "knots"}[type(domain)]
+        found = {}
+        if isinstance(domain, VariableArray) and domain.most > domain.least:
+            found[f"{name}.length"] = {**_integers(domain.least, domain.most), "length": True}
+        for item in indexed(name, getattr(domain, count)):
+            found |= _of_domain(domain.domain, item)
         return found
     if isinstance(domain, Categorical):
         count, weights = len(domain.choices), domain.weights[0]
         prior = tuple(float(weight) for weight in weights) if weights else (1 / count,) * count
         return {name: {"ordered": False, "choices": _shown(domain), "prior": prior}}
     if isinstance(domain, DiscreteBox):
-        ends = (domain.low, domain.high)
-        return {
-            name: {"ordered": True, "bounds": ends, "range": ends, "integer": True, "uniform": True}
-        }
+        return {name: _integers(domain.low, domain.high)}
     if isinstance(domain, Box):
         ends = zip(np.ravel(domain.low), np.ravel(domain.high), strict=True)
         return {
@@ -167,9 +174,9 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _of_other_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
-    """Bounds from the ends of the coordinates; the range from all but their outer thousandths.
+    """Bounds from the ends of the coordinates, or those that the domain names.
 
-    A distribution without ends, such as a normal one, has no other range.
+    The range of a distribution without ends, such as a normal one, leaves out their thousandths.
     """
     if domain.size == 0:
         return {}
@@ -183,14 +190,20 @@ def _of_other_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
             continue
         low, high, near, far = ends.astype(np.float64)
         bounds, inner = sorted((low, high)), sorted((near, far))
-        finite = np.isfinite(bounds).all() and bounds[1] - bounds[0] <= 3 * (inner[1] - inner[0])
+        # A distribution names its support; drawn ends are finite even where that is not.
+        endless = not np.isfinite(getattr(domain, "support", (np.inf, np.inf))).all()
         found[column] = {
             "ordered": True,
             "bounds": bounds,
-            "range": bounds if finite else inner,
+            "range": inner if endless else bounds,
             "integer": ends.dtype.kind in "iu",
         }
     return found
+
+
+def _integers(low: int, high: int) -> dict[str, Any]:
+    ends = (low, high)
+    return {"ordered": True, "bounds": ends, "range": ends, "integer": True, "uniform": True}
 
 
 def _shown(domain: Categorical) -> tuple[Any, ...]:

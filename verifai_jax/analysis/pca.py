@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Key
+from jaxtyping import Float, Int, Key
 
 from verifai_jax.analysis.columns import feature_columns
 from verifai_jax.analysis.samples import Samples, Scale, Which, beside, generator, whole
@@ -102,9 +103,10 @@ class Components:
 
         Draws outside the bounds (of the space, or of the whole table where no space is known) are
         drawn again; what is still outside after 32 rounds moves towards the pivot until inside.
-        Whole numbers are rounded. All other features, choices and the absence of items among them,
-        are those of the nearest row analysed. The columns are all features, so that
-        `space.from_row` takes a row.
+        Whole numbers are rounded. All other features, choices and the number of items of arrays
+        among them, are those of the nearest row analysed. What breaks a constraint of the space is
+        drawn again too, and after 32 rounds is the nearest row itself. The columns are all
+        features, so that `space.from_row` takes a row.
 
         **Raises:** `ValueError` for `n < 0` or a spread that is not a positive finite number.
         """
@@ -114,36 +116,56 @@ class Components:
         if not (np.isfinite(spread) and spread > 0):
             raise ValueError(f"spread must be positive and finite; got {spread!r}")
         rng = generator(seed)
+        found, donors = self._features(self._draw(rng, n, spread))
+        for turn in range(_REDRAWS + 1):
+            again = np.flatnonzero(~_accepted(self.samples.space, found))
+            if not len(again):
+                break
+            new, others = self._features(self._draw(rng, len(again), spread))
+            if turn == _REDRAWS:
+                new = self.samples.frame.iloc[donors[again]][list(found.columns)]
+            donors[again] = others
+            rest = found.drop(index=again)
+            found = pd.concat([rest, new.set_index(again)]).sort_index()
+        return found.rename_axis(index="sample")
+
+    def _draw(self, rng: np.random.Generator, n: int, spread: float) -> Float[np.ndarray, "n k"]:
+        """Values of the ordered columns within the bounds."""
         low, high = self._bounds
         steps = self.directions * self.width
 
-        def outside(values: np.ndarray) -> Any:
-            return ((values < low) | (values > high)).any(axis=1)
+        def normal(count: int) -> np.ndarray:
+            return rng.normal(0, spread, (count, len(steps))) * self.deviations @ steps
 
-        drawn = rng.normal(0, spread, (n, len(steps))) * self.deviations @ steps
+        moves = normal(n)
         for _ in range(_REDRAWS):
-            again = outside(self.pivot + drawn)
-            if not again.any():
+            values = self.pivot + moves
+            outside = ((values < low) | (values > high)).any(axis=1)
+            if not outside.any():
                 break
-            drawn[again] = (
-                rng.normal(0, spread, (again.sum(), len(steps))) * self.deviations @ steps
-            )
+            moves[outside] = normal(int(outside.sum()))
         # The pivot is inside, and the bounds are convex: some fraction of the way is inside too.
-        room = np.where(drawn > 0, high - self.pivot, self.pivot - low)
-        ratio = np.divide(room, np.abs(drawn), out=np.ones_like(drawn), where=drawn != 0)
+        room = np.where(moves > 0, high - self.pivot, self.pivot - low)
+        ratio = np.divide(room, np.abs(moves), out=np.ones_like(moves), where=moves != 0)
         fraction = np.clip(ratio, 0, 1).min(axis=1, initial=1)
-        values = np.clip(self.pivot + drawn * fraction[:, None], low, high)
+        return np.clip(self.pivot + moves * fraction[:, None], low, high)
+
+    def _features(
+        self, values: Float[np.ndarray, "n k"]
+    ) -> "tuple[pd.DataFrame, Int[np.ndarray, ' n']]":
+        """All features with these ordered values, and the places of the rows that lent the rest."""
         donors = self._nearest(values)
-        features = feature_columns(self.samples.table, self.samples.space)
-        found = self.samples.frame.iloc[donors][list(features)].reset_index(drop=True)
+        names = feature_columns(self.samples.table, self.samples.space)
+        found: Any = self.samples.frame.iloc[donors][list(names)].reset_index(drop=True)
         for j, column in enumerate(self.samples.ordered):
-            if column.name in features:
-                new = np.round(values[:, j]) if column.integer else values[:, j]
-                kept: Any = found[column.name]
-                whole_numbers = column.integer and not kept.isna().any()
-                new = np.where(kept.isna(), np.nan, new)
-                found[column.name] = new.astype(np.int64) if whole_numbers else new
-        return pd.DataFrame(found).rename_axis(index="sample")
+            if column.name not in names or column.length:
+                continue
+            kept = np.asarray(found[column.name], np.float64)
+            new = np.where(np.isnan(kept), np.nan, values[:, j])
+            if column.integer:
+                new = np.round(new) if np.isnan(new).any() else np.round(new).astype(np.int64)
+            found[column.name] = new
+        return found, donors
 
     @cached_property
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -233,6 +255,16 @@ def pca(
         width=width,
         scale=scale,
     )
+
+
+def _accepted(space: FeatureSpace | None, frame: "pd.DataFrame") -> np.ndarray:
+    """Which rows keep the constraint of the space, if it has one."""
+    if space is None or space.where is None or not len(frame):
+        return np.ones(len(frame), bool)
+    rows: Any = frame.to_dict("records")
+    features = [space.from_row(row) for row in rows]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *features)
+    return np.asarray(jax.vmap(space.accepts)(stacked), bool)
 
 
 def _matters(loading: float) -> bool:
