@@ -10,11 +10,16 @@ from dataclasses import fields
 from typing import Any
 
 from verifai_jax.errors import check_names, unknown_name
+from verifai_jax.search.annealing import Annealing as Annealing
+from verifai_jax.search.bandit import Bandit as Bandit
 from verifai_jax.search.base import Cube as Cube
 from verifai_jax.search.base import Evaluated as Evaluated
 from verifai_jax.search.base import Search as Search
+from verifai_jax.search.bayes import Bayes as Bayes
 from verifai_jax.search.ce_compat import CECompat as CECompat
+from verifai_jax.search.cmaes import CMAES as CMAES
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
+from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
 from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.grid import Grid as Grid
 from verifai_jax.search.halton import Halton as Halton
@@ -27,8 +32,13 @@ _SEARCHES: dict[str, type[Search]] = {
     "halton": Halton,
     "sobol": Sobol,
     "grid": Grid,
+    "annealing": Annealing,
     "cross_entropy": CrossEntropy,
     "ce_compat": CECompat,
+    "bandit": Bandit,
+    "epsilon_greedy": EpsilonGreedy,
+    "bayes": Bayes,
+    "cmaes": CMAES,
     "gradient": Gradient,
 }
 
