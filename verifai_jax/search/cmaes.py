@@ -1,10 +1,6 @@
 """CMA-ES: one Gaussian that learns where to go, how far, and along which directions.
 
-Hansen, The CMA Evolution Strategy: A Tutorial, 2016: the parameters' defaults are those of its
-table 1, without negative weights. A Cholesky factor stands for the symmetric root of the
-covariance (Krause, Arbones, Igel, A CMA-ES with optimal covariance update and storage complexity,
-2016). Above `full_up_to` coordinates the covariance is diagonal and learns faster by a factor
-(Ros, Hansen, A simple modification in CMA-ES achieving linear time and space complexity, 2008).
+Hansen, The CMA Evolution Strategy: A Tutorial, 2016; one step of it is in `evolution.py`.
 
 What is made for falsification:
 
@@ -14,19 +10,21 @@ What is made for falsification:
 - a coordinate with ordered cells keeps a standard deviation that reaches the next cell (as Hamano
   et al., CMA-ES with margin, GECCO 2022); one with unordered cells has probabilities instead;
 - all failures are equally good. A run ends when it has failed often enough, has converged or makes
-  no progress. The next one begins alternately with large steps, from the prior, and with small
-  ones, at the best of the points that exploration has found meanwhile (as Hansen, Benchmarking a
-  BI-population CMA-ES on the BBOB-2009 function testbed, alternates between two regimes).
+  no progress. The next one begins alternately with small steps, at the best of the points that
+  exploration has found meanwhile, and with large ones, from the prior (as Hansen, Benchmarking a
+  BI-population CMA-ES on the BBOB-2009 function testbed, alternates between two regimes);
+- after runs without a failure the prior is sampled for as long as the last one took, times their
+  number, and the next run begins at the best of these points: where the robustness misleads, most
+  simulations are those of the prior in the end.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
@@ -37,6 +35,7 @@ from verifai_jax.search.base import (
     check_count,
     check_fraction,
 )
+from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 
 # More cells than this are an ordered quantity: a generation cannot tell their probabilities.
@@ -53,11 +52,10 @@ class CMAESState(NamedTuple):
     explored: UInt32[Array, ""]  # points of the prior asked for
     run: Int[Array, ""]
     generation: Int[Array, ""]  # of the run; 0 is drawn from the prior
-    mean: Float[Array, " n"]
-    size: Float[Array, ""]  # of the step
-    covariance: Float[Array, "n *n"]  # over the squared size; a diagonal above `full_up_to`
-    way: Float[Array, " n"]  # evolution paths, of the covariance and of the size
-    whitened: Float[Array, " n"]
+    length: Int[Array, ""]  # generations that the run has taken
+    fruitless: Int[Array, ""]  # runs without a failure, since the last one with
+    rest: Int[Array, ""]  # generations of the prior before the run may begin
+    gaussian: Evolution  # over the coordinates without probabilities
     choices: Float[Array, "k cells"]  # probabilities of unordered cells
     u: Float[Array, "population d"]  # the generation so far
     score: Float[Array, " population"]  # robustness, 0 for all failures; infinite if not to be used
@@ -104,9 +102,9 @@ class CMAES(Search):
         check_count("failures", self.failures)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CMAESState:
-        n, d = len(_gaussian(cube)), cube.dim
+        n, d = len(_plain(cube)), cube.dim
         population = _population(cube, batch)
-        full = n <= self.full_up_to
+        middle = jnp.full(n, 0.5, jnp.float32)
         return CMAESState(
             key=key,
             round=jnp.uint32(0),
@@ -114,11 +112,10 @@ class CMAES(Search):
             explored=jnp.uint32(0),
             run=jnp.int32(0),
             generation=jnp.int32(0),
-            mean=jnp.full(n, 0.5, jnp.float32),
-            size=jnp.float32(self.step),
-            covariance=jnp.eye(n, dtype=jnp.float32) if full else jnp.ones(n, jnp.float32),
-            way=jnp.zeros(n, jnp.float32),
-            whitened=jnp.zeros(n, jnp.float32),
+            length=jnp.int32(0),
+            fruitless=jnp.int32(0),
+            rest=jnp.int32(0),
+            gaussian=Evolution.begin(middle, jnp.float32(self.step), n <= self.full_up_to),
             choices=jnp.asarray(_prior(cube)),
             u=jnp.full((population, d), 0.5, jnp.float32),
             score=jnp.full(population, jnp.inf, jnp.float32),
@@ -142,10 +139,7 @@ class CMAES(Search):
 
     def tell(self, state: CMAESState, cube: Cube, evaluated: Evaluated) -> CMAESState:
         batch = len(evaluated.rho)
-        usable = evaluated.counted & (evaluated.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
-        u = jnp.where(usable[:, None], evaluated.u, 0.5)
-
+        u, score = _judged(evaluated)
         # Points of exploration are far away from the run: they say nothing about its next step.
         outside = self._explores(state, batch) & (state.generation > 0)
         state = _reserved(state, u, jnp.where(outside, score, jnp.inf))
@@ -163,13 +157,11 @@ class CMAES(Search):
 
     def warm(self, state: CMAESState, cube: Cube, evaluated: Evaluated) -> CMAESState:
         """Begin with small steps at the best of these points."""
-        usable = evaluated.counted & (evaluated.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
-        u = jnp.where(usable[:, None], evaluated.u, 0.5)
+        u, score = _judged(evaluated)
         # The best of all calls so far is the mean of the run that would begin now.
         better = jnp.min(score, initial=jnp.inf) < state.best
         found = _reserved(state._replace(reserve_score=jnp.float32(jnp.inf)), u, score)
-        begun = self._begin(found, cube, jnp.array(True))
+        begun = self._begin(found, cube, jnp.array(True), jnp.float32(self.small_step))
         return _where(better, begun._replace(best=found.reserve_score), state)
 
     def _explores(self, state: CMAESState, batch: int) -> Bool[Array, " batch"]:
@@ -182,15 +174,14 @@ class CMAES(Search):
         self, key: Key[Array, ""], state: CMAESState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
         """Points of the Gaussian, and of the choices."""
-        plain, codes = _gaussian(cube), _unordered(cube)
+        plain, codes = _plain(cube), _codes(cube)
         sizes = [batch * len(plain), batch * len(codes)]
         # Drawn flat and kept: to compile it takes a fifth of the time.
         random = jax.lax.optimization_barrier(jax.random.uniform(key, (sum(sizes),), jnp.float32))
         normal, draw = jnp.split(random, [sizes[0]])
         normal = ndtri(jnp.maximum(normal, np.float32(2**-25))).reshape(batch, len(plain))
-        x = state.mean + state.size * _coloured(state.covariance, normal)
         u = jnp.full((batch, cube.dim), 0.5, jnp.float32)
-        u = u.at[:, plain].set(jnp.clip(x, 0.0, 1.0))
+        u = u.at[:, plain].set(jnp.clip(state.gaussian.draw(normal), 0.0, 1.0))
         if len(codes) == 0:
             return u
         limits = jnp.cumsum(state.choices, axis=1)
@@ -201,64 +192,89 @@ class CMAES(Search):
         return u.at[:, codes].set(cube.centres(cells)[:, among])
 
     def _next(self, state: CMAESState, cube: Cube) -> CMAESState:
-        """After a whole generation: learn from it, or begin a new run."""
-        n = len(_gaussian(cube))
-        population = len(state.score)
+        """After a whole generation: learn from it, wait, or begin another run."""
+        following = _where(state.rest > 0, self._wait(state, cube), self._learn(state, cube))
+        empty = jnp.full_like(state.score, jnp.inf)
+        return following._replace(score=empty, filled=jnp.int32(0))
+
+    def _learn(self, state: CMAESState, cube: Cube) -> CMAESState:
         there = jnp.isfinite(state.score)
         worst = jnp.max(state.score, where=there, initial=-jnp.inf)
         least = jnp.min(state.score, where=there, initial=jnp.inf)
-        informed = (least < worst) | (least == 0)
         better = (least < 0.99 * state.best) | ((least == 0) & (state.best > 0))
-        stale = jnp.where(better, 0, state.stale + 1).astype(jnp.int32)
-
-        weights = _weights(state.score)
-        placed = self._place(state, cube, weights)
-        moved = self._move(state, cube, weights)
-        learned = _where(state.generation == 0, placed, moved)
-        learned = learned._replace(
-            choices=_chosen(state, cube, weights),
+        weights = recombination(state.score)
+        points = state.u[:, _plain(cube)]
+        # A generation of the prior says where the run begins.
+        placed = state.gaussian._replace(mean=weights @ points)
+        gaussian = _where(state.generation == 0, placed, state.gaussian.learn(points, weights))
+        gaussian = gaussian._replace(size=jnp.minimum(gaussian.size, 1.0))
+        learned = state._replace(
+            gaussian=gaussian.widened(_margins(cube)),
+            choices=_learned(state, cube, weights),
             generation=state.generation + 1,
-            best=jnp.minimum(least, state.best),
-            stale=stale,
         )
         # Without differences between points there is nothing to learn.
-        learned = _where(informed, learned, state._replace(stale=stale))
-        empty = jnp.full(population, jnp.inf, jnp.float32)
-        learned = learned._replace(score=empty, filled=jnp.int32(0))
+        learned = _where((least < worst) | (least == 0), learned, state)
+        learned = learned._replace(
+            best=jnp.minimum(least, state.best),
+            stale=jnp.where(better, 0, state.stale + 1).astype(jnp.int32),
+            length=state.length + 1,
+        )
+        return _where(self._over(learned, cube), self._after(learned, cube), learned)
 
-        variance = (
-            learned.covariance
-            if learned.covariance.ndim == 1
-            else (jnp.diagonal(learned.covariance))
-        )
-        widest = learned.size * jnp.sqrt(jnp.max(variance, initial=0.0))
-        ended = (learned.failures >= max(self.failures, 2 * population)) | (
-            (stale >= self.patience + 5 * n // population) & (state.generation > 0)
-        )
+    def _over(self, state: CMAESState, cube: Cube) -> Bool[Array, ""]:
+        """Whether a run has failed often enough, or leads nowhere."""
+        n, population = len(_plain(cube)), len(state.score)
+        stuck = state.stale >= self.patience + 5 * n // population
         if n:
-            ended |= (widest < self.least_std) | ~jnp.isfinite(widest)
-        small = (learned.run % 2 == 0) & jnp.isfinite(learned.reserve_score)
-        return _where(ended, self._begin(learned, cube, small), learned)
+            widest = state.gaussian.size * jnp.sqrt(jnp.max(state.gaussian.variance()))
+            stuck |= (widest < self.least_std) | ~jnp.isfinite(widest)
+        failed = state.failures >= max(self.failures, 2 * population)
+        return failed | (stuck & (state.generation > 0))
 
-    def _begin(self, state: CMAESState, cube: Cube, small: Bool[Array, ""]) -> CMAESState:
-        """A new run: with small steps around the reserve, or with a generation of the prior."""
-        plain, codes = _gaussian(cube), _unordered(cube)
-        prior = jnp.asarray(_prior(cube))
-        choices = prior
+    def _after(self, state: CMAESState, cube: Cube) -> CMAESState:
+        """What follows a run: another one, or first many points of the prior."""
+        fruitful = (state.failures > 0) | (state.reserve_score == 0)
+        fruitless = jnp.where(fruitful, 0, state.fruitless + 1).astype(jnp.int32)
+        small = (state.run % 2 == 0) & jnp.isfinite(state.reserve_score)
+        small |= state.reserve_score == 0
+        next_run = self._begin(state, cube, small, jnp.float32(self.small_step))
+        # The best point so far remains that until there is a run at it.
+        waiting = self._begin(state, cube, jnp.array(False), jnp.float32(self.step))
+        waiting = waiting._replace(
+            reserve_score=state.reserve_score,
+            fruitless=fruitless,
+            rest=jnp.minimum(fruitless * state.length, 1000),
+        )
+        return _where(fruitful, next_run._replace(fruitless=fruitless), waiting)
+
+    def _wait(self, state: CMAESState, cube: Cube) -> CMAESState:
+        """After a generation of the prior between two runs."""
+        waiting = _reserved(state, state.u, state.score)._replace(rest=state.rest - 1)
+        over = (waiting.rest == 0) | (waiting.reserve_score == 0)
+        size = jnp.where(state.run % 2 == 0, self.step, self.small_step)
+        begun = self._begin(waiting, cube, jnp.array(True), size)._replace(run=state.run)
+        return _where(over & jnp.isfinite(waiting.reserve_score), begun, waiting)
+
+    def _begin(
+        self, state: CMAESState, cube: Cube, there: Bool[Array, ""], size: Float[Array, ""]
+    ) -> CMAESState:
+        """A new run: at the reserve with steps of this size, or with a generation of the prior."""
+        plain, codes = _plain(cube), _codes(cube)
+        choices = prior = jnp.asarray(_prior(cube))
         if len(codes):
             among = np.searchsorted(cube.discrete, codes)
             cell = cube.cells(state.reserve)[among]
             choices = 0.5 * prior + 0.5 * jax.nn.one_hot(cell, prior.shape[1])
-        full = state.covariance.ndim == 2
-        begun = state._replace(
+        size = jnp.where(there, size, self.step).astype(jnp.float32)
+        gaussian = Evolution.begin(state.reserve[plain], size, len(plain) <= self.full_up_to)
+        return state._replace(
             run=state.run + 1,
-            generation=jnp.where(small, 1, 0).astype(jnp.int32),
-            mean=state.reserve[plain],
-            size=jnp.where(small, self.small_step, self.step).astype(jnp.float32),
-            covariance=jnp.eye(len(plain)) if full else jnp.ones(len(plain)),
-            way=jnp.zeros_like(state.way),
-            whitened=jnp.zeros_like(state.whitened),
-            choices=jnp.where(small, choices, prior),
+            generation=jnp.where(there, 1, 0).astype(jnp.int32),
+            length=jnp.int32(0),
+            rest=jnp.int32(0),
+            gaussian=gaussian.widened(_margins(cube)),
+            choices=jnp.where(there, choices, prior),
             score=jnp.full_like(state.score, jnp.inf),
             filled=jnp.int32(0),
             best=jnp.float32(jnp.inf),
@@ -266,73 +282,14 @@ class CMAES(Search):
             failures=jnp.int32(0),
             reserve_score=jnp.float32(jnp.inf),
         )
-        return _widened(begun, cube)
-
-    def _place(
-        self, state: CMAESState, cube: Cube, weights: Float[Array, " population"]
-    ) -> CMAESState:
-        """After the generation of the prior: where the run begins."""
-        mean = weights @ state.u[:, _gaussian(cube)]
-        return _widened(state._replace(mean=mean), cube)
-
-    def _move(
-        self, state: CMAESState, cube: Cube, weights: Float[Array, " population"]
-    ) -> CMAESState:
-        """One step of the strategy; names in comments are those of the tutorial."""
-        n = len(_gaussian(cube))
-        if n == 0:
-            return state
-        steps = (state.u[:, _gaussian(cube)] - state.mean) / state.size
-        white = _whitened(state.covariance, steps)
-        # Points that others replaced may be far out: as for injected ones, their steps are cut
-        # (Hansen, Injecting external solutions into CMA-ES, 2011).
-        norm = jnp.sqrt(jnp.sum(white**2, axis=1, keepdims=True))
-        most = math.sqrt(n) + 2 * n / (n + 2)
-        cut = jnp.minimum(1.0, most / jnp.maximum(norm, 1e-12))
-        steps, white = steps * cut, white * cut
-
-        mass = 1 / jnp.sum(weights**2)  # mu_eff
-        size_rate = (mass + 2) / (n + mass + 5)  # c_sigma
-        damping = 1 + 2 * jnp.maximum(0, jnp.sqrt((mass - 1) / (n + 1)) - 1) + size_rate
-        way_rate = (4 + mass / n) / (n + 4 + 2 * mass / n)  # c_c
-        one = 2 / ((n + 1.3) ** 2 + mass)  # c_1
-        many = 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)  # c_mu
-        if state.covariance.ndim == 1:
-            one, many = (jnp.minimum(rate * (n + 2) / 3, 0.5) for rate in (one, many))
-        many = jnp.clip(many, 0.0, 1 - one)
-
-        step = weights @ steps
-        mean = jnp.clip(state.mean + state.size * step, 0.0, 1.0)
-        gain = jnp.sqrt(size_rate * (2 - size_rate) * mass)
-        whitened = (1 - size_rate) * state.whitened + gain * (weights @ white)
-        length = jnp.sqrt(jnp.sum(whitened**2))
-        expected = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
-        growth = size_rate / damping * (length / expected - 1)
-        size = jnp.minimum(state.size * jnp.exp(jnp.minimum(growth, 1.0)), 1.0)
-
-        age = state.generation.astype(jnp.float32)
-        unbiased = jnp.sqrt(1 - (1 - size_rate) ** (2 * age))
-        steady = length / unbiased < (1.4 + 2 / (n + 1)) * expected  # h_sigma
-        gain = jnp.sqrt(way_rate * (2 - way_rate) * mass)
-        way = (1 - way_rate) * state.way + steady * gain * step
-        kept = 1 - one - many + one * (1 - steady) * way_rate * (2 - way_rate)
-        if state.covariance.ndim == 1:
-            covariance = kept * state.covariance + one * way**2 + many * (weights @ steps**2)
-        else:
-            spread = (weights * steps.T) @ steps
-            covariance = kept * state.covariance + one * jnp.outer(way, way) + many * spread
-        return _widened(
-            state._replace(mean=mean, size=size, covariance=covariance, way=way, whitened=whitened),
-            cube,
-        )
 
 
-def _gaussian(cube: Cube) -> Int[np.ndarray, " n"]:
+def _plain(cube: Cube) -> Int[np.ndarray, " n"]:
     """Indices of the coordinates that the Gaussian has."""
-    return np.setdiff1d(np.arange(cube.dim), _unordered(cube))
+    return np.setdiff1d(np.arange(cube.dim), _codes(cube))
 
 
-def _unordered(cube: Cube) -> Int[np.ndarray, " k"]:
+def _codes(cube: Cube) -> Int[np.ndarray, " k"]:
     """Indices of the coordinates that have probabilities."""
     return np.array(
         [i for i in cube.discrete if not cube.ordered[i] and cube.levels[i] <= MOST_CELLS], np.int64
@@ -340,7 +297,7 @@ def _unordered(cube: Cube) -> Int[np.ndarray, " k"]:
 
 
 def _prior(cube: Cube) -> Float[np.ndarray, "k cells"]:
-    codes = _unordered(cube)
+    codes = _codes(cube)
     prior = np.zeros((len(codes), max((cube.levels[i] for i in codes), default=0)), np.float32)
     for row, j in zip(prior, np.searchsorted(cube.discrete, codes), strict=True):
         row[: len(cube.probabilities[j])] = cube.probabilities[j]
@@ -353,24 +310,11 @@ def _population(cube: Cube, batch: int) -> int:
     return batch * -(-least // batch)
 
 
-def _weights(score: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Of the recombination: logarithmic in the rank, zero in the worse half, equal where tied."""
-    there = jnp.isfinite(score)
-    count = jnp.sum(there).astype(jnp.float32)
-    rank = jnp.argsort(jnp.argsort(score)).astype(jnp.float32)
-    weight = jnp.maximum(jnp.log((count + 1) / 2) - jnp.log(rank + 1), 0.0)
-    # A single point is all that there is.
-    weight = jnp.where(there, jnp.where(count > 1, weight, 1.0), 0.0)
-    tied = (score[:, None] == score[None]) & there
-    weight = jnp.where(there, (tied @ weight) / jnp.maximum(jnp.sum(tied, axis=1), 1), 0.0)
-    return weight / jnp.maximum(jnp.sum(weight), 1e-12)
-
-
-def _chosen(
+def _learned(
     state: CMAESState, cube: Cube, weights: Float[Array, " population"]
 ) -> Float[Array, "k cells"]:
     """Probabilities of the unordered cells after this generation."""
-    codes = _unordered(cube)
+    codes = _codes(cube)
     if len(codes) == 0:
         return state.choices
     cell = cube.cells(state.u)[:, np.searchsorted(cube.discrete, codes)]
@@ -380,6 +324,20 @@ def _chosen(
     # So that on average one coordinate in every third point leaves what was learned.
     kept = 1 - 1 / (3 * len(codes))
     return kept * learned + (1 - kept) * prior
+
+
+def _margins(cube: Cube) -> Float[np.ndarray, " n"]:
+    """Least standard deviation of each coordinate of the Gaussian."""
+    return np.array(
+        [MARGIN / cube.levels[i] if cube.levels[i] else 0.0 for i in _plain(cube)], np.float32
+    )
+
+
+def _judged(evaluated: Evaluated) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+    """Points and their scores: 0 for all failures, infinite where there is no verdict."""
+    usable = evaluated.counted & (evaluated.rho < jnp.inf)
+    score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
+    return jnp.where(usable[:, None], evaluated.u, 0.5), score
 
 
 def _reserved(state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n"]) -> CMAESState:
@@ -392,37 +350,5 @@ def _reserved(state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n
     )
 
 
-def _coloured(covariance: Array, normal: Float[Array, "batch n"]) -> Float[Array, "batch n"]:
-    if covariance.ndim == 1:
-        return jnp.sqrt(covariance) * normal
-    return normal @ jnp.linalg.cholesky(covariance).T
-
-
-def _whitened(covariance: Array, steps: Float[Array, "m n"]) -> Float[Array, "m n"]:
-    if covariance.ndim == 1:
-        return steps / jnp.sqrt(covariance)
-    return solve_triangular(jnp.linalg.cholesky(covariance), steps.T, lower=True).T
-
-
-def _widened(state: CMAESState, cube: Cube) -> CMAESState:
-    """With deviations that reach the neighbouring cells, and a covariance that has a factor."""
-    plain = _gaussian(cube)
-    if len(plain) == 0:
-        return state
-    least = np.array([MARGIN / cube.levels[i] if cube.levels[i] else 0.0 for i in plain])
-    full = state.covariance.ndim == 2
-    variance = jnp.diagonal(state.covariance) if full else state.covariance
-    # A direction may become narrow, but not so that 32 bits lose it.
-    floor = jnp.maximum(1e-6 * jnp.max(variance), 1e-12)
-    std = state.size * jnp.sqrt(jnp.maximum(variance, floor))
-    factor = jnp.maximum(least.astype(np.float32) / std, 1.0)
-    if full:
-        covariance = state.covariance + floor * jnp.eye(len(plain), dtype=jnp.float32)
-        covariance = factor[:, None] * covariance * factor
-    else:
-        covariance = factor**2 * jnp.maximum(state.covariance, floor)
-    return state._replace(covariance=covariance)
-
-
-def _where(condition: Bool[Array, ""], one: CMAESState, other: CMAESState) -> CMAESState:
+def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

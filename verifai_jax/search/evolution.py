@@ -1,0 +1,133 @@
+"""One step of CMA-ES: a Gaussian learns from points and their ranks.
+
+Hansen, The CMA Evolution Strategy: A Tutorial, 2016: rates are the defaults of its table 1, for
+weights that are not negative. A Cholesky factor stands for the symmetric root of the covariance
+(Krause, Arbones, Igel, A CMA-ES with optimal covariance update and storage complexity, 2016). A
+covariance of shape `[n]` is a diagonal one, which learns faster by a factor (Ros, Hansen, A simple
+modification in CMA-ES achieving linear time and space complexity, 2008).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Float
+
+
+class Evolution(NamedTuple):
+    mean: Float[Array, " n"]
+    size: Float[Array, ""]  # of the step
+    covariance: Float[Array, "n *n"]  # over the squared size; or its diagonal
+    way: Float[Array, " n"]  # evolution paths, of the covariance and of the size
+    whitened: Float[Array, " n"]
+    age: Float[Array, ""]  # steps taken
+
+    @classmethod
+    def begin(cls, mean: Float[Array, " n"], size: Float[Array, ""], full: bool) -> "Evolution":
+        n = len(mean)
+        return cls(
+            mean=mean,
+            size=size,
+            covariance=jnp.eye(n, dtype=jnp.float32) if full else jnp.ones(n, jnp.float32),
+            way=jnp.zeros(n, jnp.float32),
+            whitened=jnp.zeros(n, jnp.float32),
+            age=jnp.float32(0),
+        )
+
+    def variance(self) -> Float[Array, " n"]:
+        """Of each coordinate, over the squared size."""
+        return jnp.diagonal(self.covariance) if self.covariance.ndim == 2 else self.covariance
+
+    def draw(self, normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
+        """Points of the Gaussian, from standard normal numbers."""
+        if self.covariance.ndim == 1:
+            return self.mean + self.size * jnp.sqrt(self.covariance) * normal
+        return self.mean + self.size * normal @ jnp.linalg.cholesky(self.covariance).T
+
+    def learn(self, points: Float[Array, "m n"], weights: Float[Array, " m"]) -> "Evolution":
+        """After points with these recombination weights; in comments the tutorial's names."""
+        n = len(self.mean)
+        if n == 0:
+            return self
+        steps = (points - self.mean) / self.size
+        white = self._white(steps)
+        # Points that others replaced may be far out: as for injected ones, their steps are cut
+        # (Hansen, Injecting external solutions into CMA-ES, 2011).
+        norm = jnp.sqrt(jnp.sum(white**2, axis=1, keepdims=True))
+        most = math.sqrt(n) + 2 * n / (n + 2)
+        cut = jnp.minimum(1.0, most / jnp.maximum(norm, 1e-12))
+        steps, white = steps * cut, white * cut
+
+        mass = 1 / jnp.maximum(jnp.sum(weights**2), 1e-12)  # mu_eff
+        size_rate = (mass + 2) / (n + mass + 5)  # c_sigma
+        damping = 1 + 2 * jnp.maximum(0, jnp.sqrt((mass - 1) / (n + 1)) - 1) + size_rate
+        way_rate = (4 + mass / n) / (n + 4 + 2 * mass / n)  # c_c
+        one = 2 / ((n + 1.3) ** 2 + mass)  # c_1
+        many = 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)  # c_mu
+        if self.covariance.ndim == 1:
+            one, many = (jnp.minimum(rate * (n + 2) / 3, 0.5) for rate in (one, many))
+        many = jnp.clip(many, 0.0, 1 - one)
+
+        step = weights @ steps
+        gain = jnp.sqrt(size_rate * (2 - size_rate) * mass)
+        whitened = (1 - size_rate) * self.whitened + gain * (weights @ white)
+        length = jnp.sqrt(jnp.sum(whitened**2))
+        expected = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
+        growth = size_rate / damping * (length / expected - 1)
+
+        unbiased = jnp.sqrt(1 - (1 - size_rate) ** (2 * (self.age + 1)))
+        steady = length / unbiased < (1.4 + 2 / (n + 1)) * expected  # h_sigma
+        gain = jnp.sqrt(way_rate * (2 - way_rate) * mass)
+        way = (1 - way_rate) * self.way + steady * gain * step
+        kept = 1 - one - many + one * (1 - steady) * way_rate * (2 - way_rate)
+        if self.covariance.ndim == 1:
+            covariance = kept * self.covariance + one * way**2 + many * (weights @ steps**2)
+        else:
+            spread = (weights * steps.T) @ steps
+            covariance = kept * self.covariance + one * jnp.outer(way, way) + many * spread
+        return Evolution(
+            mean=self.mean + self.size * step,
+            size=self.size * jnp.exp(jnp.minimum(growth, 1.0)),
+            covariance=covariance,
+            way=way,
+            whitened=whitened,
+            age=self.age + 1,
+        )
+
+    def widened(self, least: Float[np.ndarray, " n"]) -> "Evolution":
+        """With standard deviations of at least `least`, and a covariance that has a factor."""
+        if len(self.mean) == 0:
+            return self
+        # A direction may become narrow, but not so that 32 bits lose it.
+        variance = self.variance()
+        floor = jnp.maximum(1e-6 * jnp.max(variance), 1e-12)
+        std = self.size * jnp.sqrt(jnp.maximum(variance, floor))
+        factor = jnp.maximum(least.astype(np.float32) / std, 1.0)
+        if self.covariance.ndim == 1:
+            return self._replace(covariance=factor**2 * jnp.maximum(variance, floor))
+        covariance = self.covariance + floor * jnp.eye(len(self.mean), dtype=jnp.float32)
+        return self._replace(covariance=factor[:, None] * covariance * factor)
+
+    def _white(self, steps: Float[Array, "m n"]) -> Float[Array, "m n"]:
+        if self.covariance.ndim == 1:
+            return steps / jnp.sqrt(self.covariance)
+        factor = jnp.linalg.cholesky(self.covariance)
+        return solve_triangular(factor, steps.T, lower=True).T
+
+
+def recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Weights of points: logarithmic in the rank, zero in the worse half, equal where tied.
+
+    Points of infinite score have none.
+    """
+    there = jnp.isfinite(score)
+    count = jnp.sum(there).astype(jnp.float32)
+    rank = jnp.argsort(jnp.argsort(score)).astype(jnp.float32)
+    weight = jnp.maximum(jnp.log((count + 1) / 2) - jnp.log(rank + 1), 0.0)
+    # A single point is all that there is.
+    weight = jnp.where(there, jnp.where(count > 1, weight, 1.0), 0.0)
+    tied = (score[:, None] == score[None]) & there
+    weight = jnp.where(there, (tied @ weight) / jnp.maximum(jnp.sum(tied, axis=1), 1), 0.0)
+    return weight / jnp.maximum(jnp.sum(weight), 1e-12)
