@@ -6,7 +6,8 @@ multiarmed bandit problem, Machine Learning 47, 2002). VerifAI has such a search
 batches and learns before the first failure:
 
 - rewards come from ranks: the best point of those remembered has 1, points outside of the best
-  share have 0, and all failures are equally good. So any robustness will do;
+  share have 0, so that any robustness will do. All failures are equally good and share their
+  ranks: the more of them there are, the less is one worth, and the search looks elsewhere too;
 - only the last points are remembered (sliding-window UCB: Garivier, Moulines, On upper-confidence
   bound policies for switching bandits, 2011), as what a coordinate is worth changes while the
   others learn;

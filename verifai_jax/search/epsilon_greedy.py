@@ -191,7 +191,9 @@ class EpsilonGreedy(Search):
         scores = jnp.concatenate([score, state.score])
         _, best = jax.lax.top_k(-scores, len(state.score))
         level, before = scores[best[-1]], state.score[-1]
-        progress = jnp.isinf(before) | (level < 0.99 * before)
+        # By a hundredth of what is between them and the prior, wherever zero is.
+        far = jnp.maximum(self._median(state) - before, 0.0)
+        progress = jnp.isinf(before) | (level < before - 0.01 * far)
         stale = jnp.where(progress, 0, state.stale + len(score)).astype(jnp.int32)
         return state._replace(best=points[best], score=scores[best], stale=stale)
 
