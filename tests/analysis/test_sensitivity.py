@@ -123,7 +123,10 @@ def test_noise_is_an_input_of_its_own():
 
 
 def test_elementary_effects_of_a_linear_function_are_its_slopes(mixed):
-    found = morris(mixed, trajectories=64).table
+    result = morris(mixed, trajectories=64)
+    found = result.table
+    assert "moves the robustness by 3 (3 to 3) over its range" in str(result)
+    assert ", up on average" in str(result)
     # Over the whole range: 2 for real, 3 between the choices, 2 for whole from 0 to 4.
     for name, effect in {"real": 2.0, "kind": 3.0, "whole": 2.0, "none": 0.0}.items():
         assert found.loc[name, "mu_star"] == pytest.approx(effect, abs=1e-4)

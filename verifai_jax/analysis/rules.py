@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from verifai_jax.analysis.columns import Column
 from verifai_jax.analysis.conditions import Condition, Region, everywhere
 from verifai_jax.analysis.samples import Samples, whole
+from verifai_jax.analysis.trees import proposals
 from verifai_jax.rates import Rate, clopper_pearson
 from verifai_jax.run import Run
 
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
 
 FEWEST = 10
 """Failing rows, and safe rows, from which on some are kept aside."""
-MOST_ONE_HOT = 30
-MOST_ENTRIES = 500_000
-"""Rows times columns that a tree is made from; regions are scored on all rows."""
 WORTH = 1.02
 """By how much a condition must raise the score of a rule."""
 
@@ -276,7 +274,7 @@ def _chosen(
         best, grown = everywhere(values.shape[1], codes.shape[1]), True
         while grown:
             rows = remaining & best.covers(values, codes)
-            tried = _proposals(best, values[rows], codes[rows], failing[rows], unordered, depth)
+            tried = proposals(best, values[rows], codes[rows], failing[rows], unordered, depth)
             tried = [region for region in tried if region.size <= depth]
             finer = max(tried, key=score, default=best)
             grown = score(finer) > WORTH * score(best)
@@ -300,91 +298,6 @@ def _simplified(region: Region, score: Any) -> Region:
             break
         region, value = best, score(best)
     return region
-
-
-def _proposals(
-    start: Region,
-    values: Float[np.ndarray, "n k"],
-    codes: Int[np.ndarray, "n m"],
-    failing: Bool[np.ndarray, " n"],
-    unordered: tuple[Column, ...],
-    depth: int,
-) -> list[Region]:
-    """Parts of `start`: all nodes of trees that weigh failing rows as they are, or like safe ones.
-
-    The rows are those inside `start`.
-    """
-    if failing.all() or not failing.any():
-        return []
-    from sklearn.tree import DecisionTreeClassifier
-
-    matrix, meanings = _encoded(values, codes, failing, unordered)
-    if not matrix.shape[1]:
-        return []
-    rows = _few(failing, int(MOST_ENTRIES // matrix.shape[1]))
-    leaf = int(np.clip(failing[rows].sum() // 10, 1, 5))
-    found: list[Region] = []
-    for weight in (None, "balanced"):
-        tree = DecisionTreeClassifier(
-            max_depth=depth, min_samples_leaf=leaf, class_weight=weight, random_state=0
-        )
-        nodes = tree.fit(matrix[rows], failing[rows]).tree_
-        stack = [(0, start)]
-        while stack:
-            node, region = stack.pop()
-            if node:
-                found.append(region)
-            if nodes.children_left[node] < 0:
-                continue
-            column, edge = meanings[nodes.feature[node]], nodes.threshold[node]
-            stack.append((nodes.children_right[node], _part(region, column, edge, upper=True)))
-            stack.append((nodes.children_left[node], _part(region, column, edge, upper=False)))
-    return found
-
-
-def _few(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
-    """Rows that trees are made from where there are too many: rare verdicts are kept."""
-    if len(failing) <= most:
-        return np.arange(len(failing))
-    parts = []
-    for part in (np.flatnonzero(failing), np.flatnonzero(~failing)):
-        parts.append(part[:: max(1, -(-2 * len(part) // most))])
-    return np.concatenate(parts)
-
-
-def _encoded(
-    values: Float[np.ndarray, "n k"],
-    codes: Int[np.ndarray, "n m"],
-    failing: Bool[np.ndarray, " n"],
-    unordered: tuple[Column, ...],
-) -> tuple[Float[np.ndarray, "n e"], list[tuple[int, Any]]]:
-    """Columns that a tree can split, and what each means.
-
-    An ordered column stands for itself. An unordered one is given by a column for each choice, and
-    by its choices ranked by their share of failures: a cut in that order is the best subset.
-    """
-    columns = list(values.T)
-    meanings: list[tuple[int, Any]] = [(j, None) for j in range(values.shape[1])]
-    for j, column in enumerate(unordered):
-        count = len(column.choices)
-        present = codes[:, j] >= 0
-        seen = np.bincount(codes[present, j], minlength=count)
-        bad = np.bincount(codes[present & failing, j], minlength=count)
-        ranks = np.argsort(np.argsort(bad / np.maximum(seen, 1), kind="stable"), kind="stable")
-        columns.append(np.where(present, ranks[np.maximum(codes[:, j], 0)], -1).astype(float))
-        meanings.append((j, ranks))
-        if count <= MOST_ONE_HOT:
-            for place in range(count):
-                columns.append((codes[:, j] == place).astype(float))
-                meanings.append((j, (np.arange(count) == place).astype(int)))
-    return np.stack(columns, axis=1) if columns else values, meanings
-
-
-def _part(region: Region, column: tuple[int, Any], edge: float, *, upper: bool) -> Region:
-    j, ranks = column
-    if ranks is None:
-        return region.bounded(j, above=edge) if upper else region.bounded(j, upto=edge)
-    return region.restricted(j, frozenset(np.flatnonzero((ranks > edge) == upper).tolist()))
 
 
 def _measured(

@@ -198,10 +198,10 @@ def _words(method: str, row: Any) -> str:
         alone = f"{100 * max(row['first'], 0):5.1f} % alone"
         return f"{100 * row['total']:5.1f} % of the variance in all ({between}), {alone}"
     if "mu_star" in row:
-        way = "" if np.isnan(row["mu"]) else f", {'up' if row['mu'] > 0 else 'down'} on average"
+        way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
         return (
             f"moves the robustness by {row['mu_star']:.3g} ({row['low']:.3g} to {row['high']:.3g})"
-            f"{way}, differently by {row['sigma']:.3g}"
+            f" over its range, standard deviation {row['sigma']:.3g}{way}"
         )
     if np.isnan(row["bound"]):
         return "discrete: has no gradient"
