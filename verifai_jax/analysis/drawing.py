@@ -85,3 +85,8 @@ def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
         if name in columns and not columns[name].ordered:
             choices = columns[name].choices
             axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])
+
+
+def shortened(text: str, most: int = 60) -> str:
+    """At most so many characters; the end of a name says more than its middle."""
+    return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from verifai_jax.analysis.columns import feature_columns
+from verifai_jax.analysis.drawing import shortened
 from verifai_jax.analysis.samples import Samples, Scale, Which, beside, generator, whole
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
@@ -294,16 +295,14 @@ def _plot(components: Components, path: str | Path | None) -> Any:
         bars.barh(
             place, directions[i][shown], height * 0.9, color=color, label=f"component {i + 1}"
         )
-    bars.set_yticks(np.arange(len(shown)), [names[j] for j in shown])
+    bars.set_yticks(np.arange(len(shown)), [shortened(names[j], 28) for j in shown])
     bars.invert_yaxis()
     bars.axvline(0, color=BOUND, linewidth=0.8)
     bars.set_xlim(-1.05, 1.05)
     bars.set_xlabel("loading")
     tidy(bars)
     if len(directions):
-        bars.legend(
-            frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3
-        )
+        figure.legend(frameon=False, fontsize=8, loc="outside lower right", ncols=3)
     left = f"; {len(names) - len(shown)} columns not drawn" if len(names) > len(shown) else ""
     figure.suptitle(f"Principal components of {samples.kind}{left}", fontsize=10)
     return show_or_save(figure, path)

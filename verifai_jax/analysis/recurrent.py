@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.analysis.columns import Column
+from verifai_jax.analysis.drawing import shortened
 from verifai_jax.analysis.samples import Samples, Which, whole
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
@@ -355,17 +356,13 @@ def _plot(found: Recurrent, path: str | Path | None) -> Any:
         for y, row in zip(place, rows, strict=True):
             if np.isfinite(row.lift):
                 right = max(row.share, row.expected)
-                axes.text(right + 0.015, y, f"{row.lift:.2g}x", va="center", fontsize=8)
-    axes.set_yticks(place, [_shortened(text) for text in shown["combination"]])
+                axes.text(right + 0.015, y, f"{row.lift:.2f}x", va="center", fontsize=8)
+    axes.set_yticks(place, [shortened(text) for text in shown["combination"]])
     axes.invert_yaxis()
     axes.set_xlim(0, min(1.1, 1.15 * max(shown[["share", "expected"]].max().max(), 0.05)))
     axes.set_xlabel("share")
     tidy(axes)
     axes.grid(visible=False, axis="y")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
     figure.suptitle(f"Recurrent values, {found.samples.kind}", fontsize=10)
     return show_or_save(figure, path)
-
-
-def _shortened(text: str, most: int = 60) -> str:
-    return text if len(text) <= most else text[: most - 3] + "..."
