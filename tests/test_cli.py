@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from verifai_jax.cli import main
+from verifai_jax.run import load
 
 ROOT = Path(__file__).parent.parent
 PROBLEM = """
@@ -19,6 +20,7 @@ ramp = vj.Problem(
     system=lambda f, key: vj.Trace({"x": f["a"] + f["b"] * jnp.linspace(0, 1, 9)}, dt=1 / 8),
     spec="always[0, 1] x <= 1",
     description="a ramp that should stay below one",
+    nominal={"a": 0.5, "b": 0.25},
 )
 flat = vj.Problem("flat", ramp.space, ramp.system, "eventually x > 0.5")
 """
@@ -74,6 +76,42 @@ def test_options_of_a_search(call, tmp_path):
     )
     assert "0.3" in json.loads((tmp_path / "here" / "run.json").read_text())["search"]
     assert "here" in output
+
+
+def test_resume_goes_on_in_the_same_folder(call, tmp_path):
+    start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--batch", 16]
+    call(*start, "--budget", 48, "--only", "b", "--out", "one", "--no-pictures")
+    call("falsify", "--resume", "one", "--only", "b", "--budget", 80, "--no-pictures")
+    call(*start, "--budget", 80, "--only", "b", "--out", "two", "--no-pictures")
+    one, two = (load(tmp_path / name).table.all for name in ("one", "two"))
+    assert one.equals(two)
+    assert set(one["a"]) == {0.5}
+    output = call("falsify", "--resume", "one", "--budget", 99, code=1)
+    assert "its feature 'a' was" in output
+    output = call("falsify", "--resume", "one", "--seed", 3, code=2)
+    assert "--seed is fixed in the run that --resume goes on with" in output
+
+
+def test_ends_and_warm_start(call):
+    ramp = ["falsify", "specs/ramp.py:ramp", "--batch", 64, "--no-pictures"]
+    output = call(*ramp, "--search", "uniform", "--within", 0.1, "--out", "prior")
+    assert "stopped by stop_when" in output
+    assert "whenever stopped" in output
+    output = call(*ramp, "--search", "uniform", "--decide", 0.6, "--out", "decided")
+    assert "stopped by stop_when" in output
+    output = call(*ramp, "--warm-start", "prior", "--budget", 64, "--out", "warm")
+    assert "64 simulations" in output
+    assert "give one" in call(*ramp, "--within", 0.1, "--decide", 0.1, code=2)
+    assert "needs independent samples" in call(*ramp, "--within", 0.1, code=1)
+
+
+def test_analyze(call, tmp_path):
+    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 400, "--no-pictures")
+    output = call("analyze", "runs/ramp-1")
+    assert "Where it fails" in output
+    report = (tmp_path / "runs" / "ramp-1" / "analysis" / "report.md").read_text()
+    assert "Coverage" in report
+    assert (tmp_path / "runs/ramp-1/analysis/overview.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_list(call):

@@ -14,6 +14,9 @@ from verifai_jax.snapshot import STATE
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1), "kind": vj.Categorical("slow", "fast")}
 
 
+NOMINAL = {"a": 0.5, "b": 0.0, "kind": "slow"}
+
+
 def ramp(features, key):
     slope = features["a"] + 0.3 * features["b"] ** 2 + 0.1 * features["kind"]
     return vj.Trace({"x": slope * jnp.linspace(0, 1, 5)}, dt=0.25)
@@ -97,9 +100,19 @@ class TestRefused:
         with pytest.raises(vj.RunError, match="the saved state is not one of search CrossEntropy"):
             vj.resume(run, search=search.CrossEntropy(), budget=32)
 
+    def test_another_space(self, problem):
+        run = vj.falsify(problem, "halton", 16, batch=16)
+        other = vj.Problem(
+            "ramp", {**SPACE, "b": vj.Box(-1, 2)}, ramp, "always[0, 1] x <= 1.1", nominal=NOMINAL
+        )
+        with pytest.raises(ValueError, match="was over another space: its feature 'b' was"):
+            vj.resume(run, other, budget=32)
+        with pytest.raises(ValueError, match="its feature 'b' was"):
+            vj.resume(run, other.only("a", "kind"), budget=32)
+
     def test_a_search_of_ones_own_has_to_be_given(self, problem):
         run = vj.falsify(problem, Own(), 16, batch=16)
-        with pytest.raises(ValueError, match="is none of .*; give it"):
+        with pytest.raises(ValueError, match=r"is none of .*; give it"):
             vj.resume(run, budget=32)
         resumed = vj.resume(run, search=Own(), budget=32)
         assert same(resumed, vj.falsify(problem, Own(), 32, batch=16))

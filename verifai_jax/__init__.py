@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+from verifai_jax import analysis as analysis
 from verifai_jax import mtl as mtl
 from verifai_jax import search as search
 from verifai_jax.devices import claim_cores as _claim_cores

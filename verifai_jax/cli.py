@@ -93,20 +93,18 @@ def falsify(
     if within is not None or decide is not None:
         ends["stop_when"] = Decided(decide) if within is None else Within(within)  # pyright: ignore[reportArgumentType]
     if resume is not None:
-        fixed = {"--search": search, "--batch": batch, "--seed": seed, "--only": only, "--out": out}
+        fixed = {"--search": search, "--batch": batch, "--seed": seed, "--out": out}
         fixed |= {"--set": options or None, "--warm-start": warm_start}
         for option, value in fixed.items():
             if value is not None:
                 raise click.UsageError(f"{option} is fixed in the run that --resume goes on with")
-        problem = load_target(target or _recorded_target(resume))
+        problem = _only(load_target(target or _recorded_target(resume)), only)
         run = run_resume(resume, problem, budget=budget, **ends)
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     else:
         chosen = named(search or "cross_entropy", **_options(options))
-        problem = load_target(target)
-        if only is not None:
-            problem = problem.only(*(name.strip() for name in only.split(",")))
+        problem = _only(load_target(target), only)
         run = run_falsify(
             problem,
             chosen,
@@ -193,6 +191,21 @@ def replay(
 
 
 @main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--problem", "target", help="FILE.py:NAME of the problem [the one recorded].")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the report [the run's].")
+def analyze(folder: Path, target: str | None, out: Path | None) -> None:
+    """What the table of the run in FOLDER says: rules, importance, kinds of failures, coverage."""
+    from verifai_jax.run import load
+    from verifai_jax.targets import load_target
+
+    run = load(folder, load_target(target or _recorded_target(folder)))
+    found = run.analyze()
+    click.echo(str(found))
+    click.echo(f"  written      {found.save((out or folder) / 'analysis')}")
+
+
+@main.command()
 @click.argument("formula")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
@@ -258,6 +271,10 @@ def doctor() -> None:
     from verifai_jax.doctor import report
 
     click.echo(report())
+
+
+def _only(problem: Any, names: str | None) -> Any:
+    return problem if names is None else problem.only(*map(str.strip, names.split(",")))
 
 
 def _options(pairs: tuple[str, ...]) -> dict[str, Any]:

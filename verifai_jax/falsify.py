@@ -138,6 +138,7 @@ def resume(
             )
         search = searches.from_json(run.search_data)
     search = _check_search(problem, search)
+    _check_same_space(run, problem)
     _check_rule(search, stop_when)
     budget = run.budget if budget is None else budget
     _check_options(budget, run.batch, run.seed, max_seconds, stop_after)
@@ -221,6 +222,7 @@ def _play(
             problem=problem,
             budget=int(ends.budget),
             search_data=searches.to_json(search),
+            space_data=_described(problem),
             acceptance=rounds.acceptance,
             snapshot=rounds.snapshot,
         )
@@ -302,6 +304,28 @@ def _check_rule(search: Search, rule: StoppingRule | None) -> None:
             f"stop_when needs independent samples of the space, which search {search!r} does not "
             "give; use search='uniform'"
         )
+
+
+def _described(problem: Problem) -> dict[str, Any] | None:
+    try:
+        return problem.space.to_json()
+    except ValueError:
+        return None  # It has domains that only the user knows.
+
+
+def _check_same_space(run: Run, problem: Problem) -> None:
+    data = _described(problem)
+    if run.space_data is None or data is None or run.space_data == data:
+        return
+    was, now = dict(run.space_data["features"]), dict(data["features"])
+    for name in now:
+        if was.get(name) != now[name]:
+            raise ValueError(
+                f"the run of {run.name!r} was over another space: its feature {name!r} was "
+                f"{was.get(name)}, that of the given problem is {now[name]} (a run with --only is "
+                "resumed with the same --only)"
+            )
+    raise ValueError(f"the run of {run.name!r} was over a space with another constraint or order")
 
 
 def _earlier(warm_start: Any, problem: Problem) -> Any:

@@ -87,7 +87,8 @@ class Run:
     `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
     independent samples of the feature space; `folder` on disk, if any; `target`: how the command
     line names the problem; `problem` itself, None for a loaded run without one; `budget`;
-    `search_data`: the search as plain data, None for one of the user's own; `acceptance`: share of
+    `search_data` and `space_data`: the search and the space as plain data, None for one of the
+    user's own; `acceptance`: share of
     proposed points that the constraint of the space let through, None without one; `snapshot`: what
     `resume` goes on from.
     """
@@ -108,6 +109,7 @@ class Run:
     problem: Problem | None = None
     budget: int = 0
     search_data: Mapping[str, Any] | None = None
+    space_data: Mapping[str, Any] | None = None
     acceptance: float | None = None
     snapshot: Mapping[str, Any] | None = None
 
@@ -289,7 +291,7 @@ _RECORDED = (
     "prior",
     "target",
 )
-_ADDED = ("budget", "search_data", "acceptance")  # Absent from the records of 0.1.
+_ADDED = ("budget", "search_data", "space_data", "acceptance")  # Absent from the records of 0.1.
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
