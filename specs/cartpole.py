@@ -88,3 +88,28 @@ recover = vj.Problem(
     description="within 1 s after a push from 1.0 s to 1.1 s, be calm for half a second",
     draw=draw,
 )
+
+gusts = vj.Problem(
+    "gusts",
+    vj.FeatureSpace(
+        {
+            "x0": vj.TruncatedNormal(0.0, 0.4, -1.0, 1.0),
+            "theta0": vj.Box(-0.1, 0.1),
+            "masspole": vj.LogUniform(0.05, 0.5),
+            "length": vj.Box(0.25, 1.2),
+            "controller": vj.Categorical("network", "linear", weights=[0.7, 0.3]),
+            "wind": vj.Signal(vj.Box(-2.5, 2.5), knots=8, hold="linear"),
+        },
+        where=lambda f: f["masspole"] * f["length"] <= 0.3,
+    ),
+    cartpole.cartpole(cartpole.either(cartpole.neural(), cartpole.linear()), duration=4.0),
+    {
+        "safe": f"always[0, 4] ({ON_THE_TRACK} & {UPRIGHT})",
+        "centred": "always[0, 4] abs(x) <= 1.5",
+        "calm": "always[1, 4] abs(theta) <= 0.15",
+    },
+    priority=[("safe", "centred"), ("safe", "calm")],
+    nominal={**NOMINAL, "controller": "network", "wind": 0.0},
+    description="either controller in a gusty wind: safe first, then centred and calm",
+    draw=draw,
+)

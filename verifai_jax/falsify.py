@@ -325,7 +325,9 @@ def _check_same_space(run: Run, problem: Problem) -> None:
                 f"{was.get(name)}, that of the given problem is {now[name]} (a run with --only is "
                 "resumed with the same --only)"
             )
-    raise ValueError(f"the run of {run.name!r} was over a space with another constraint or order")
+    # The name of a constraint may change with the line it is written in.
+    if list(was) != list(now) or bool(run.space_data["where"]) != bool(data["where"]):
+        raise ValueError(f"the run of {run.name!r} was over a space of another order or constraint")
 
 
 def _earlier(warm_start: Any, problem: Problem) -> Any:
