@@ -9,6 +9,7 @@ from verifai_jax.devices import claim_cores as _claim_cores
 from verifai_jax.falsify import RunError as RunError
 from verifai_jax.falsify import falsify as falsify
 from verifai_jax.falsify import resume as resume
+from verifai_jax.falsify import simulate as simulate
 from verifai_jax.features import Array as Array
 from verifai_jax.features import Box as Box
 from verifai_jax.features import Categorical as Categorical

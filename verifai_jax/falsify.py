@@ -6,7 +6,7 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,7 +17,7 @@ from verifai_jax import search as searches
 from verifai_jax.errors import suggests_options, unknown_name
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
-from verifai_jax.proposals import cube_of
+from verifai_jax.proposals import cube_of, units
 from verifai_jax.rates import StoppingRule
 from verifai_jax.rounds import Rounds
 from verifai_jax.run import Run, load, write_record
@@ -95,6 +95,42 @@ def falsify(
 
     ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
     return _play(rounds, ends, seed, place, progress, target, prepare)
+
+
+@suggests_options
+def simulate(
+    problem: Problem,
+    rows: "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]",
+    *,
+    batch: int = 1024,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Simulate given features, in their order: no search, a row of the table for each.
+
+    **Arguments:**
+
+    - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
+      file), or features as a person writes them, one or several.
+    - the others as in `falsify`.
+
+    Features pass through the unit cube, which changes the last digit of some real ones.
+
+    **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
+    """
+    if hasattr(rows, "columns"):
+        for column in problem.space.columns:
+            if column not in rows.columns:  # pyright: ignore[reportAttributeAccessIssue]
+                raise unknown_name("column", column, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
+        points = units(problem.space, rows)
+    else:
+        listed = [rows] if isinstance(rows, Mapping) else list(rows)
+        points = np.stack([problem.space.flatten(problem.space.coerce(row)) for row in listed])
+    return falsify(
+        problem, searches.Listed(points), len(points),
+        batch=batch, seed=seed, folder=folder, progress=progress,
+    )  # fmt: skip
 
 
 @suggests_options

@@ -23,6 +23,7 @@ from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
 from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.grid import Grid as Grid
 from verifai_jax.search.halton import Halton as Halton
+from verifai_jax.search.listed import Listed as Listed
 from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform

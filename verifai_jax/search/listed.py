@@ -1,0 +1,60 @@
+"""Points given beforehand, in their order: those of a table, of an analysis, of a person."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.search.base import Cube, Evaluated, Search
+
+
+class ListedState(NamedTuple):
+    index: Int[Array, ""]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Listed(Search):
+    """Given points of the unit cube, one after the other; it ends with the last one.
+
+    **Arguments:** `points`: `[n, d]`, in `[0, 1]`.
+
+    **Raises:** `ValueError` for no points, or points outside the unit cube; `check` for points of
+    another dimension than the cube's.
+    """
+
+    points: Any
+    learns: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, np.float32)
+        if points.ndim != 2 or not len(points):
+            raise ValueError(f"points must be [n, d] with n >= 1; got shape {list(points.shape)}")
+        if not np.all((points >= 0) & (points <= 1)):
+            raise ValueError("points must lie in the unit cube, [0, 1] in every coordinate")
+        object.__setattr__(self, "points", points)
+
+    def check(self, cube: Cube) -> None:
+        if self.points.shape[1] != cube.dim:
+            raise ValueError(
+                f"the points have {self.points.shape[1]} coordinates, the space has {cube.dim}"
+            )
+
+    def total(self, cube: Cube) -> int | None:
+        return len(self.points)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> ListedState:
+        return ListedState(jnp.int32(0))
+
+    def ask(
+        self, state: ListedState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], ListedState]:
+        rows = jnp.minimum(state.index + jnp.arange(batch), len(self.points) - 1)
+        return jnp.asarray(self.points)[rows], ListedState(state.index + batch)
+
+    def tell(self, state: ListedState, cube: Cube, evaluated: Evaluated) -> ListedState:
+        return state
+
+    def __repr__(self) -> str:
+        return f"Listed({len(self.points)} points)"
