@@ -88,7 +88,7 @@ def row_by_row(search, cube, histograms, told):
     return histograms
 
 
-@pytest.mark.parametrize("alpha", [0.9, 0.5, 0.0, 1.0])
+@pytest.mark.parametrize("alpha", [0.9, 0.0, 1.0])
 def test_a_batch_is_as_its_rows_one_by_one(alpha):
     cube = Cube((3, 0, 4, 0, 2), lengths=(0, 4))
     search = CECompat(buckets=7, alpha=alpha, threshold=0.2)
@@ -131,10 +131,8 @@ def test_points_follow_the_histograms():
     "cube",
     [
         Cube(()),
-        Cube((0, 0, 0)),
         Cube((0, 4, 0, 1, 1000)),
-        Cube((3, 0, 2), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True)),
-        Cube((3, 0, 2), lengths=(0, 2)),
+        Cube((3, 0, 2), weights=((0.7, 0.2, 0.1), None, None), lengths=(0, 2)),
         Cube((0,) * 200),
     ],
     ids=lambda cube: f"{len(cube.levels)} {cube.levels[:3]} {cube.lengths}",
