@@ -102,7 +102,9 @@ gusts = vj.Problem(
         },
         where=lambda f: f["masspole"] * f["length"] <= 0.3,
     ),
-    cartpole.cartpole(cartpole.either(cartpole.neural(), cartpole.linear()), duration=4.0),
+    cartpole.cartpole(
+        cartpole.either(cartpole.neural(), cartpole.linear()), duration=4.0, terminate=True
+    ),
     {
         "safe": f"always[0, 4] ({ON_THE_TRACK} & {UPRIGHT})",
         "centred": "always[0, 4] abs(x) <= 1.5",
