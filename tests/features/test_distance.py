@@ -1,0 +1,79 @@
+"""Distances between features: known values, and the axioms of a metric."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Normal, Signal
+
+SPACE = FeatureSpace(
+    {
+        "x": Box(0, 10),
+        "n": Normal(0, 1),
+        "gear": DiscreteBox(1, 5),
+        "alg": Categorical("a", "b", "c", weights=[0.5, 0.4, 0.1]),
+        "wind": Signal(Box(-1, 1), 2),
+        "cars": Array(Box(0, 1), length=(0, 2)),
+    }
+)
+BASE = {"x": 2, "n": 0, "gear": 3, "alg": "a", "wind": [0, 0], "cars": []}
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({}, 0),
+        ({"x": 7}, 0.5),
+        ({"n": 1}, 0.3413447),  # The probability between the two.
+        ({"gear": 5}, 0.5),
+        ({"gear": 1}, 0.5),
+        ({"alg": "b"}, 1),
+        ({"alg": "c"}, 1),
+        ({"wind": [0, 1]}, 0.5),
+        ({"cars": [0.5, 0.5]}, 1),
+        ({"cars": [0.5]}, 0.5),
+        ({"x": 5, "gear": 4, "alg": "c"}, np.sqrt(0.3**2 + 0.25**2 + 1)),
+    ],
+)
+def test_known_values(changes, wanted):
+    one, other = SPACE.coerce(BASE), SPACE.coerce({**BASE, **changes})
+    assert float(SPACE.distance(one, other)) == pytest.approx(wanted, abs=1e-6)
+
+
+points = st.lists(st.floats(0, 1, width=32), min_size=SPACE.dim, max_size=SPACE.dim)
+
+
+@jax.jit
+def distances(us):
+    a, b, c = (SPACE.unflatten(u) for u in us)
+    return [SPACE.distance(*pair) for pair in ((a, b), (b, a), (b, c), (a, c), (a, a))]
+
+
+@given(points, points, points)
+@settings(max_examples=100, deadline=None)
+def test_is_a_metric(a, b, c):
+    us = jnp.array([a, b, c], jnp.float32)
+    ab, ba, bc, ac, aa = (float(d) for d in distances(us))
+    assert aa == 0
+    assert ab == ba >= 0
+    assert ac <= ab + bc + 1e-5
+
+
+@given(points, st.integers(0, SPACE.dim - 1))
+@settings(max_examples=40, deadline=None)
+def test_is_zero_only_between_the_same(u, i):
+    one = jnp.array(u, jnp.float32)
+    other = one.at[i].set(jnp.mod(one[i] + 0.5, 1.0))
+    a, b = SPACE.unflatten(one), SPACE.unflatten(other)
+    same = all(np.array_equal(p, q) for p, q in zip(*map(jax.tree.leaves, (a, b)), strict=True))
+    assert (float(SPACE.distance(a, b)) == 0) == same
+
+
+def test_slopes_are_finite_between_the_same():
+    u = jnp.full(SPACE.dim, 0.3)
+    slope = jax.grad(lambda v: SPACE.distance(SPACE.unflatten(u), SPACE.unflatten(v)))
+    assert np.all(np.isfinite(slope(u)))
+    np.testing.assert_allclose(slope(u.at[0].set(0.6))[0], 1, rtol=1e-5)
