@@ -11,7 +11,7 @@ Each round asks for a batch of points that might fail, by one of two rules.
   AISTATS 2016).
 
 All failures are equally good: below zero the target is flat. Above it is logarithmic in the
-robustness over its median, so that a few huge values do not hide the rest.
+robustness over its lower quartile, and capped, so that huge values do not hide the rest.
 """
 
 from dataclasses import dataclass
@@ -34,10 +34,11 @@ from verifai_jax.search.halton import halton_points
 
 MOST_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
-FIT_POINTS, FIT_STEPS = 192, 12
+FIT_POINTS, FIT_STEPS = 192, 8
 PARENTS = 8  # best points around which candidates are drawn
 KNOWN = 1 - 1e-5  # correlation with an observation, above which a point need not be simulated
 LARGEST = 1e30  # robustness
+CAP = 30.0  # quartiles of the robustness, above which the process does not tell values apart
 PATIENCE = 80  # points without progress, after which half of them are those of the prior
 
 
@@ -70,7 +71,7 @@ class Bayes(Search):
     - `exploration`: share of the points that are drawn from the prior, for ever; it grows while
       there is neither a failure nor progress.
 
-    Hyper-parameters are fitted again, from the last ones on, when there are a fifth more points.
+    Hyper-parameters are fitted again, from the last ones on, when there are a quarter more points.
 
     **Raises:** `ValueError` for values out of range.
     """
@@ -171,7 +172,7 @@ class Bayes(Search):
             seen=state.seen + told,
             stale=jnp.where(progress, 0, state.stale + told),
         )
-        due = (state.seen >= self.initial) & (5 * (state.seen - state.fitted) >= state.fitted)
+        due = (state.seen >= self.initial) & (4 * (state.seen - state.fitted) >= state.fitted)
         hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
         return state._replace(hyper=hyper, fitted=jnp.where(due, state.seen, state.fitted))
 
@@ -282,7 +283,9 @@ def _improving(
         density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
         gain = std * (z * ndtr(z) + density)
         # Far below zero the difference above is rounding errors; order by the distance instead.
-        return jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2), mean, std
+        worth = jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2)
+        known = _known(posterior, process.cross(posterior, _encoded(u, cube)))
+        return jnp.where(known, worth - 1e6, worth), mean, std
 
     shared = _snapped(shared, cube)
     worth, mean, std = merit(shared)
@@ -366,8 +369,9 @@ def _observations(state: BayesState, cube: Cube) -> Observations:
     mask = jnp.isfinite(state.score)
     score = jnp.where(mask, state.score, 0.0)
     positive = jnp.sort(jnp.where(score > 0, score, jnp.inf))
-    median = positive[jnp.sum(score > 0) // 2]
-    y = jnp.log1p(score / jnp.where(jnp.isfinite(median), median, 1.0))
+    quartile = positive[jnp.sum(score > 0) // 4]
+    y = score / jnp.where(jnp.isfinite(quartile), quartile, 1.0)
+    y = jnp.log1p(jnp.minimum(y, CAP))
     count = jnp.maximum(jnp.sum(mask), 1)
     y = y - jnp.sum(y, where=mask) / count
     std = jnp.sqrt(jnp.sum(y**2, where=mask) / count)

@@ -13,9 +13,9 @@ What is made for falsification:
   no progress. The next one begins alternately with small steps, at the best of the points that
   exploration has found meanwhile, and with large ones, from the prior (as Hansen, Benchmarking a
   BI-population CMA-ES on the BBOB-2009 function testbed, alternates between two regimes);
-- after runs without a failure the prior is sampled for as long as the last one took, times their
-  number, and the next run begins at the best of these points: where the robustness misleads, most
-  simulations are those of the prior in the end.
+- after runs without a failure the prior is sampled for twice as long as the last one took, times
+  their number, and the next run begins at the best of these points: where the robustness misleads,
+  most simulations are those of the prior in the end.
 """
 
 import math
@@ -244,7 +244,7 @@ class CMAES(Search):
         waiting = waiting._replace(
             reserve_score=state.reserve_score,
             fruitless=fruitless,
-            rest=jnp.minimum(fruitless * state.length, 1000),
+            rest=jnp.minimum(2 * fruitless * state.length, 1000),
         )
         return _where(fruitful, next_run._replace(fruitless=fruitless), waiting)
 

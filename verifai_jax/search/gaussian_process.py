@@ -168,7 +168,7 @@ class GaussianProcess:
         self, posterior: Posterior, x: Float[Array, "m d"]
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and standard deviation of the values at these points, without noise."""
-        cross = self._cross(posterior, x)
+        cross = self.cross(posterior, x)
         left = solve_triangular(posterior.factor, cross.T, lower=True)
         variance = jnp.exp(posterior.hyper.variance) - jnp.sum(left**2, axis=0)
         return cross @ posterior.weights, jnp.sqrt(jnp.maximum(variance, 1e-12))
@@ -181,7 +181,8 @@ class GaussianProcess:
         # One call for all random numbers: each costs a good part of a second to compile.
         sizes = [waves * (c + 5), waves * (1 + 3 * k), (waves + n) * count]
         random = jax.random.uniform(key, (sum(sizes),), posterior.factor.dtype)
-        random = jnp.split(random, np.cumsum(sizes)[:-1])
+        # Or else every use of them computes them anew.
+        random = jnp.split(jax.lax.optimization_barrier(random), np.cumsum(sizes)[:-1])
         normal = ndtri(jnp.maximum(jnp.concatenate([random[0], random[2]]), SMALLEST))
         spectrum = normal[: sizes[0]].reshape(waves, c + 5)
         amplitudes, noise = jnp.split(normal[sizes[0] :].reshape(waves + n, count), [waves])
@@ -209,7 +210,11 @@ class GaussianProcess:
     ) -> Float[Array, "m f+n"]:
         """Times the paths' weights it is the paths' values at these points."""
         waves = self._waves(posterior.hyper, paths, x)
-        return jnp.concatenate([waves, self._cross(posterior, x)], axis=1)
+        return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)
+
+    def cross(self, posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, "m n"]:
+        """Covariance of the values at these points with the observations; zero for absent ones."""
+        return jnp.where(posterior.mask, self.covariance(posterior.hyper, x, posterior.x), 0.0)
 
     def _waves(self, hyper: Hyper, paths: Paths, x: Float[Array, "m d"]) -> Float[Array, "m f"]:
         plain, codes = self._places()
@@ -223,9 +228,6 @@ class GaussianProcess:
         odd = (paths.multiply * code + paths.add) >> 31
         flips = jnp.sum(jnp.where(paths.ignored, 0, odd), axis=-1)
         return jnp.where(flips % 2 == 0, waves, -waves)
-
-    def _cross(self, posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, "m n"]:
-        return jnp.where(posterior.mask, self.covariance(posterior.hyper, x, posterior.x), 0.0)
 
     def _noisy(
         self, hyper: Hyper, x: Float[Array, "n d"], mask: Bool[Array, " n"]

@@ -1,0 +1,196 @@
+"""CMA-ES: its step against the tutorial in plain NumPy, its quality on known landscapes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from landscapes import LANDSCAPES, gain, play
+
+from verifai_jax.search import Cube, Evaluated
+from verifai_jax.search.cmaes import CMAES
+from verifai_jax.search.evolution import Evolution, recombination
+from verifai_jax.search.halton import halton_points
+from verifai_jax.testing import check_search
+
+KEY = jax.random.key(0)
+FLAT = ("ball", "ridge", "minima", "saddles", "misleading")
+GROUPS = dict.fromkeys(FLAT, FLAT) | {
+    "mixed": ("mixed",),
+    "few": ("few", "plane"),
+    "plane": ("few", "plane"),
+}
+
+
+def played(name):
+    names = GROUPS[name]
+    u, value = play(CMAES(), names, 16, 75 if name in FLAT else 20, 25)
+    return u[names.index(name)], value[names.index(name)]
+
+
+@pytest.mark.parametrize("name", sorted(LANDSCAPES))
+def test_beats_uniform(name):
+    assert gain(name, played(name)[1]) > (1 / 3 if name == "misleading" else 4)
+
+
+def test_goes_on_to_other_failures():
+    u, value = played("saddles")
+    corners = [
+        len({tuple(p) for p in np.round(points[rho < 0]).astype(int)})
+        for points, rho in zip(u, value, strict=True)
+    ]
+    assert np.mean(corners) >= 3
+    assert np.all(np.mean(value[:, 600:] < 0, axis=1) > 0.03)
+
+
+def test_never_stops_exploring():
+    # A tenth of 600 points, at least: over every seed's and coordinate's whole range.
+    u, _ = played("ball")
+    assert np.all(u[:, 600:].min(axis=1) < 0.1)
+    assert np.all(u[:, 600:].max(axis=1) > 0.9)
+
+
+def test_single_points():
+    _, (value,) = play(CMAES(), ("ball",), 1, 256, 15)
+    assert gain("ball", value) > 4
+
+
+def test_large_batches():
+    _, (value,) = play(CMAES(), ("ball",), 512, 6, 5)
+    failing = (value < 0).reshape(5, 6, 512).mean(axis=2)
+    assert np.all(failing[:, 0] < 0.02)
+    assert np.all(failing.max(axis=1) > 0.2)
+
+
+def test_the_same_robustness_everywhere_gives_the_prior():
+    search, cube = CMAES(), Cube((0, 0))
+
+    def step(state, _):
+        u, state = search.ask(state, cube, 16)
+        told = Evaluated(u, jnp.ones(16), jnp.ones(16, bool))
+        return search.tell(state, cube, told), u
+
+    _, seen = jax.jit(lambda state: jax.lax.scan(step, state, None, 4))(search.init(KEY, cube, 16))
+    expected = halton_points(jnp.arange(1, 65, dtype=jnp.uint32), 2, KEY)
+    np.testing.assert_allclose(seen.reshape(64, 2), expected, atol=1e-6)
+
+
+def one_step(evolution, points, weights):
+    """The tutorial's equations, one after the other, for a full covariance."""
+    mean, size, covariance, way, whitened, age = (np.asarray(x, float) for x in evolution)
+    n = len(mean)
+    mu = 1 / np.sum(weights**2)
+    cs = (mu + 2) / (n + mu + 5)
+    ds = 1 + 2 * max(0, np.sqrt((mu - 1) / (n + 1)) - 1) + cs
+    cc = (4 + mu / n) / (n + 4 + 2 * mu / n)
+    c1 = 2 / ((n + 1.3) ** 2 + mu)
+    cmu = min(1 - c1, 2 * (mu - 2 + 1 / mu) / ((n + 2) ** 2 + mu))
+    y = (points - mean) / size
+    total = sum(w * step for w, step in zip(weights, y, strict=True))
+    factor = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitened = (1 - cs) * whitened + np.sqrt(cs * (2 - cs) * mu) * factor @ total
+    chi = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
+    norm = np.linalg.norm(whitened)
+    h = norm / np.sqrt(1 - (1 - cs) ** (2 * (age + 1))) < (1.4 + 2 / (n + 1)) * chi
+    way = (1 - cc) * way + h * np.sqrt(cc * (2 - cc) * mu) * total
+    outer = sum(w * np.outer(step, step) for w, step in zip(weights, y, strict=True))
+    covariance = (
+        (1 + c1 * (1 - h) * cc * (2 - cc) - c1 - cmu) * covariance
+        + c1 * np.outer(way, way)
+        + cmu * outer
+    )
+    size_after = size * np.exp(cs / ds * (norm / chi - 1))
+    return mean + size * total, size_after, covariance, way, whitened, age + 1
+
+
+def test_a_step_is_that_of_the_tutorial():
+    rng = np.random.default_rng(0)
+    evolution = Evolution.begin(jnp.full(3, 0.5), jnp.float32(0.2), True)
+    learn = jax.jit(Evolution.learn)
+    for _ in range(5):
+        points = evolution.draw(jnp.asarray(rng.standard_normal((12, 3)), jnp.float32))
+        weights = recombination(jnp.sum((points - 0.2) ** 2, axis=1))
+        expected = one_step(evolution, np.asarray(points, float), np.asarray(weights, float))
+        evolution = learn(evolution, points, weights)
+        for got, wanted in zip(evolution, expected, strict=True):
+            np.testing.assert_allclose(got, wanted, rtol=2e-4, atol=1e-5)
+
+
+def test_a_diagonal_covariance_learns_the_scales():
+    scales = 10.0 ** -jnp.arange(3)
+    rng = np.random.default_rng(1)
+    learn = jax.jit(Evolution.learn)
+    for full in (False, True):
+        evolution = Evolution.begin(jnp.full(3, 0.5), jnp.float32(0.3), full)
+        for _ in range(60):
+            points = evolution.draw(jnp.asarray(rng.standard_normal((16, 3)), jnp.float32))
+            value = jnp.sum((points / scales) ** 2, axis=1)
+            evolution = learn(evolution, points, recombination(value))
+        ratios = np.sqrt(np.asarray(evolution.variance()))
+        # Standard deviations go with the widths of the bowl: 1, 0.1 and 0.01.
+        assert 3 < ratios[0] / ratios[1] < 30
+        assert 3 < ratios[1] / ratios[2] < 30
+        assert np.max(np.abs(evolution.mean)) < 0.02
+
+
+def test_recombination():
+    # The better half of what is there, in the order of the ranks; ties share.
+    inf = np.inf
+    weights = np.maximum(np.log(2.5) - np.log([3, inf, 1, 2, 4]), 0)
+    for score, expected in (
+        ([3, inf, 1, 2, 4], weights / weights.sum()),
+        ([0, 0, 0, 0, 0], np.full(5, 0.2)),
+        ([inf, 2, inf, inf, inf], [0, 1, 0, 0, 0]),
+        ([inf] * 5, np.zeros(5)),
+    ):
+        got = jax.jit(recombination)(jnp.array(score, jnp.float32))
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_discrete_coordinates_keep_moving():
+    evolution = Evolution.begin(jnp.full(2, 0.5), jnp.float32(1e-3), True)
+    wide = evolution.widened(np.array([0.0, 0.1], np.float32))
+    std = wide.size * np.sqrt(wide.variance())
+    np.testing.assert_allclose(std, [1e-3, 0.1], rtol=1e-3)
+
+
+def test_a_warm_start_begins_at_the_best_point():
+    search, cube = CMAES(small_step=0.01), Cube((0, 0, 3), ordered=(True, True, False))
+    u = jnp.array([[0.2, 0.9, 0.5], [0.7, 0.1, 0.9], [0.4, 0.4, 0.1], [0.1, 0.1, 0.1]])
+    told = Evaluated(u, jnp.array([3.0, 1.0, 2.0, -1.0]), jnp.array([True, True, True, False]))
+    state = search.init(KEY, cube, 4)
+    worse = told._replace(rho=told.rho + 5)
+    warm = jax.jit(search.warm, static_argnums=1)
+    for table in (worse, told, worse):
+        state = warm(state, cube, table)
+    asked = np.asarray(jax.jit(search.ask, static_argnums=(1, 2))(state, cube, 4)[0])
+    near = np.max(np.abs(asked[:, :2] - u[1, :2]), axis=1) < 0.06
+    assert near.sum() == 3  # the other one explores
+
+
+@pytest.mark.parametrize(
+    "cube",
+    [
+        Cube((3, 0, 9), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True)),
+        Cube((3, 2), ordered=(False, False)),
+    ],
+    ids=["weighted", "unordered"],
+)
+def test_contract(cube):
+    check_search(CMAES(), cube, batch=5, rounds=6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"step": 0}, r"step must be in \(0, 1\]; got 0"),
+        ({"small_step": 2}, r"small_step must be in \(0, 1\]; got 2"),
+        ({"exploration": 0}, r"exploration must be in \(0, 1\]; got 0"),
+        ({"least_std": "tiny"}, r"least_std must be in \(0, 1\]; got 'tiny'"),
+        ({"full_up_to": -1}, "full_up_to must be an integer of at least 0; got -1"),
+        ({"patience": 0}, "patience must be an integer of at least 1; got 0"),
+        ({"failures": 1.5}, "failures must be an integer of at least 1; got 1.5"),
+    ],
+)
+def test_values_out_of_range(options, message):
+    with pytest.raises(ValueError, match=message):
+        CMAES(**options)
