@@ -35,19 +35,16 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     u = jax.random.uniform(jax.random.key(seed), (samples, size), jnp.float32)
     u = jnp.concatenate([u, jnp.zeros((1, size)), jnp.ones((1, size))])
 
-    def round_trip(u: Any) -> tuple[Any, Any, Any, Any]:
+    def round_trip(u: Any) -> tuple[Any, Any, Any]:
         value = domain.from_unit(u)
         back = domain.to_unit(value)
-        again = domain.from_unit(back)
-        return value, back, again, domain.to_unit(again)
+        return value, back, domain.from_unit(back)
 
     both = jax.jit(jax.vmap(round_trip))
-    values, back, again, still = both(u)
+    values, back, again = both(u)
     assert back.shape == u.shape, f"to_unit must give shape [{size}]; got {list(back.shape[1:])}"
     assert bool(jnp.all((back >= 0) & (back <= 1))), "to_unit must stay in [0, 1]"
-    # In a tail a coordinate in float32 says less of a value than its own digits.
-    if not np.allclose(back, still, 0, 4e-6):
-        _same(values, again, "from_unit(to_unit(value)) must be the value")
+    _same(values, again, "from_unit(to_unit(value)) must be the value")
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(values)), (
         "values must be finite, at the corners of the cube too"
     )

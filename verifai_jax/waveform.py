@@ -5,6 +5,7 @@ wind(time)                                                   # in seconds; trace
 features["wind"].over(4.0)(time)                             # where no duration was given
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from verifai_jax.errors import unknown_name
 
 HOLDS = ("linear", "constant")
 
@@ -36,11 +39,14 @@ class Waveform:
 
     def __post_init__(self) -> None:
         if self.hold not in HOLDS:
-            raise ValueError(f"hold must be 'linear' or 'constant'; got {self.hold!r}")
+            raise unknown_name("hold", self.hold, HOLDS)
 
     def over(self, duration: float) -> "Waveform":
-        """The same control points over so many seconds."""
-        return replace(self, duration=float(duration))
+        """The same control points over so many seconds.
+
+        **Raises:** `ValueError` for a duration that is not positive.
+        """
+        return replace(self, duration=seconds(duration))
 
     def __call__(self, time: Float[Array, ""] | float) -> Float[Array, "*shape"]:
         """The value at a time in seconds.
@@ -75,6 +81,17 @@ class Waveform:
         between = knots[:-1, None] * (1 - share) + knots[1:, None] * share
         inner = between.reshape(-1, *knots.shape[1:]).astype(knots.dtype)
         return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
+
+
+def seconds(duration: Any) -> float:
+    """A duration, checked.
+
+    **Raises:** `ValueError` unless it is a positive finite number.
+    """
+    number = isinstance(duration, int | float | np.number) and not isinstance(duration, bool)
+    if not (number and 0 < duration < math.inf):
+        raise ValueError(f"duration must be a positive number of seconds; got {duration!r}")
+    return float(duration)
 
 
 def bound(features: Any, duration: float) -> Any:

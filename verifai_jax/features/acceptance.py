@@ -12,7 +12,7 @@ ENOUGH = 1000
 """Accepted samples after which the rate is known well enough."""
 
 
-def acceptance_rate(space: Any, seed: int = 0) -> float:
+def acceptance_rate(space: Any, seed: Any = 0) -> float:
     """The share of the prior's samples that `space.where` accepts.
 
     **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
@@ -20,22 +20,25 @@ def acceptance_rate(space: Any, seed: int = 0) -> float:
     """
     point = jax.ShapeDtypeStruct((space.dim,), jnp.float32)
     try:
-        answer = jax.eval_shape(lambda u: space.accepts(space.unflatten(u)), point)
-    except jax.errors.ConcretizationTypeError as error:
+        answer = jax.eval_shape(lambda u: space.where(space.unflatten(u)), point)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
-            "where is traced by JAX, so it cannot use `and`, `or`, `not` or `if` on features: use "
-            f"&, |, ~ and jnp.where ({type(error).__name__})"
+            "where is traced by JAX, so it cannot use `and`, `or`, `not`, `if` or NumPy on "
+            f"features: use &, |, ~, jnp.where and jnp ({type(error).__name__})"
         ) from error
     except Exception as error:
         raise ValueError(
             f"where raised {type(error).__name__} for the features {list(space.domains)}: {error}"
         ) from error
-    if answer.shape != () or answer.dtype != jnp.bool_:
-        raise ValueError(
-            f"where must return one truth value; got shape {list(answer.shape)} of {answer.dtype}"
-        )
+    if getattr(answer, "shape", None) != () or answer.dtype != jnp.bool_:
+        shown = type(answer).__name__
+        if hasattr(answer, "shape"):
+            shown = f"shape {list(answer.shape)} of {answer.dtype}"
+        raise ValueError(f"where must return one truth value; got {shown}")
     accepts = jax.jit(jax.vmap(lambda u: space.accepts(space.unflatten(u))))
     accepted = tried = 0
+    if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
+        seed = [int(word) for word in np.ravel(jax.random.key_data(seed))]
     random = np.random.default_rng(seed)
     while tried < SAMPLES and accepted < ENOUGH:
         accepted += int(np.sum(accepts(random.random((BLOCK, space.dim), np.float32))))

@@ -69,7 +69,11 @@ class Array(Domain):
         return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
 
     def coerce(self, value: Any) -> Any:
-        return self.domain.coerce(value)
+        if _is_stacked(value):
+            return self.domain.coerce(value)
+        # As a person wrote it, which one item may do in another form than the next.
+        items = [_element(value, i, self.length, "the array") for i in range(self.length)]
+        return _stacked([self.domain.coerce(item) for item in items])
 
     def check(self, value: Any, name: str) -> None:
         for i in range(self.length):
@@ -88,8 +92,15 @@ class Array(Domain):
         return columns
 
     def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
-        items = [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
+        return _stacked(
+            [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
+        )
+
+    def refined(self, factor: int) -> "Array":
+        return Array(self.domain.refined(factor), self.length)
+
+    def refine(self, value: Any, factor: int) -> Any:
+        return jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.length)(value)
 
     def __repr__(self) -> str:
         return f"Array({self.domain!r}, length={self.length})"
@@ -116,6 +127,16 @@ class Items:
 
     def __getitem__(self, name: Any) -> Any:
         return self.values[name]
+
+    def cleared(self, absent: Any) -> "Items":
+        """The same items, with `absent` at the places that do not count."""
+        mask, axes = self.mask, jnp.ndim(self.length) + 1
+
+        def clear(leaf: Any, rest: Any) -> Any:
+            counts = jnp.expand_dims(mask, tuple(range(axes, jnp.ndim(leaf))))
+            return jnp.where(counts, leaf, jnp.asarray(rest, leaf.dtype))
+
+        return Items(jax.tree.map(clear, self.values, absent), self.length)
 
 
 @dataclass(frozen=True, repr=False)
@@ -175,12 +196,13 @@ class VariableArray(Domain):
 
     def coerce(self, value: Any) -> Items:
         if isinstance(value, Items):
-            length = jnp.asarray(value.length, jnp.int32)
-            return Items(self.domain.coerce(value.values), length)
+            items = Items(self.domain.coerce(value.values), jnp.asarray(value.length, jnp.int32))
+            # Whatever stands behind the length must not make two of the same value.
+            return items.cleared(self._absent)
         items = [self.domain.coerce(item) for item in _listed(value, "the array")]
         length = jnp.asarray(len(items), jnp.int32)
         items += [self._absent] * (self.most - len(items))
-        return Items(jax.tree.map(lambda *leaves: jnp.stack(leaves), *items), length)
+        return Items(_stacked(items), length)
 
     def check(self, value: Any, name: str) -> None:
         if isinstance(value, Items):
@@ -225,8 +247,14 @@ class VariableArray(Domain):
             self.domain.from_columns(row, item) if i < length else self._absent
             for i, item in enumerate(indexed(name, self.most))
         ]
-        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
-        return Items(stacked, jnp.asarray(length, jnp.int32))
+        return Items(_stacked(items), jnp.asarray(length, jnp.int32))
+
+    def refined(self, factor: int) -> "VariableArray":
+        return VariableArray(self.domain.refined(factor), self.least, self.most)
+
+    def refine(self, value: Items, factor: int) -> Items:
+        finer = jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.most)
+        return Items(finer(value.values), value.length)
 
     @property
     def _absent(self) -> Any:
@@ -239,6 +267,16 @@ class VariableArray(Domain):
 
     def __repr__(self) -> str:
         return f"Array({self.domain!r}, length=({self.least}, {self.most}))"
+
+
+def _is_stacked(value: Any) -> bool:
+    """Whether this is a value as `from_unit` gives it, and not one that a person wrote."""
+    leaves = jax.tree.leaves(value, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
+    return all(isinstance(leaf, jax.Array) for leaf in leaves)
+
+
+def _stacked(items: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
 
 
 def _check_domain(domain: Any) -> None:
@@ -267,9 +305,9 @@ def _emptied(entries: np.ndarray, absent: np.ndarray) -> np.ndarray:
     """Entries of which some are absent, of one dtype whether or not there are such."""
     if entries.dtype.kind in "iub":
         entries = entries.astype(np.float64)
-    return np.where(absent, np.nan if entries.dtype.kind == "f" else None, entries).astype(
-        entries.dtype
-    )
+    emptied = entries.copy()
+    emptied[absent] = np.nan if entries.dtype.kind == "f" else None
+    return emptied
 
 
 def _listed(value: Any, name: str) -> list[Any]:

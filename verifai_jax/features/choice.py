@@ -78,10 +78,18 @@ class Categorical(Domain):
             )
         if not all(weight > 0 for weight in numbers):
             raise ValueError(
-                f"weights must be positive (leave out a choice that never comes); got {numbers}"
+                "weights must be positive (leave out a choice that never comes); "
+                f"got {short(numbers)}"
+            )
+        if min(numbers) < 1 / MOST_LEVELS:
+            raise ValueError(
+                f"a weight must be at least {1 / MOST_LEVELS:.1g}, which a float32 coordinate can "
+                f"tell from nothing; got {short(numbers)}"
             )
         if abs(math.fsum(numbers) - 1) > 1e-6:
-            raise ValueError(f"weights must sum to one; {numbers} sum to {math.fsum(numbers):g}")
+            raise ValueError(
+                f"weights must sum to one; {short(numbers)} sum to {math.fsum(numbers):.7g}"
+            )
         return numbers
 
     @cached_property
@@ -202,7 +210,7 @@ class Categorical(Domain):
     def __repr__(self) -> str:
         weights = ""
         if self.probabilities is not None:
-            weights = f", weights=[{', '.join(f'{p:g}' for p in self.probabilities)}]"
+            weights = f", weights={short(self.probabilities)}"
         return f"Categorical({listed(self.choices)}{weights})"
 
 

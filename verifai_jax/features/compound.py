@@ -125,6 +125,12 @@ class Struct(Domain):
             field: domain.from_columns(row, dotted(name, field)) for field, domain in self.fields
         }
 
+    def refined(self, factor: int) -> "Struct":
+        return Struct({name: domain.refined(factor) for name, domain in self.fields})
+
+    def refine(self, value: Mapping[str, Any], factor: int) -> dict[str, Any]:
+        return {name: domain.refine(value[name], factor) for name, domain in self.fields}
+
     @cached_property
     def _runs(self) -> tuple[tuple[tuple[str, ...], Domain], ...]:
         """The fields, neighbouring scalar boxes merged into a vector: 200 cost one operation."""

@@ -1,9 +1,10 @@
-"""Real numbers that are not uniform: `Normal`, `TruncatedNormal`, `LogUniform`, one's own.
+"""Real numbers with a distribution: `Normal`, `TruncatedNormal`, `LogUniform`, one of your own.
 
-The unit cube is the probability space: a coordinate is the probability of a smaller value, and a
-value the quantile of its coordinate. Both tails are computed from their own end, so that float32
-resolves them; at 0 and 1, where a quantile may be infinite, the nearest probability that float32
-can tell from them is taken.
+    FeatureSpace({"wind": Normal(0, 2), "mass": LogUniform(0.01, 10)})
+
+A unit coordinate is the probability to its left, so that uniform coordinates sample the
+distribution (inverse transform sampling). Both tails are computed from the smaller probability;
+0 and 1 give finite values, and slopes there are finite and not zero.
 """
 
 import abc
@@ -28,34 +29,37 @@ from verifai_jax.features.domain import (
     short,
 )
 
-LEAST_TAIL = 2.0**-25
-"""The least probability of a tail: a quarter of the distance of float32 numbers below 1."""
+OUTERMOST = 2.0**-26
+"""The probability beyond the outermost points: what float32 rounds away when taken from 1."""
+DEEPEST = 1e-29
+"""Share of a normal distribution that has to lie between the ends of a truncated one."""
 
 
 class Continuous(Domain):
-    """A real number with a distribution of its own; the base of those below."""
+    """A real number whose unit coordinate is its cumulative probability."""
 
-    low: float = -math.inf
-    high: float = math.inf
+    @property
+    @abc.abstractmethod
+    def support(self) -> tuple[float, float]:
+        """The interval that holds all values; its ends may be infinite."""
 
     @abc.abstractmethod
-    def quantile(self, u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-        """The value with probability `u` below and `tail = 1 - u` above it; neither is zero."""
+    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
+        """The value with this probability to its left; finite at 0 and 1."""
 
     @abc.abstractmethod
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        """The probability of a smaller value."""
+        """The probability to the left of this value."""
 
     @property
     def levels(self) -> tuple[int, ...]:
         return (0,)
 
     def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
-        u = u[0]
-        return self.quantile(jnp.maximum(u, LEAST_TAIL), jnp.maximum(1 - u, LEAST_TAIL))
+        return self.quantile(u[0]).astype(u.dtype)
 
     def to_unit(self, value: Any) -> Float[Array, "1"]:
-        return jnp.clip(jnp.reshape(self.probability(as_real(value)), (1,)), 0.0, 1.0)
+        return jnp.clip(self.probability(as_real(value)), 0, 1)[None]
 
     def coerce(self, value: Any) -> Float[Array, ""]:
         return as_real(value)
@@ -64,13 +68,20 @@ class Continuous(Domain):
         number = as_numbers(value, name)
         if number.shape != ():
             raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
-        slack = np.finfo(np.float32).eps * max(
-            (abs(end) for end in (self.low, self.high) if math.isfinite(end)), default=0.0
+        low, high = self.support
+        eps = np.finfo(np.float32).eps
+        inside = (
+            low * (1 - math.copysign(eps, low)) <= number <= high * (1 + math.copysign(eps, high))
         )
-        if not (self.low - slack <= number <= self.high + slack and math.isfinite(number)):
+        if not (inside and np.isfinite(number)):
+            bounds = "be finite" if math.isinf(high) else f"lie in [{short(low)}, {short(high)}]"
+            raise ValueError(f"{name} must {bounds}; got {short(number.item())}")
+        nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
+        lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))
+        if abs(nearest - number) > 0.1 * (upper - lower) + 1e-5 * abs(number):
             raise ValueError(
-                f"{name} must lie in [{short(self.low)}, {short(self.high)}]; "
-                f"got {short(number.item())}"
+                f"{name} is so far in the tail of {self!r} that a float32 coordinate cannot reach "
+                f"it; the nearest value is {nearest:.6g}; got {short(number.item())}"
             )
 
     def columns(self, name: str) -> tuple[str, ...]:
@@ -85,25 +96,33 @@ class Continuous(Domain):
 
 @dataclass(frozen=True, repr=False)
 class Normal(Continuous):
-    """Normally distributed numbers.
+    """A normal distribution: `Normal(mean, std)`.
 
-    Unbounded; a coordinate in float32 reaches 5.4 standard deviations.
+    A float32 coordinate reaches 5.5 standard deviations to either side, beyond which lies a
+    probability of 3e-8; the coordinates 0 and 1 stand for these outermost values.
 
-    **Raises:** `ValueError` for a mean that is not finite or a `std` that is not positive.
+    **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
+    positive, or values that do not fit into float32.
     """
 
     mean: float
     std: float
 
     def __post_init__(self) -> None:
-        _check_normal(self)
+        _numbers(self, "mean", "std")
+        _check_scale(self, self.mean, self.std)
 
-    def quantile(self, u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-        return self.mean + self.std * _standard_quantile(u, tail)
+    @property
+    def support(self) -> tuple[float, float]:
+        return (-math.inf, math.inf)
+
+    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
+        left = u < 0.5
+        z = ndtri(_at_least(jnp.where(left, u, 1 - u), OUTERMOST))
+        return self.mean + self.std * jnp.where(left, z, -z)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        z = (value - self.mean) / self.std
-        return jnp.where(z < 0, ndtr(z), 1 - ndtr(-z))
+        return ndtr((value - self.mean) / self.std)
 
     def __repr__(self) -> str:
         return f"Normal({short(self.mean)}, {short(self.std)})"
@@ -111,10 +130,16 @@ class Normal(Continuous):
 
 @dataclass(frozen=True, repr=False)
 class TruncatedNormal(Continuous):
-    """Normally distributed numbers, given that they lie between `low` and `high`.
+    """A normal distribution given that the value lies in `[low, high]`.
 
-    **Raises:** `ValueError` as `Normal`, for ends that are reversed, equal or not finite, and for
-    an interval so far in the tail that float32 has no probabilities there.
+    - `mean`, `std`: of the distribution before it is cut off.
+
+    The coordinates 0 and 1 are `low` and `high` exactly. Where an end is more than 5 standard
+    deviations away, values near it are too improbable for a float32 coordinate.
+
+    **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
+    positive, ends that are reversed or equal, ends so near that it is uniform between them, or so
+    far in one tail (11 standard deviations) that float32 cannot hold the probabilities.
     """
 
     mean: float
@@ -123,84 +148,113 @@ class TruncatedNormal(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _check_normal(self)
-        _check_ends(self)
-        if self._mass[2] < 1e-30:
+        _numbers(self, "mean", "std", "low", "high")
+        _check_scale(self, self.mean, self.std)
+        _check_ends(self, self.low, self.high)
+        if self.high - self.low < 0.05 * self.std:
             raise ValueError(
-                f"the interval is too far from the mean for float32: its probability is "
-                f"{self._mass[2]:.2g}; got {self!r}"
+                "low and high are less than 0.05 standard deviations apart, where the "
+                f"distribution is uniform: use Box({short(self.low)}, {short(self.high)}); "
+                f"got {self!r}"
+            )
+        if self._inside < DEEPEST:
+            raise ValueError(
+                f"only {self._inside:.1g} of the normal distribution lies between low and high, "
+                f"which float32 cannot resolve (at least {DEEPEST:g} is needed); got {self!r}"
             )
 
     @property
-    def _mass(self) -> tuple[float, float, float]:
-        """Probabilities below and above the interval, and within; of the nearer tail's mirror."""
-        low, high = ((end - self.mean) / self.std for end in (self.low, self.high))
-        if self._mirrored:
-            low, high = -high, -low
-        below, above = _tail(low), _tail(-high)
-        within = _tail(high) - below if high < 0 else 1 - below - above
-        return below, above, within
+    def support(self) -> tuple[float, float]:
+        return (self.low, self.high)
 
     @property
     def _mirrored(self) -> bool:
-        """Whether the interval lies more above the mean than below."""
-        return self.low + self.high > 2 * self.mean
+        """Whether all lies in the upper tail, so that the mirror image is computed."""
+        return self.low > self.mean
 
-    def quantile(self, u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-        below, above, within = self._mass
+    @property
+    def _tails(self) -> tuple[float, float, float, float]:
+        """Probabilities below and above the lower end, below and above the upper end."""
+        ends = [(self.low - self.mean) / self.std, (self.high - self.mean) / self.std]
         if self._mirrored:
-            u, tail = tail, u
-        z = _standard_quantile(below + u * within, above + tail * within)
-        value = self.mean + self.std * (-z if self._mirrored else z)
-        return jnp.clip(value, self.low, self.high)
+            ends = [-ends[1], -ends[0]]
+        below = [math.erfc(-end / math.sqrt(2)) / 2 for end in ends]
+        above = [math.erfc(end / math.sqrt(2)) / 2 for end in ends]
+        return (below[0], above[0], below[1], above[1])
+
+    @property
+    def _inside(self) -> float:
+        below_low, _, below_high, above_high = self._tails
+        # The difference of the smaller ones cancels least.
+        return below_high - below_low if below_high < 0.5 else 1 - below_low - above_high
+
+    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
+        below, _, _, above = self._tails
+        left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
+        p = below + self._inside * _at_least(left, OUTERMOST)
+        q = above + self._inside * _at_least(right, OUTERMOST)
+        lower = p < 0.5
+        z = ndtri(jnp.where(lower, p, q))
+        x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
+        low, high = np.asarray([self.low, self.high], u.dtype)
+        x = _but(x, (u <= 0) | (x < low), low)
+        return _but(x, (u >= 1) | (x > high), high)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        below, above, within = self._mass
-        z = (value - self.mean) / self.std
+        low, high = np.asarray([self.low, self.high], value.dtype)
+        z = (jnp.clip(value, low, high) - self.mean) / self.std
         z = -z if self._mirrored else z
-        u = jnp.where(z < 0, (ndtr(z) - below) / within, 1 - (ndtr(-z) - above) / within)
-        return 1 - u if self._mirrored else u
+        below_low, above_low, below_high, above_high = (t / self._inside for t in self._tails)
+        tail = ndtr(-jnp.abs(z)) / self._inside
+        left = jnp.where(z < 0, tail - below_low, above_low - tail)
+        right = jnp.where(z < 0, below_high - tail, tail - above_high)
+        left, right = (right, left) if self._mirrored else (left, right)
+        u = jnp.where(left < 0.5, left, 1 - right)
+        return _but(_but(u, value <= low, 0), value >= high, 1)
 
     def __repr__(self) -> str:
-        parts = (self.mean, self.std, self.low, self.high)
-        return f"TruncatedNormal({', '.join(map(short, parts))})"
+        shown = ", ".join(short(x) for x in (self.mean, self.std, self.low, self.high))
+        return f"TruncatedNormal({shown})"
 
 
 @dataclass(frozen=True, repr=False)
 class LogUniform(Continuous):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
-    **Raises:** `ValueError` for ends that are not positive, reversed, equal or not finite.
+    **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.
     """
 
     low: float
     high: float
 
     def __post_init__(self) -> None:
-        _check_ends(self)
+        _numbers(self, "low", "high")
         if self.low <= 0:
-            raise ValueError(f"a LogUniform needs positive ends; got {self!r}")
+            raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
+        if self.low < LEAST_REAL:
+            raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:g}; got {self!r}")
+        _check_ends(self, self.low, self.high)
 
-    def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
-        # Finite at 0 and 1, so exact there.
-        return self.quantile(u[0], 1 - u[0])
+    @property
+    def support(self) -> tuple[float, float]:
+        return (self.low, self.high)
 
-    def quantile(self, u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-        width = math.log(self.high / self.low)
-        value = jnp.where(
-            u < 0.5, self.low * jnp.exp(u * width), self.high * jnp.exp(-tail * width)
-        )
-        return jnp.clip(value, self.low, self.high)
+    @property
+    def _width(self) -> float:
+        return math.log(self.high) - math.log(self.low)
+
+    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
+        left = u < 0.5
+        # From the nearer end: exact at both.
+        end = jnp.where(left, jnp.asarray(self.low, u.dtype), jnp.asarray(self.high, u.dtype))
+        return end * jnp.exp(jnp.where(left, u, u - 1) * self._width)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        width = math.log(self.high / self.low)
+        value = jnp.maximum(value, LEAST_REAL)
+        from_low = jnp.log(value / self.low) / self._width
+        from_high = jnp.log(value / self.high) / self._width
         middle = math.sqrt(self.low) * math.sqrt(self.high)
-        positive = jnp.maximum(value, LEAST_REAL)
-        return jnp.where(
-            value < middle,
-            jnp.log(positive / self.low) / width,
-            1 - jnp.log(self.high / positive) / width,
-        )
+        return jnp.where(value < middle, from_low, 1 + from_high)
 
     def __repr__(self) -> str:
         return f"LogUniform({short(self.low)}, {short(self.high)})"
@@ -208,81 +262,123 @@ class LogUniform(Continuous):
 
 @dataclass(frozen=True, repr=False)
 class Distribution(Continuous):
-    """A distribution by its inverse cumulative distribution function and that function itself.
+    """A distribution of your own, by two JAX functions of one number that are each other's inverse.
 
-    **Arguments:** two JAX functions of one number, `inverse_cdf` from `(0, 1)` to values and `cdf`
-    back; `name` for people.
+        Distribution(lambda u: 3 * jnp.sqrt(u), lambda x: (x / 3) ** 2, name="triangle")
 
-    **Raises:** `ValueError` for functions that are not finite, do not rise, or do not undo each
-    other.
+    **Arguments:** `inverse_cdf`: probability -> value, increasing; `cdf`: value -> probability;
+    `name`: for people and JSON. Where `inverse_cdf` or its slope is infinite at 0 or 1, the
+    outermost float32 coordinates are used there instead.
+
+    **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
+    finite inside, or are not each other's inverse.
     """
 
     inverse_cdf: Callable[[Any], Any]
     cdf: Callable[[Any], Any]
-    name: str = field(default="custom")
+    name: str = "custom"
+    _range: tuple[float, float] = field(default=(0.0, 1.0), init=False, compare=False)
 
     def __post_init__(self) -> None:
-        u = jnp.linspace(0.001, 0.999, 65, dtype=jnp.float32)
+        for role in ("inverse_cdf", "cdf"):
+            function = getattr(self, role)
+            if not callable(function):
+                raise TypeError(f"{role} of a Distribution must be a function; got {function!r}")
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise ValueError(f"name of a Distribution must be a text; got {self.name!r}")
+        with jax.ensure_compile_time_eval():
+            object.__setattr__(self, "_range", self._checked())
+
+    def _checked(self) -> tuple[float, float]:
+        """The probabilities that 0 and 1 stand for; refuses functions that do not fit together."""
+        u = np.linspace(0, 1, 129, dtype=np.float32)[1:-1]
+        values = self._sampled("inverse_cdf", self.inverse_cdf, u)
+        for i in range(len(u)):
+            if not np.isfinite(values[i]):
+                raise ValueError(f"inverse_cdf of {self!r} gives {values[i]} at u = {u[i]:.3g}")
+            if i and values[i] <= values[i - 1]:
+                raise ValueError(
+                    f"inverse_cdf of {self!r} must increase; it gives {values[i - 1]:.3g} at "
+                    f"u = {u[i - 1]:.3g} and {values[i]:.3g} at u = {u[i]:.3g}"
+                )
+        back = self._sampled("cdf", self.cdf, values)
+        worst = int(np.argmax(np.nan_to_num(np.abs(back - u), nan=np.inf)))
+        if not abs(back[worst] - u[worst]) <= 1e-3:
+            raise ValueError(
+                f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:.3g}) "
+                f"is {values[worst]:.3g} and cdf({values[worst]:.3g}) is {back[worst]:.3g}"
+            )
+        ends = np.array([0, 1], np.float32)
+        finite = np.isfinite(self._sampled("inverse_cdf", self.inverse_cdf, ends))
+        finite &= np.isfinite(self._sampled("inverse_cdf", jax.grad(self.inverse_cdf), ends))
+        return 0.0 if finite[0] else OUTERMOST, 1.0 if finite[1] else 1 - 2.0**-24
+
+    def _sampled(
+        self, role: str, function: Callable[[Any], Any], points: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
         try:
-            values = jax.vmap(self.inverse_cdf)(u)
-            back = jax.vmap(self.cdf)(values)
+            array = np.asarray(jax.vmap(function)(jnp.asarray(points)))
         except Exception as error:
             raise ValueError(
-                f"the functions of Distribution {self.name!r} must be JAX functions of one number; "
-                f"{type(error).__name__}: {error}"
+                f"{role} of {self!r} raised {type(error).__name__} on a number: {error}"
             ) from error
-        if values.shape != u.shape or not np.all(np.isfinite(values)):
-            raise ValueError(f"inverse_cdf of {self.name!r} must give a finite number on (0, 1)")
-        if not np.all(np.diff(values) > 0):
-            raise ValueError(f"inverse_cdf of {self.name!r} must rise on (0, 1)")
-        worst = int(np.argmax(np.abs(back - u)))
-        if not abs(float(back[worst] - u[worst])) < 1e-3:
+        if array.shape != points.shape or array.dtype.kind != "f":
             raise ValueError(
-                f"cdf of {self.name!r} must undo its inverse_cdf; at {float(u[worst]):.3f} it "
-                f"gives {float(back[worst]):.3f}"
+                f"{role} of {self!r} must give one real number for one; got {array.dtype} of shape "
+                f"{list(array.shape[1:])}"
             )
+        return array
 
-    def quantile(self, u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.asarray(self.inverse_cdf(jnp.minimum(u, 1 - 2.0**-24))).astype(u.dtype)
+    @property
+    def support(self) -> tuple[float, float]:
+        return (-math.inf, math.inf)
+
+    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
+        low, high = self._range
+        return jnp.asarray(self.inverse_cdf(_but(_at_least(u, low), u > high, high)))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.asarray(self.cdf(value)).astype(value.dtype)
+        return jnp.asarray(self.cdf(value))
 
     def __repr__(self) -> str:
-        return f"Distribution({self.name})"
+        return f"Distribution(name={self.name!r})"
 
 
-def _standard_quantile(u: Float[Array, ""], tail: Float[Array, ""]) -> Float[Array, ""]:
-    """Of the standard normal distribution, from the nearer end."""
-    lower = u < tail
-    z = ndtri(jnp.where(lower, u, tail))
-    return jnp.where(lower, z, -z)
-
-
-def _tail(z: float) -> float:
-    """The probability of a smaller standard normal number, in double precision."""
-    return 0.5 * math.erfc(-z / math.sqrt(2))
-
-
-def _check_normal(domain: Any) -> None:
-    for name in ("mean", "std"):
-        object.__setattr__(domain, name, as_number(getattr(domain, name), f"{name} of a normal"))
-    if not abs(domain.mean) <= MOST_REAL:
-        raise ValueError(f"mean must be finite; got {domain!r}")
-    if not LEAST_REAL <= domain.std <= MOST_REAL / 10:
-        raise ValueError(f"std must be positive and finite; got {domain!r}")
-
-
-def _check_ends(domain: Any) -> None:
+def _numbers(domain: Any, *names: str) -> None:
     kind = type(domain).__name__
-    for name in ("low", "high"):
-        object.__setattr__(domain, name, as_number(getattr(domain, name), f"{name} of a {kind}"))
-    if not all(abs(end) <= MOST_REAL for end in (domain.low, domain.high)):
-        raise ValueError(f"the ends of a {kind} must be finite; got {domain!r}")
-    if domain.low == domain.high:
+    for name in names:
+        given = as_number(getattr(domain, name), f"{name} of a {kind}")
+        if not math.isfinite(given):
+            raise ValueError(f"{name} of a {kind} must be finite; got {given!r}")
+        object.__setattr__(domain, name, given)
+
+
+def _check_scale(domain: Domain, mean: float, std: float) -> None:
+    if std <= 0:
+        hint = f" (a single value is Constant({short(mean)}))" if std == 0 else ""
+        raise ValueError(f"the standard deviation must be positive{hint}; got {domain!r}")
+    if std < LEAST_REAL or abs(mean) + 6 * std > MOST_REAL:
+        raise ValueError(f"its values must fit into float32; got {domain!r}")
+
+
+def _check_ends(domain: Domain, low: float, high: float) -> None:
+    if low == high:
         raise ValueError(
-            f"a {kind} of zero width has one value: use Constant({short(domain.low)}); "
-            f"got {domain!r}"
+            f"an interval of zero width has one value: use Constant({short(low)}); got {domain!r}"
         )
-    if domain.low > domain.high:
-        raise ValueError(f"low must be below high in a {kind}; got {domain!r}")
+    if low > high:
+        raise ValueError(f"low must be below high; got {domain!r}")
+    if max(abs(low), abs(high)) > MOST_REAL or np.float32(low) == np.float32(high):
+        raise ValueError(f"low and high must be different float32 numbers; got {domain!r}")
+
+
+def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
+    return _but(x, x < least, least)
+
+
+def _but(x: Float[Array, ""], condition: Any, value: Any) -> Float[Array, ""]:
+    """`x`, but where the condition holds exactly `value`, with the slope of `x` even there.
+
+    A search that stands at an end of the coordinate can so leave it.
+    """
+    return jnp.where(condition, value + (x - jax.lax.stop_gradient(x)), x)

@@ -102,6 +102,14 @@ class Domain(abc.ABC):
         """What each unit coordinate of the feature called `name` is called."""
         return self.columns(name)
 
+    def refined(self, factor: int) -> "Domain":
+        """The same domain with finer signals, where it has any; see `Signal.refined`."""
+        return self
+
+    def refine(self, value: Any, factor: int) -> Any:
+        """A value of this domain as one of `refined(factor)`."""
+        return value
+
 
 def cell(u: Float[Array, "*shape"], count: int) -> Any:
     """Which of `count` equally wide cells holds `u`, as `int32`; 1.0 is in the last one."""

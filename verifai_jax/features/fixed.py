@@ -27,11 +27,8 @@ class Fixed(Domain):
 
     def __init__(self, domain: Domain, value: Any, name: str = "value") -> None:
         domain.check(value, name)
-        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], domain.coerce(value))
-        columns = domain.to_columns(batch, "")
-        row = tuple((column, as_scalar(entries[0])) for column, entries in columns.items())
         object.__setattr__(self, "domain", domain)
-        object.__setattr__(self, "row", row)
+        object.__setattr__(self, "row", _row(domain, value))
 
     @property
     def value(self) -> Any:
@@ -60,6 +57,8 @@ class Fixed(Domain):
 
     def check(self, value: Any, name: str) -> None:
         self.domain.check(value, name)
+        if _row(self.domain, value) != self.row:
+            raise ValueError(f"{name} is fixed, {self._shown()}; got {value!r}")
 
     def columns(self, name: str) -> tuple[str, ...]:
         return self.domain.columns(name)
@@ -70,7 +69,25 @@ class Fixed(Domain):
     def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
         return self.domain.from_columns(row, name)
 
-    def __repr__(self) -> str:
-        values = [value for _, value in self.row]
+    def refined(self, factor: int) -> "Fixed":
+        return Fixed(self.domain.refined(factor), self.domain.refine(self.value, factor))
+
+    def refine(self, value: Any, factor: int) -> Any:
+        return self.domain.refine(value, factor)
+
+    def _shown(self) -> str:
+        values = [value for _, value in self.row if value is not None]
         shown = [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values[:6]]
-        return f"{', '.join(shown)}{', ...' * (len(values) > 6)}, fixed in {self.domain!r}"
+        return f"{', '.join(shown)}{', ...' * (len(values) > 6)}"
+
+    def __repr__(self) -> str:
+        return f"{self._shown()}, fixed in {self.domain!r}"
+
+
+def _row(domain: Domain, value: Any) -> tuple[tuple[str, Any], ...]:
+    """A value as the table shows it; None where an item is absent, which NaN would not equal."""
+    with jax.ensure_compile_time_eval():
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], domain.coerce(value))
+        columns = domain.to_columns(batch, "")
+    entries = ((column, as_scalar(column_entries[0])) for column, column_entries in columns.items())
+    return tuple((column, None if entry != entry else entry) for column, entry in entries)

@@ -44,7 +44,7 @@ def to_plain(domain: Domain) -> dict[str, Any]:
             return {"kind": "Array", "domain": to_plain(domain.domain), "length": length}
         case Categorical():
             for choice in domain.choices:
-                if not isinstance(choice, bool | int | float | str):
+                if not isinstance(choice, bool | int | float | str | None):
                     raise ValueError(f"the choice {choice!r} is no plain data")
             weights = None if domain.probabilities is None else list(domain.probabilities)
             return {"kind": "Categorical", "choices": list(domain.choices), "weights": weights}
@@ -83,6 +83,10 @@ def _built(data: Mapping[str, Any], given: Mapping[str, Distribution]) -> Domain
     kind = data["kind"]
     match kind:
         case "Struct":
+            names = [name for name, _ in data["fields"]]
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"the name {name!r} comes twice; got {names}")
             return Struct({name: from_plain(field, given) for name, field in data["fields"]})
         case "Array":
             length: Any = data["length"]

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from verifai_jax.errors import unknown_name
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import Domain, indexed
-from verifai_jax.waveform import HOLDS, Waveform, is_waveform
+from verifai_jax.features.domain import Domain, as_numbers, indexed
+from verifai_jax.waveform import HOLDS, Waveform, is_waveform, seconds
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Signal(Domain):
     """
 
     domain: Domain
-    knots: int
+    knots: int = 16
     hold: str = "linear"
     duration: float | None = None
 
@@ -54,10 +54,8 @@ class Signal(Domain):
                 f"a Signal with {self.hold} hold needs at least {least} knots; got {knots!r}"
             )
         object.__setattr__(self, "knots", int(knots))
-        if self.duration is not None and not 0 < self.duration < float("inf"):
-            raise ValueError(
-                f"duration must be a positive number of seconds; got {self.duration!r}"
-            )
+        if self.duration is not None:
+            object.__setattr__(self, "duration", seconds(self.duration))
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -80,7 +78,14 @@ class Signal(Domain):
         return self._waveform(knots)
 
     def check(self, value: Any, name: str) -> None:
-        knots = np.asarray(value.knots if is_waveform(value) else value)
+        if is_waveform(value):
+            if (value.hold, value.duration) not in ((self.hold, self.duration), (self.hold, None)):
+                raise ValueError(
+                    f"{name} must have hold={self.hold!r} and duration={self.duration}; got "
+                    f"hold={value.hold!r} and duration={value.duration}"
+                )
+            value = value.knots
+        knots = as_numbers(value, name)
         if knots.ndim == np.ndim(getattr(self.domain, "low", 0.0)):
             self.domain.check(knots, name)
             return

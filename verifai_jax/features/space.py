@@ -11,6 +11,7 @@ space.only("x0", nominal={"alg": "ppo"})                             # a view
 import html
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,7 +26,6 @@ from verifai_jax.features.compound import Struct
 from verifai_jax.features.domain import Domain, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
-from verifai_jax.features.signal import Signal
 
 
 class FeatureSpace:
@@ -132,15 +132,14 @@ class FeatureSpace:
         self.root.check(complete, "")
         if self.where is not None and not bool(self.accepts(self.root.coerce(complete))):
             raise ValueError(
-                f"the features break the constraint {_source(self.where)} of this space; "
-                f"got {dict(features)!r}"
+                f"{dict(features)!r} breaks the constraint of this space, {_source(self.where)}"
             )
 
     def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
         """Whether the constraint holds; True without one. Pure JAX."""
         return jnp.asarray(True if self.where is None else self.where(features))
 
-    def check_where(self, seed: int = 0) -> float:
+    def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
         """The share of the prior that the constraint accepts, measured; 1 without one.
 
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
@@ -154,6 +153,8 @@ class FeatureSpace:
         **Raises:** as `check_where`.
         """
         self.check_where()
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(f"the number of samples must be a positive integer; got {count!r}")
         found, have = [], 0
         many = jax.jit(jax.vmap(lambda u: (self.unflatten(u), self.accepts(self.unflatten(u)))))
         while have < count:
@@ -199,6 +200,7 @@ class FeatureSpace:
         if not features:
             raise ValueError("name at least one feature that varies")
         check_names("feature", features, self.domains)
+        check_names("feature", nominal or {}, self.domains)
         others = [
             name
             for name, domain in self.root.fields
@@ -215,20 +217,15 @@ class FeatureSpace:
     def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[Any], Any]]":
         """From coarse to fine: the space with finer signals, and a map of features to it.
 
-        Only signals that are features themselves are refined; see `Signal.refined`.
+        See `Signal.refined`; the finer features are the same functions of time.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
         """
-        domains = {
-            name: domain.refined(factor) if isinstance(domain, Signal) else domain
-            for name, domain in self.root.fields
-        }
-
-        def refine(features: Mapping[str, Any]) -> dict[str, Any]:
-            return {
-                name: value.refined(factor) if isinstance(domains[name], Signal) else value
-                for name, value in features.items()
-            }
-
-        return FeatureSpace(domains, self.where), refine
+        positive = isinstance(factor, int | np.integer) and not isinstance(factor, bool)
+        if not positive or factor < 1:
+            raise ValueError(f"factor must be a positive integer; got {factor!r}")
+        finer = FeatureSpace(dict(self.root.refined(factor).fields), self.where)
+        return finer, lambda features: self.root.refine(features, factor)
 
     def to_json(self) -> dict[str, Any]:
         """The space as plain data; of a constraint only that there is one, and its name.
@@ -346,4 +343,7 @@ def _varied(domain: Domain) -> Domain:
 def _source(where: Callable[[Any], Any]) -> str:
     """What a constraint is called."""
     name = getattr(where, "__name__", type(where).__name__)
-    return "where" if name == "<lambda>" else name
+    if name == "<lambda>":
+        code = where.__code__
+        return f"lambda in line {code.co_firstlineno} of {Path(code.co_filename).name}"
+    return name
