@@ -11,6 +11,7 @@ row with the distribution it would have, given acceptance; rows that stay refuse
 counted.
 """
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -131,7 +132,7 @@ class Proposals:
             "counts": np.array([self.asked, self.accepted], np.int64),
         }
 
-    def restore(self, snapshot: dict[str, Any]) -> None:
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Go on where `snapshot` was taken.
 
         **Raises:** `ValueError` for a snapshot of another search, space or batch size.

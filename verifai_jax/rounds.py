@@ -5,6 +5,7 @@ a round is enough to go on from there, whatever happened since.
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,7 +126,7 @@ class Rounds:
         self._saved = now
         write_snapshot(self.snapshot, folder)
 
-    def resume(self, snapshot: dict[str, Any]) -> None:
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on where `snapshot` was taken; the table must hold its rows already.
 
         **Raises:** `ValueError` for a snapshot of another search, space or batch size.
@@ -135,9 +136,8 @@ class Rounds:
             names = self._objective.state
             self._objective.state = {name: snapshot[f"objective.{name}"] for name in names}
         table = self.table.all
-        proper = table["status"] == "ok"
-        self.judged = int(proper.sum())
-        self.found = int((proper & table["violated"]).sum())
+        self.judged = len(table) - len(self.table.failed)
+        self.found = len(self.table.counterexamples)
         self.best = float(np.fmin.reduce(table["rho"].to_numpy(), initial=np.nan))
         self._keep()
 
