@@ -59,7 +59,9 @@ notebooks: .venv/installed
 
 bench: .venv-bench/installed
 	.venv-bench/bin/python benchmarks/throughput.py
-	.venv-bench/bin/python benchmarks/search_quality.py
+	.venv-bench/bin/python benchmarks/search_quality.py landscapes
+	.venv-bench/bin/python benchmarks/search_quality.py cartpole
+	.venv-bench/bin/python benchmarks/search_cost.py
 	.venv-bench/bin/python benchmarks/monitor.py
 
 policy: .venv/installed

@@ -55,6 +55,18 @@ class TestFeatures:
         for domain, expected in levels.items():
             assert domain.levels == expected
 
+    def test_intervals(self):
+        box = vj.Box.from_intervals((3, 1), (0, 10))
+        assert box == vj.Box([1, 0], [3, 10])
+        np.testing.assert_allclose(box.to_unit([1.5, 2.5]), [0.25, 0.25])
+        np.testing.assert_allclose(box.from_unit(jnp.array([0.25, 0.25])), [1.5, 2.5])
+        assert vj.Box.from_intervals((3, 1)) == vj.Box(1, 3)
+        assert vj.DiscreteBox.from_interval(0.2, 3.9) == vj.DiscreteBox(1, 3)
+        with pytest.raises(ValueError, match="low must be below high"):
+            vj.Box(3, 1)
+        with pytest.raises(ValueError, match="an interval is a pair of numbers"):
+            vj.Box.from_intervals(3)  # pyright: ignore[reportArgumentType]
+
     def test_order_is_the_one_written(self):
         names = ["param2", "param10", "a", "B"]
         assert vj.FeatureSpace({n: vj.Box(0, 1) for n in names}).columns == tuple(names)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from landscapes import gain, play
+from playing import gain, play
 
 from verifai_jax.search import Cube, Evaluated
 from verifai_jax.search.bayes import Bayes
@@ -14,7 +14,7 @@ from verifai_jax.testing import check_search
 KEY = jax.random.key(0)
 SMALL = Bayes(capacity=128, candidates=128)
 IMPROVEMENT = Bayes("expected_improvement", capacity=128, candidates=128)
-FLAT = ("ball", "minima")
+FLAT = ("ball", "ripples")
 
 
 def jitted(search):
@@ -24,7 +24,7 @@ def jitted(search):
     )
 
 
-@pytest.mark.parametrize("names", [FLAT, ("mixed",), ("few",)], ids="-".join)
+@pytest.mark.parametrize("names", [FLAT, ("mixed",), ("few_of_many",)], ids="-".join)
 def test_beats_uniform(names):
     values = play(SMALL, names, 8, 11, 9, together=False)[1]
     for name, value in zip(names, values, strict=True):

@@ -85,6 +85,8 @@ def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
         if name in columns and not columns[name].ordered:
             choices = columns[name].choices
             axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])
+        else:
+            axis.get_major_locator().set_params(nbins=5)
 
 
 def shortened(text: str, most: int = 60) -> str:

@@ -72,9 +72,9 @@ class Box(Domain):
     @classmethod
     def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
         """VerifAI's notation, an interval for each entry, whose ends may come in any order."""
-        ends = [sorted(interval) for interval in intervals]
-        if not ends or any(len(pair) != 2 for pair in ends):
+        if not intervals or not all(np.shape(interval) == (2,) for interval in intervals):
             raise ValueError(f"an interval is a pair of numbers; got {intervals!r}")
+        ends = [sorted(interval) for interval in intervals]
         if len(ends) == 1:
             return cls(*ends[0])
         low, high = zip(*ends, strict=True)
