@@ -36,8 +36,9 @@ help:
 falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
+# Tests of one file share what they compile, so a file stays with one worker.
 test: .venv/installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: .venv/installed
 	$(BIN)/python -m pytest -m slow
