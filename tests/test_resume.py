@@ -84,6 +84,29 @@ class Own(search.Uniform):
     """A search that verifai_jax does not know by name."""
 
 
+def test_a_black_box_with_everything_that_a_space_has(tmp_path):
+    def cars(features):
+        items = features["cars"]
+        load = features["x"] + items.length + float(np.sum(items.values * items.mask))
+        return vj.Trace({"load": np.array([load])}, dt=1.0)
+
+    space = vj.FeatureSpace(
+        {"x": vj.Normal(0, 1), "cars": vj.Array(vj.Box(0, 1), length=(0, 3))},
+        where=lambda features: features["x"] > -1,
+    )
+    spec = {"grave": "load < 4", "light": "load < 2"}
+    loaded = vj.Problem("cars", space, vj.blackbox(cars), spec, priority=["grave", "light"])
+    vj.falsify(loaded, "cross_entropy", 60, batch=20, folder=tmp_path / "run")
+    resumed = vj.resume(tmp_path / "run", loaded, budget=100)
+    assert same(resumed, vj.falsify(loaded, "cross_entropy", 100, batch=20))
+    table = resumed.table.all
+    assert np.all(table["x"] > -1)
+    np.testing.assert_array_equal(table["cars[2]"].isna(), table["cars.length"] < 3)
+    load = table["x"] + table["cars.length"] + table[[f"cars[{i}]" for i in range(3)]].sum(axis=1)
+    np.testing.assert_allclose(table["rho.grave"], 4 - load, atol=1e-5)
+    assert resumed.replay(resumed.best).rho["light"] == pytest.approx(resumed.best["rho"])
+
+
 class TestRefused:
     def test_a_spent_budget(self, problem):
         run = vj.falsify(problem, "halton", 16, batch=16)
