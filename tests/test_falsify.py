@@ -42,6 +42,13 @@ def test_rows_are_what_was_simulated(problem):
     assert run.best["rho"] == table["rho"].min()
 
 
+def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
+    assert vj.falsify(problem, "uniform", 3000).batch == 1024
+    assert vj.falsify(problem, "cross_entropy", 1000).batch == 32
+    assert vj.falsify(problem, "cross_entropy", 5).batch == 5
+    assert vj.search.Bayes().most_at_once == 16
+
+
 def test_same_seed_same_table(problem):
     one = vj.falsify(problem, "cross_entropy", 300, batch=64, seed=5).table.all
     two = vj.falsify(problem, "cross_entropy", 300, batch=64, seed=5).table.all

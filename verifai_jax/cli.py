@@ -51,7 +51,7 @@ def main(traceback: bool) -> None:
 @click.option("--search", help="Name of the search  [default: cross_entropy]")
 @click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 @click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
-@click.option("--batch", type=int, help="Simulations a round  [default: 1024]")
+@click.option("--batch", type=int, help="Simulations a round  [default: by search]")
 @click.option("--seed", type=int, help="[default: 0]")
 @click.option("--only", metavar="NAMES", help="Features to vary, comma-separated; others nominal.")
 @click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
@@ -109,7 +109,7 @@ def falsify(
             problem,
             chosen,
             10_000 if budget is None else budget,
-            batch=1024 if batch is None else batch,
+            batch=batch,
             seed=0 if seed is None else seed,
             warm_start=None if warm_start is None else load(warm_start),
             folder=out or _next_folder(problem.name),

@@ -42,7 +42,7 @@ def falsify(
     search: str | Search = "cross_entropy",
     budget: int = 10_000,
     *,
-    batch: int = 1024,
+    batch: int | None = None,
     seed: int = 0,
     max_seconds: float | None = None,
     stop_after: int | None = None,
@@ -60,7 +60,8 @@ def falsify(
     - `search`: a name (`verifai_jax.search.names()`), or a search with its options.
     - `budget`: simulations at most; the last batch is cut to fit.
     - `batch`: simulations a round. Active searches learn once a round: a small batch spends
-      fewer simulations, a large one less time.
+      fewer simulations, a large one less time. By default 1024, and for a search that learns at
+      most a twentieth of the budget, so that it can (16 for `bayes`).
     - `seed`: the same seed gives the same table, bit for bit, on the same machine.
     - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
     - `stop_after`: stop after the round in which that many counterexamples are reached.
@@ -79,12 +80,12 @@ def falsify(
     work on the space; `RunError` with the finished part of the run when the loop breaks down.
     """
     started = time.perf_counter()
-    _check_options(budget, batch, seed, max_seconds, stop_after)
+    _check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     search = _check_search(problem, search)
     _check_rule(search, stop_when)
     earlier = _earlier(warm_start, problem)
     problem.check()
-    batch = min(batch, budget)
+    batch = min(_usual_batch(search, budget) if batch is None else batch, budget)
     place = _new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
     rounds = Rounds(problem, search, batch, seed, table)
@@ -295,6 +296,13 @@ def _play(
             result,
         ) from cause
     return result
+
+
+def _usual_batch(search: Search, budget: int) -> int:
+    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few."""
+    if not search.learns:
+        return search.most_at_once
+    return min(search.most_at_once, 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
 def _is_integer(value: Any) -> bool:

@@ -159,6 +159,9 @@ class Search(abc.ABC):
     learns: ClassVar[bool] = True
     """Whether `tell` changes what is asked next; False for sequences fixed from the start."""
 
+    most_at_once: ClassVar[int] = 1024
+    """Points in a round beyond which more rounds are worth more than larger ones."""
+
     def check(self, cube: Cube) -> None:  # noqa: B027 - most searches work on every cube
         """Raise `ValueError` if this search cannot work on this cube."""
 

@@ -15,7 +15,7 @@ robustness over its lower quartile, and capped, so that huge values do not hide 
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,6 +76,7 @@ class Bayes(Search):
     **Raises:** `ValueError` for values out of range.
     """
 
+    most_at_once: ClassVar[int] = 16
     acquisition: str = "thompson"
     capacity: int = 512
     candidates: int = 512
