@@ -179,7 +179,12 @@ class Proposals:
             parts.append(points)
             ready += len(points)
         whole = parts[-1] if ready == len(parts[-1]) else np.concatenate(parts)
-        self._queue = np.asarray(whole[most:])
+        if ready <= most:
+            # As the search gave it: a full round needs no copy.
+            self._queue = np.zeros((0, self.cube.dim), np.float32)
+            return whole
+        whole = np.asarray(whole)
+        self._queue = whole[most:]
         return whole[:most]
 
     def _learned(self, most: int) -> Float[Any, "m d"]:
