@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import (
@@ -30,6 +29,7 @@ from verifai_jax.search.base import (
     check_count,
     check_fraction,
     check_positive,
+    standard_normal,
 )
 
 # More ordered cells than this are stepped over as if continuous.
@@ -115,7 +115,7 @@ class Annealing(Search):
         certain = jnp.arange(d) == (row[:, :1] * d).astype(jnp.int32)
         moved = certain | (move < jnp.where(row[:, 1:2] < 0.5, 1.0, max(0.3, 1 / max(d, 1))))
         scale = state.step[turn][:, None] * 1.5 * 0.03 ** row[:, 2:3]
-        step = scale * ndtri(jnp.maximum(noise, np.float32(2**-25)))
+        step = scale * standard_normal(noise)
         one, other = (row[:, 3:5] * chains).astype(jnp.int32).T
         along = (0.3 + 0.7 * row[:, 2:3]) * (state.u[one] - state.u[other]) + 0.1 * step
         step = jnp.where(moved, jnp.where(row[:, 5:] < ALONG_OTHERS, along, step), 0.0)
@@ -137,8 +137,8 @@ class Annealing(Search):
     def tell(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
         batch, chains = len(evaluated.rho), len(state.energy)
         turn = self._turn(state, batch)
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        usable = evaluated.judged
+        new = evaluated.score
         before = state.energy[turn]
         spread = self._spread(state, turn, new)
         coldness = self._coldness(chains) / jnp.where(spread > 0, spread, 1.0)
@@ -169,8 +169,8 @@ class Annealing(Search):
 
     def warm(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
         """Put the chains at the best points, the best at the coldest."""
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        usable = evaluated.judged
+        new = evaluated.score
         energy = jnp.concatenate([new, state.energy])
         u = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
         best = jnp.argsort(energy)[: len(state.energy)]

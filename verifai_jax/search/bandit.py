@@ -115,8 +115,8 @@ class Bandit(Search):
         return u, state._replace(round=state.round + 1)
 
     def tell(self, state: BanditState, cube: Cube, evaluated: Evaluated) -> BanditState:
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        new = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        usable = evaluated.judged
+        new = evaluated.score
         u = jnp.where(usable[:, None], evaluated.u, 0.5)
         u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
         score = jnp.concatenate([new, state.score])

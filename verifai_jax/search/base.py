@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key
 
 
@@ -141,6 +142,16 @@ class Evaluated(NamedTuple):
     counted: Bool[Array, " n"]
     gradient: Float[Array, "n d"] | None = None
 
+    @property
+    def judged(self) -> Bool[Array, " n"]:
+        """Rows from which something can be learned: counted ones with a finite robustness."""
+        return self.counted & jnp.isfinite(self.rho)
+
+    @property
+    def score(self) -> Float[Array, " n"]:
+        """Robustness with all failures equally good, 0; infinite where nothing can be learned."""
+        return jnp.where(self.judged, jnp.maximum(self.rho, 0.0), jnp.inf)
+
 
 class Search(abc.ABC):
     """The contract; `verifai_jax.testing.check_search` tests it.
@@ -188,6 +199,11 @@ class Search(abc.ABC):
     def temperature(self, state: Any) -> Float[Array, ""]:
         """Of the smooth robustness to differentiate next; only where `wants_gradient`."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
+
+
+def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Standard normal numbers from uniform ones in `[0, 1)`, finite at 0."""
+    return ndtri(jnp.maximum(uniform, np.float32(2**-25)))
 
 
 def check_positive(name: str, value: Any) -> None:

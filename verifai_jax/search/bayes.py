@@ -20,10 +20,17 @@ from typing import ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import log_ndtr, ndtr, ndtri
+from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search, check_count, check_fraction
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    standard_normal,
+)
 from verifai_jax.search.gaussian_process import (
     GaussianProcess,
     Hyper,
@@ -330,7 +337,7 @@ def _near(
     share = float(d) ** -random[:, 2:3]
     pick, noise = random[:, 3 : 3 + d], random[:, 3 + d :]
     moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
-    moved = jnp.clip(parent + step * ndtri(jnp.maximum(noise, np.float32(2**-25))), 0.0, 1.0)
+    moved = jnp.clip(parent + step * standard_normal(noise), 0.0, 1.0)
     # An unordered choice has no neighbours: any other.
     codes = np.array(_process(cube).unordered)
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)

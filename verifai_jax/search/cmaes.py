@@ -25,7 +25,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import (
@@ -34,6 +33,7 @@ from verifai_jax.search.base import (
     Search,
     check_count,
     check_fraction,
+    standard_normal,
 )
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
@@ -179,7 +179,7 @@ class CMAES(Search):
         # Drawn flat and kept: to compile it takes a fifth of the time.
         random = jax.lax.optimization_barrier(jax.random.uniform(key, (sum(sizes),), jnp.float32))
         normal, draw = jnp.split(random, [sizes[0]])
-        normal = ndtri(jnp.maximum(normal, np.float32(2**-25))).reshape(batch, len(plain))
+        normal = standard_normal(normal).reshape(batch, len(plain))
         u = jnp.full((batch, cube.dim), 0.5, jnp.float32)
         u = u.at[:, plain].set(jnp.clip(state.gaussian.draw(normal), 0.0, 1.0))
         if len(codes) == 0:

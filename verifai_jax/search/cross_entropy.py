@@ -20,7 +20,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import (
@@ -30,6 +29,7 @@ from verifai_jax.search.base import (
     check_count,
     check_fraction,
     check_positive,
+    standard_normal,
 )
 from verifai_jax.search.halton import halton_points
 
@@ -106,8 +106,8 @@ class CrossEntropy(Search):
         return u, state._replace(round=state.round + 1, explored=explored)
 
     def tell(self, state: CrossEntropyState, cube: Cube, evaluated: Evaluated) -> CrossEntropyState:
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        usable = evaluated.judged
+        score = evaluated.score
         # New points come first: of equally good ones the first, so the newest, are kept.
         u = jnp.where(usable[:, None], evaluated.u, 0.5)
         points = jnp.concatenate([u, state.elite])
@@ -145,7 +145,7 @@ class CrossEntropy(Search):
         mean = weight @ state.elite / count
         std = jnp.sqrt(weight @ (state.elite - mean) ** 2 / count)
         std = jnp.maximum(self.widening * std, self.least_std)
-        normal = ndtri(jnp.maximum(noise, np.float32(2**-25)))
+        normal = standard_normal(noise)
         spread = float(np.sqrt(1 - self.focus**2))
         u = jnp.clip(mean + self.focus * (parent - mean) + spread * std * normal, 0.0, 1.0)
         if len(cells) == 0:

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import (
@@ -26,6 +25,7 @@ from verifai_jax.search.base import (
     check_count,
     check_fraction,
     check_positive,
+    standard_normal,
 )
 
 # More ordered cells than this are moved by noise, as if continuous.
@@ -127,7 +127,7 @@ class EpsilonGreedy(Search):
         factor = self.reach * NARROWEST_NOISE ** row[:, 3:4]
         # Half of the draws move a few coordinates only, at least one of them on average.
         moved = move < jnp.where(row[:, 4:5] < 0.5, 1.0, max(0.3, 1 / max(d, 1)))
-        step = factor * std * ndtri(jnp.maximum(noise, np.float32(2**-25)))
+        step = factor * std * standard_normal(noise)
         u = jnp.clip(parent + jnp.where(moved, step, 0.0), 0.0, 1.0)
 
         many = np.array(
@@ -142,9 +142,9 @@ class EpsilonGreedy(Search):
     def tell(
         self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
     ) -> EpsilonGreedyState:
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
+        usable = evaluated.judged
         exploring = self._exploring(state, len(evaluated.rho))
-        score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        score = evaluated.score
 
         # What greed gained over the prior; equally good draws count half.
         greedy = usable & ~exploring
@@ -178,8 +178,7 @@ class EpsilonGreedy(Search):
         self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
     ) -> EpsilonGreedyState:
         """Take the best points; what the prior gives has to be seen yet."""
-        usable = evaluated.counted & jnp.isfinite(evaluated.rho)
-        score = jnp.where(usable, jnp.maximum(evaluated.rho, 0.0), jnp.inf)
+        score = evaluated.score
         return self._learned(state, evaluated.u, score)._replace(stale=state.stale)
 
     def _learned(

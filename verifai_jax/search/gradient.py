@@ -132,7 +132,7 @@ class Gradient(Search):
     def tell(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
         assert evaluated.gradient is not None, "the gradient search needs gradients"
         free = np.array(cube.levels) == 0
-        judged = evaluated.counted & jnp.isfinite(evaluated.rho)
+        judged = evaluated.judged
         rho = jnp.where(judged, evaluated.rho, jnp.inf)
         usable = judged & jnp.all(jnp.isfinite(evaluated.gradient), axis=1)
         gradient = jnp.where(usable[:, None] & free, evaluated.gradient, 0.0)
