@@ -14,7 +14,7 @@ import numpy as np
 
 import verifai_jax
 from verifai_jax import search as searches
-from verifai_jax.errors import suggests_options, unknown_name
+from verifai_jax.errors import check_names, suggests_options
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
 from verifai_jax.proposals import cube_of, units
@@ -121,9 +121,7 @@ def simulate(
     **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
     """
     if hasattr(rows, "columns"):
-        for column in problem.space.columns:
-            if column not in rows.columns:  # pyright: ignore[reportAttributeAccessIssue]
-                raise unknown_name("column", column, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
+        check_names("column", problem.space.columns, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
         points = units(problem.space, rows)
     else:
         listed = [rows] if isinstance(rows, Mapping) else list(rows)
@@ -382,9 +380,7 @@ def _earlier(warm_start: Any, problem: Problem) -> Any:
     frame = table.all if isinstance(table, ErrorTable) else table
     if not hasattr(frame, "columns"):
         raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
-    for column in (*problem.space.columns, "rho"):
-        if column not in frame.columns:
-            raise unknown_name("column of warm_start", column, map(str, frame.columns))
+    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, frame.columns))
     return frame
 
 

@@ -65,7 +65,10 @@ class Proposals:
         self.total = search.total(self.cube)
         self.asked = self.accepted = 0
         self._program = _program(search, self.cube, batch)
-        self._accepts = None if space.where is None else _acceptance(space, batch)
+        self._accepts = None if space.where is None else space.accepts_points
+        if self._accepts is not None:
+            # Compiled now, in the shape that it will be asked in.
+            self._accepts(np.zeros((batch, self.cube.dim), np.float32))
         self._state = self._program.init(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
@@ -107,6 +110,11 @@ class Proposals:
             gradient=None if gradient is None else self._spread(gradient, 0.0),
         )
         self._state = self._program.tell(self._state, told)
+
+    def tell_refused(self) -> None:
+        """Tell the search that no row of the last round could be simulated."""
+        gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
+        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient)
 
     def warm(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
         """Let the search learn from the points of an earlier table, before the first round."""
@@ -251,10 +259,3 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
     if search.wants_gradient:
         temperature = jax.jit(search.temperature).lower(state).compile()
     return _Program(init, ask, tell, temperature)
-
-
-def _acceptance(space: FeatureSpace, batch: int) -> Any:
-    """The compiled constraint, over a batch of points."""
-    points = jax.ShapeDtypeStruct((batch, space.dim), jnp.float32)
-    one = jax.vmap(lambda u: space.accepts(space.unflatten(u)))
-    return jax.jit(one).lower(points).compile()

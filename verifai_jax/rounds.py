@@ -77,29 +77,23 @@ class Rounds:
         """Ask, evaluate, tell and store at most `most` simulations."""
         first = len(self.table)
         points = self._proposals.next(most)
-        n = len(points)
-        if n:
-            temperature = self._proposals.temperature
-            evaluation = self.engine.evaluate(points, self.simulation_key, first, temperature)
-            violated = self._violated(evaluation, points, first)
-        else:
-            d = points.shape[1]
-            nothing = np.zeros((0, len(self.problem.formulas)), np.float32)
-            gradient = np.zeros((0, d), np.float32) if self.search.wants_gradient else None
-            evaluation = Evaluation(nothing, np.zeros(0, np.int32), {}, gradient)
-            violated = np.zeros(0, bool)
-        rho = np.min(evaluation.rho, axis=1, initial=np.inf)
+        if not len(points):
+            self._proposals.tell_refused()
+            self._keep()
+            return
+        temperature = self._proposals.temperature
+        evaluation = self.engine.evaluate(points, self.simulation_key, first, temperature)
+        violated = self._violated(evaluation, points, first)
+        rho = np.min(evaluation.rho, axis=1)
         proper = evaluation.status == Status.OK
         told = rho
         if self._objective is not None:
-            broken = evaluation.rho < 0
-            told = self._objective(evaluation.rho, broken).astype(np.float32)
+            told = self._objective(evaluation.rho, evaluation.rho < 0).astype(np.float32)
         self._proposals.tell(told, proper, evaluation.gradient)
-        if n:
-            self.table.append(self._columns(evaluation, rho, violated))
-            self.found += int(np.sum(violated))
-            self.judged += int(np.sum(proper))
-            self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
+        self.table.append(self._columns(evaluation, rho, violated))
+        self.found += int(np.sum(violated))
+        self.judged += int(np.sum(proper))
+        self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
         self._keep()
 
     def warm(self, table: "pd.DataFrame") -> None:

@@ -139,6 +139,11 @@ class FeatureSpace:
         """Whether the constraint holds; True without one. Pure JAX."""
         return jnp.asarray(True if self.where is None else self.where(features))
 
+    @cached_property
+    def accepts_points(self) -> Callable[[Any], Bool[Array, " n"]]:
+        """Whether the constraint holds at points `[n, dim]` of the unit cube; compiled."""
+        return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
+
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
         """The share of the prior that the constraint accepts, measured; 1 without one.
 
@@ -156,12 +161,12 @@ class FeatureSpace:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"the number of samples must be a positive integer; got {count!r}")
         found, have = [], 0
-        many = jax.jit(jax.vmap(lambda u: (self.unflatten(u), self.accepts(self.unflatten(u)))))
+        many = jax.jit(jax.vmap(self.unflatten))
         while have < count:
             key, now = jax.random.split(key)
-            features, accepted = many(jax.random.uniform(now, (max(count, 64), self.dim)))
-            kept = np.flatnonzero(accepted)[: count - have]
-            found.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], features))
+            points = jax.random.uniform(now, (max(count, 64), self.dim))
+            kept = np.flatnonzero(self.accepts_points(points))[: count - have]
+            found.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], many(points)))
             have += len(kept)
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
 
