@@ -1,31 +1,15 @@
 """Importances of features whose influence is known."""
 
 import numpy as np
-import pandas as pd
 import pytest
+from failing_table import failing_table
 
 from verifai_jax.analysis.importance import importance
 
 
-def table(n=3000, seed=0):
-    """Robustness x + 2 [colour is red], which fails below 0.3; y, lanes and z do nothing."""
-    g = np.random.default_rng(seed)
-    frame = pd.DataFrame(
-        {
-            "y": g.random(n),
-            "x": g.random(n),
-            "colour": g.choice(["red", "blue", "green"], n),
-            "lanes": g.integers(0, 4, n),
-            "same": 1.0,
-        }
-    )
-    frame["rho"] = frame.x + 2 * (frame.colour == "red") - 0.3
-    return frame.assign(violated=frame.rho < 0, status="ok")
-
-
 @pytest.fixture(scope="module")
 def found():
-    return importance(table())
+    return importance(failing_table(3000))
 
 
 def test_influence_is_found(found):
@@ -52,7 +36,7 @@ def test_loss_is_what_theory_says(found):
 
 
 def test_rare_failures_are_learned():
-    frame = table(20000)
+    frame = failing_table(20000)
     frame["violated"] = (frame.x > 0.97) & (frame.colour == "blue")
     assert frame["violated"].mean() < 0.015
     found = importance(frame)
@@ -62,7 +46,7 @@ def test_rare_failures_are_learned():
 
 def test_noise_means_nothing():
     g = np.random.default_rng(5)
-    frame = table(1000)
+    frame = failing_table(1000)
     frame["rho"] = g.normal(size=1000)
     frame["violated"] = g.random(1000) < 0.4
     found = importance(frame)
@@ -72,7 +56,7 @@ def test_noise_means_nothing():
 
 
 def test_without_failures_only_the_robustness_is_explained():
-    frame = table(500).assign(violated=False)
+    frame = failing_table(500).assign(violated=False)
     found = importance(frame)
     assert found.missing == {"failing": "no failing row, too few to learn from"}
     assert "failing" not in found.table
@@ -85,7 +69,7 @@ def test_without_failures_only_the_robustness_is_explained():
 
 
 def test_absence_is_information():
-    frame = table(2000)
+    frame = failing_table(2000)
     frame.loc[frame.x > 0.5, "x"] = np.nan
     frame["violated"] = frame.x.isna()
     frame.loc[frame.lanes == 3, "colour"] = None
@@ -93,8 +77,8 @@ def test_absence_is_information():
 
 
 def test_the_same_seed_gives_the_same_table(found):
-    assert importance(table()).table.equals(found.table)
-    assert not importance(table(), seed=1).table.equals(found.table)
+    assert importance(failing_table(3000)).table.equals(found.table)
+    assert not importance(failing_table(3000), seed=1).table.equals(found.table)
 
 
 def test_refusals():
@@ -103,9 +87,9 @@ def test_refusals():
         match="no importance can be learned from 'table': failing: no failing row, too few to "
         "learn from; robustness: it is 1 in every row",
     ):
-        importance(table(100).assign(rho=1.0, violated=False))
+        importance(failing_table(100).assign(rho=1.0, violated=False))
     with pytest.raises(ValueError, match="repeats must be a whole number of at least 2"):
-        importance(table(100), repeats=1)
+        importance(failing_table(100), repeats=1)
 
 
 def test_picture(found, tmp_path):

@@ -2,33 +2,17 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
+from failing_table import failing_table
 from PIL import Image
 
 import verifai_jax as vj
 from verifai_jax.analysis.overview import TITLES, analyze
 
 
-def table(n, seed=0):
-    """Fails for x below 0.3 unless the colour is red."""
-    g = np.random.default_rng(seed)
-    frame = pd.DataFrame(
-        {
-            "y": g.random(n),
-            "x": g.random(n),
-            "colour": g.choice(["red", "blue", "green"], n),
-            "lanes": g.integers(0, 4, n),
-            "same": 1.0,
-        }
-    )
-    frame["rho"] = frame.x + 2 * (frame.colour == "red") - 0.3
-    return frame.assign(violated=frame.rho < 0, status="ok")
-
-
 @pytest.fixture(scope="module")
 def found():
-    return analyze(table(600))
+    return analyze(failing_table(600))
 
 
 def test_every_analysis_speaks(found):
@@ -75,7 +59,7 @@ def test_report_on_disk(found, tmp_path):
 
 @pytest.mark.parametrize("failing", ["none", "one", "three", "all", "any", "empty", "single"])
 def test_odd_tables(failing, tmp_path):
-    frame = table(60)
+    frame = failing_table(60)
     if failing in ("none", "all"):
         frame["violated"] = failing == "all"
     elif failing in ("one", "three"):
@@ -107,7 +91,7 @@ def test_odd_tables(failing, tmp_path):
 
 
 def test_only_constant_columns():
-    frame = table(30)[["same", "rho", "violated", "status"]]
+    frame = failing_table(30)[["same", "rho", "violated", "status"]]
     found = analyze(frame)
     assert found["coverage"] is None
     assert "nothing varies" in str(found)
