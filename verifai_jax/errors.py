@@ -6,9 +6,10 @@ UnknownNameError: unknown search 'halten'; did you mean 'halton'? Known: uniform
 
 import difflib
 import functools
+import importlib
 import inspect
 from collections.abc import Callable, Iterable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,3 +46,23 @@ def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
         return function(*arguments, **options)
 
     return checked
+
+
+class MissingExtra(ImportError):
+    """An optional package that is not installed, with the command that installs it."""
+
+
+def require(module: str, extra: str) -> Any:
+    """Import an optional `module`, which the `extra` of verifai_jax installs.
+
+    **Raises:** `MissingExtra`, one line with the pip command.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        # A package that is there but lacks one of its own is missing all the same.
+        raise MissingExtra(
+            f"{module} needs {error.name}, which is not installed: pip install 'verifai_jax[{extra}]'"
+            if error.name != module
+            else f"{module} is not installed: pip install 'verifai_jax[{extra}]'"
+        ) from error
