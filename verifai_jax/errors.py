@@ -61,8 +61,7 @@ def require(module: str, extra: str) -> Any:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         # A package that is there but lacks one of its own is missing all the same.
+        lacks = "is" if error.name == module else f"needs {error.name}, which is"
         raise MissingExtra(
-            f"{module} needs {error.name}, which is not installed: pip install 'verifai_jax[{extra}]'"
-            if error.name != module
-            else f"{module} is not installed: pip install 'verifai_jax[{extra}]'"
+            f"{module} {lacks} not installed: pip install 'verifai_jax[{extra}]'"
         ) from error
