@@ -1,0 +1,55 @@
+"""Simulators that a worker process can import."""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from verifai_jax.trace import Trace
+
+
+def decay(features):
+    return Trace({"x": features["a"] * np.exp(-np.arange(5) * 0.1)}, dt=0.1)
+
+
+def seeded(features, seed):
+    if seed == 0:
+        return troublesome(features)
+    return Trace({"x": np.array([features["a"], float(seed)])}, dt=0.1)
+
+
+def troublesome(features):
+    """Does what the feature `a` says: 0 is well, what follows is not."""
+    match features["a"]:
+        case 1:
+            raise KeyError("no such road")
+        case 2:
+            os._exit(3)
+        case 3:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case 4:
+            time.sleep(60)
+        case 5:
+            sys.exit("enough")
+        case 6:
+            return "no trace"
+        case 7:
+            return Trace({"y": np.ones(5)}, dt=0.1)
+        case 8:
+            print("noise " * 10)
+        case 9:
+            return Trace({"x": np.array([os.getpid(), os.getsid(0)])}, dt=1.0)
+        case 10:
+            die_once(features["file"])
+        case 11:
+            return Trace({"x": np.array([float(features["wind"](t)) for t in (0.0, 1.0)])}, dt=1.0)
+    return decay(features)
+
+
+def die_once(file):
+    if not Path(file).exists():
+        Path(file).touch()
+        os._exit(1)
