@@ -1,0 +1,208 @@
+"""MuJoCo in C: a batch in lock-step, the policy in JAX between its control periods.
+
+The physics runs on all cores through `mujoco.batch.Batch`, which measured as fast as
+`mujoco.rollout` and keeps its states where the next period continues; parameters that differ
+between rows are written into its arrays, so there is one model however large the batch. A batch is
+worked through in two halves: while one is stepped, the other's policy is evaluated.
+"""
+
+import contextlib
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.errors import require
+from verifai_jax.systems.mujoco_loop import Lived, Loop, Sampled
+from verifai_jax.trace import Status, Trace
+
+HALVED = 64  # Rows from which two halves are worth their overhead.
+
+
+@dataclass(eq=False)
+class Native:
+    """Batches of one loop, and the programs that they need; made once for a system."""
+
+    loop: Loop
+    batches: dict[Any, Any] = field(default_factory=dict)
+    programs: dict[Any, Any] = field(default_factory=dict)
+
+    def simulate(self, features: Any, keys: Any) -> Trace:
+        """A batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
+        count = len(keys)
+        program = self._program(features)
+        halves = 2 if count >= HALVED and count % 2 == 0 else 1
+        size = count // halves
+        with _no_warnings():
+            parts = [
+                _Part(self, program, i, _rows(features, i * size, size), keys[i * size :][:size])
+                for i in range(halves)
+            ]
+            ahead = parts[1:]
+            parts[0].look(0)
+            for k in range(self.loop.periods + 1):
+                for part in ahead:
+                    part.look(k)
+                parts[0].go()
+                if k < self.loop.periods:
+                    parts[0].look(k + 1)
+                for part in ahead:
+                    part.go()
+        return self._trace([part.results() for part in parts])
+
+    def _program(self, features: Any) -> "_Program":
+        leaves, form = jax.tree.flatten(features)
+        key = (form, tuple((np.shape(leaf)[1:], np.result_type(leaf)) for leaf in leaves))
+        key = (*key, bool(jax.config.read("jax_enable_x64")))
+        if key not in self.programs:
+            one = jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf)[1:], _kind(leaf)), features
+            )
+            self.loop.check(one)
+            self.programs[key] = _Program(self.loop, self.loop.reads(one))
+        return self.programs[key]
+
+    def batch(self, size: int, number: int) -> Any:
+        """A `mujoco.batch.Batch` of this many rows; the one that there is already."""
+        if (size, number) not in self.batches:
+            module = require("mujoco.batch", extra="mujoco")
+            # Batches of other sizes are not needed again, or not soon.
+            self.batches = {key: b for key, b in self.batches.items() if key[0] == size}
+            self.batches[size, number] = module.Batch(self.loop.compiled, size)
+        return self.batches[size, number]
+
+    def _trace(self, results: list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]) -> Trace:
+        signals = {
+            name: np.concatenate([result[0][name] for result in results]) for name in results[0][0]
+        }
+        age, finite = (np.concatenate([result[i] for result in results]) for i in (1, 2))
+        status = np.where(finite, Status.OK, Status.NONFINITE).astype(np.int32)
+        ends = self.loop.terminate is not None
+        form = Trace(
+            {name: signal[0] for name, signal in signals.items()},
+            dt=self.loop.control_period,
+            valid=1 if ends else None,
+            status=0,
+            held=ends,
+            finite=self.loop.vouched(),
+        )
+        leaves = [*signals.values(), *([(age + 1).astype(np.int32)] if ends else []), status]
+        return jax.tree.unflatten(jax.tree.structure(form), leaves)
+
+
+class _Program:
+    """What is compiled for features of one form."""
+
+    def __init__(self, loop: Loop, reads: frozenset[str]) -> None:
+        self.loop = loop
+        # The state always, so that what is not finite is seen.
+        self.names = ("qpos", "qvel", "act", *sorted(reads - {"qpos", "qvel", "act"}))
+        self.sizes = [int(np.prod(loop.shapes[name])) for name in self.names]
+        self.stage = self._stage()
+        self.start = jax.jit(jax.vmap(loop.start))
+        self.leaves = jax.jit(jax.vmap(loop.bindings.leaves))
+        self.sample = jax.jit(jax.vmap(self._sample, in_axes=(None, 0, 0, 0)))
+
+    def _stage(self) -> int:
+        """How much MuJoCo has to compute at a sample, beside the steps."""
+        derived = set(self.names) - {"qpos", "qvel", "act"}
+        if not derived:
+            return 0
+        needed = 1
+        if "sensordata" in derived and np.any(self.loop.compiled.sensor_needstage > 1):
+            needed = 2
+        return needed
+
+    def _sample(self, k: Any, packed: Any, lived: Lived, features: Any) -> tuple[Sampled, Lived]:
+        parts = jnp.split(packed, np.cumsum(self.sizes)[:-1])
+        arrays = {
+            name: part.reshape(self.loop.shapes[name])
+            for name, part in zip(self.names, parts, strict=True)
+        }
+        if "sensordata" in arrays:
+            # Before the first step there is no acceleration yet.
+            unknown = (k == 0) & self.loop.late
+            arrays["sensordata"] = jnp.where(unknown, 0.0, arrays["sensordata"])
+        return self.loop.sample(k, arrays, lived, features)
+
+
+class _Part:
+    """A half of the rows, or all of them, on their way through a simulation."""
+
+    def __init__(self, native: Native, program: _Program, number: int, features: Any, keys: Any):
+        self.loop, self.program = native.loop, program
+        count = len(keys)
+        self.batch = native.batch(count, number)
+        self.features = jax.device_put(features)
+        bindings = self.loop.bindings
+        if bindings.arrays:
+            for name, value in program.leaves(self.features).items():
+                self.batch.expand(name)[...] = np.asarray(value).reshape(
+                    self.batch.expand(name).shape
+                )
+            if bindings.moves_constants:
+                self.batch.set_const()
+        self.batch.reset(stage=0)
+        for name, value in program.start(self.features, keys).items():
+            self.batch.bind(name)[...] = np.asarray(value)
+        self.views = [self.batch.bind(name) for name in program.names]
+        if program.stage:
+            self.batch.forward(stage=program.stage)
+        dtype = np.float64 if jax.config.read("jax_enable_x64") else np.float32
+        self.packed = np.zeros((count, sum(program.sizes)), dtype)
+        self.lived = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.lived()
+        )
+        self.samples: list[dict[str, Any]] = []
+        self.sampled: Any = None
+
+    def look(self, k: int) -> None:
+        """Start to evaluate the policy on the state at sample `k`."""
+        start = 0
+        for view, size in zip(self.views, self.program.sizes, strict=True):
+            self.packed[:, start : start + size] = view.reshape(len(view), size)
+            start += size
+        self.sampled, self.lived = self.program.sample(
+            np.int32(k), self.packed, self.lived, self.features
+        )
+
+    def go(self) -> None:
+        """Step to the next sample what has not ended, under the control that was decided."""
+        self.samples.append(self.sampled.signals)
+        still = ~(np.asarray(self.sampled.frozen) | ~np.asarray(self.lived.finite))
+        for name, value in self.sampled.inputs.items():
+            self.batch.bind(name)[...] = np.asarray(value).reshape(self.batch.bind(name).shape)
+        if still.any():
+            ids = None if still.all() else still
+            self.batch.step(ids, nstep=self.loop.substeps, stage=self.program.stage)
+
+    def results(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Signals `[n, time, ...]`, periods lived `[n]`, and whether all was finite `[n]`."""
+        signals = {
+            name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
+            for name in self.samples[0]
+        }
+        return signals, np.asarray(self.lived.age), np.asarray(self.lived.finite)
+
+
+def _rows(features: Any, first: int, count: int) -> Any:
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[first : first + count], features)
+
+
+def _kind(leaf: Any) -> Any:
+    return jax.dtypes.canonicalize_dtype(np.result_type(leaf))
+
+
+@contextlib.contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT: what is not finite is reported by the status."""
+    mujoco = require("mujoco", extra="mujoco")
+    del mujoco
+    yield
+
+
+_ = ctypes
