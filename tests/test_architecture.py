@@ -26,9 +26,13 @@ ALLOWED = {
     "systems": {"errors", "trace", "waveform"},
     "table": {"errors"},
     "progress": set(),
+    "journal": set(),
+    "packing": set(),
+    "gradients": set(),
+    "backends": {"engine", "host", "problem", "run"},
     "problem": {"features", "mtl", "trace", "errors", "rulebook"},
-    "engine": {"problem", "devices", "mtl", "trace"},
-    "host": {"engine", "problem", "mtl", "trace"},
+    "engine": {"problem", "devices", "gradients", "mtl", "packing", "trace"},
+    "host": {"engine", "journal", "problem", "mtl", "systems", "trace"},
     "run": {
         "analysis",
         "engine",
@@ -45,6 +49,7 @@ ALLOWED = {
     "rounds": {
         "engine",
         "host",
+        "journal",
         "problem",
         "proposals",
         "rulebook",
@@ -55,6 +60,8 @@ ALLOWED = {
         "trace",
     },
     "falsify": {
+        "backends",
+        "engine",
         "errors",
         "problem",
         "progress",

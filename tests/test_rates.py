@@ -18,7 +18,7 @@ def test_agrees_with_scipy(n, data, confidence):
     k = data.draw(st.integers(0, n))
     expected = binomtest(k, n).proportion_ci(confidence, method="exact")
     rate = clopper_pearson(k, n, confidence)
-    np.testing.assert_allclose([rate.low, rate.high], [expected.low, expected.high], rtol=1e-9)
+    np.testing.assert_allclose([rate.low, rate.high], [expected.low, expected.high], rtol=1e-8)
 
 
 def test_covers_the_true_rate_at_least_as_often_as_promised():

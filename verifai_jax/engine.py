@@ -20,12 +20,14 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.devices import enable_compile_cache
+from verifai_jax.gradients import Derivative, reverse_refused
 from verifai_jax.mtl import robustness, satisfied, smooth
+from verifai_jax.packing import Packing
 from verifai_jax.problem import Problem
 from verifai_jax.trace import Status, Trace
 
+PRECISIONS = ("float32", "float64")
 CHUNK = 512  # Lanes worked on together: about 1 MB of a 200-sample trace with two signals.
-FORWARD_MODE_LIMIT = 4  # Features up to which a forward sweep each is no slower than one reverse.
 
 
 class Evaluation(NamedTuple):
@@ -49,6 +51,18 @@ class Evaluation(NamedTuple):
 def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array, ""]:
     """The random key of one simulation: a function of the run's key and the row alone."""
     return jax.random.fold_in(key, row)
+
+
+def in_precision(precision: str) -> Any:
+    """A context in which JAX computes in `"float32"` or `"float64"`.
+
+    **Raises:** `ValueError` for another precision.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(
+            f"precision must be {' or '.join(map(repr, PRECISIONS))}; got {precision!r}"
+        )
+    return jax.enable_x64(precision == "float64")
 
 
 def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
@@ -86,6 +100,9 @@ class Engine:
     - `batch`: rows of a call at most; fewer are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
     - `devices`: JAX devices to split the batch over; all of the default backend when left out.
+    - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
+
+    `notes` says, once compiled, what was decided and would surprise.
     """
 
     def __init__(
@@ -94,10 +111,12 @@ class Engine:
         batch: int,
         gradient: bool = False,
         devices: list[Any] | None = None,
+        precision: str = "float32",
     ) -> None:
         self.problem = problem
         self.batch = batch
         self.gradient = gradient
+        self.precision = precision
         devices = jax.devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
@@ -106,11 +125,15 @@ class Engine:
         self.lanes = -(-per_device // self.chunks)
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0
+        self.notes: tuple[str, ...] = ()
+        self._derivative = Derivative(problem.space.dim)
+        self._packing: dict[str, Packing] = {}
         self._executables: dict[str, Any] = {}
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
-        self._executable("evaluate")
+        with in_precision(self.precision):
+            self._executable("evaluate")
 
     def evaluate(
         self,
@@ -124,36 +147,51 @@ class Engine:
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
         - `temperature`: of the smooth robustness that is differentiated; unused without gradient.
         """
-        n = len(u)
-        arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(temperature))
-        rho, status, features, gradient = self._executable("evaluate")(*arguments)
-        return Evaluation(
-            rho=np.asarray(rho)[:n],
-            status=np.asarray(status)[:n],
-            features=jax.tree.map(lambda leaf: np.asarray(leaf)[:n], features),
-            gradient=np.asarray(gradient)[:n] if self.gradient else None,
-        )
+        rho, status, features, gradient = self._run("evaluate", u, key, first, temperature)
+        return Evaluation(rho, status, features, gradient if self.gradient else None)
 
     def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
         """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
-        arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(1.0))
-        return np.asarray(self._executable("verdicts")(*arguments))[: len(u)]
+        return self._run("verdicts", u, key, first, 1.0)
+
+    def _run(self, mode: str, u: Any, key: Any, first: int, temperature: Any) -> Any:
+        with in_precision(self.precision):
+            arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(temperature))
+            packed = self._executable(mode)(*arguments)
+            return self._packing[mode].unpack(packed, len(u))
 
     def _executable(self, mode: str) -> Any:
         if mode not in self._executables:
             enable_compile_cache()
             started = time.perf_counter()
-            one_row = {"evaluate": self._evaluate_row, "verdicts": self._verdict_row}[mode]
-            arguments = (
-                jax.ShapeDtypeStruct((self.padded, self.problem.space.dim), jnp.float32),
-                jax.eval_shape(lambda: jax.random.key(0)),
-                jax.ShapeDtypeStruct((), jnp.int32),
-                jax.ShapeDtypeStruct((), jnp.float32),
-            )
-            program = jax.jit(self._batched(one_row))
-            self._executables[mode] = program.lower(*arguments).compile()
+            self._executables[mode] = self._compiled(mode)
             self.compile_seconds += time.perf_counter() - started
         return self._executables[mode]
+
+    def _compiled(self, mode: str) -> Any:
+        one_row = {"evaluate": self._evaluate_row, "verdicts": self._verdict_row}[mode]
+        arguments = (
+            jax.ShapeDtypeStruct((self.padded, self.problem.space.dim), jnp.float32),
+            jax.eval_shape(lambda: jax.random.key(0)),
+            jax.ShapeDtypeStruct((), jnp.int32),
+            jax.ShapeDtypeStruct((), jnp.float32),
+        )
+        packing = self._packing[mode] = Packing()
+
+        def packed_row(u: Array, key: Array, temperature: Array) -> Any:
+            return packing.pack(one_row(u.astype(self.precision), key, temperature))
+
+        program = self._batched(packed_row)
+        try:
+            # A new function object each time: JAX remembers what it traced by the function.
+            return jax.jit(partial(program)).lower(*arguments).compile()
+        except ValueError as error:
+            if not (self.gradient and self._derivative.reverse and reverse_refused(error)):
+                raise
+        self._derivative = self._derivative.forward_instead()
+        hint = getattr(self.problem.system, "reverse_hint", "")
+        self.notes = (f"{self._derivative.told()}{f': {hint}' if hint else ''}",)
+        return jax.jit(partial(program)).lower(*arguments).compile()
 
     def _batched(self, one_row: Any) -> Any:
         """Spread `one_row(u, key, temperature)` over chunks of lanes and over the devices."""
@@ -198,33 +236,18 @@ class Engine:
         def objective(u: Array) -> tuple[Array, Any]:
             features = self.problem.space.unflatten(u)
             trace = self.problem.system(features, key).hold()
-            semantics = smooth(temperature)
+            semantics = smooth(temperature.astype(u.dtype))
             smoothed = [
                 robustness(formula, trace, semantics, end=self.problem.end)
                 for formula in self.problem.formulas.values()
             ]
             return jnp.min(jnp.stack(smoothed)), (*judge(self.problem, trace), features)
 
-        if u.shape[0] <= FORWARD_MODE_LIMIT:
-            derivative, (rho, status, features) = _forward(objective, u)
-        else:
-            derivative, (rho, status, features) = jax.grad(objective, has_aux=True)(u)
+        derivative, (rho, status, features) = self._derivative(objective, u)
         return rho.astype(u.dtype), status, features, derivative.astype(u.dtype)
 
     def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
         return verdict(self.problem, self.problem.system(self.problem.space.unflatten(u), key))
-
-
-def _forward(objective: Any, u: Float[Array, " d"]) -> tuple[Float[Array, " d"], Any]:
-    """Gradient and auxiliary output by one forward sweep a coordinate, all in one pass."""
-
-    def sweep(direction: Array) -> Any:
-        return jax.jvp(objective, (u,), (direction,), has_aux=True)
-
-    # Only the tangents depend on the direction: the simulation itself is done once.
-    directions = jnp.eye(u.shape[0], dtype=u.dtype)
-    _, derivative, aux = jax.vmap(sweep, out_axes=(None, 0, None))(directions)
-    return derivative, aux
 
 
 def _pad(u: Any, rows: int) -> Any:
@@ -235,9 +258,11 @@ def _pad(u: Any, rows: int) -> Any:
     return np.concatenate([u, np.broadcast_to(u[-1:], (rows - len(u), u.shape[1]))])
 
 
-def engine_for(problem: Problem, batch: int, gradient: bool = False) -> Engine:
+def engine_for(
+    problem: Problem, batch: int, gradient: bool = False, precision: str = "float32"
+) -> Engine:
     """The engine of this (problem, batch, mode), made once and kept as long as the problem."""
-    mode = (batch, gradient)
+    mode = (batch, gradient, precision)
     if mode not in problem.engines:
-        problem.engines[mode] = Engine(problem, batch, gradient)
+        problem.engines[mode] = Engine(problem, batch, gradient, precision=precision)
     return problem.engines[mode]

@@ -6,7 +6,8 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,6 +15,8 @@ import numpy as np
 
 import verifai_jax
 from verifai_jax import search as searches
+from verifai_jax.backends import Choice, resolved
+from verifai_jax.engine import in_precision
 from verifai_jax.errors import check_names, suggests_options
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
@@ -49,6 +52,8 @@ def falsify(
     stop_when: StoppingRule | None = None,
     warm_start: "Run | ErrorTable | pd.DataFrame | None" = None,
     folder: str | Path | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
     progress: bool | None = None,
     target: str | None = None,
 ) -> Run:
@@ -70,6 +75,9 @@ def falsify(
     - `warm_start`: an earlier run or table with the same features, from which a search that learns
       starts. Its rows are not copied.
     - `folder`: where rows are kept on disk as they come; must not hold another run.
+    - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
+    - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
+      can use when left out, as measured here. Name it for the same table on every machine.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
 
@@ -77,25 +85,33 @@ def falsify(
 
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
-    work on the space; `RunError` with the finished part of the run when the loop breaks down.
+    work on the space, a folder that cannot be written; `RunError` with the finished part of the run
+    when the loop breaks down.
     """
     started = time.perf_counter()
     _check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     search = _check_search(problem, search)
     _check_rule(search, stop_when)
     earlier = _earlier(warm_start, problem)
-    problem.check()
+    in_precision(precision)
     batch = min(_usual_batch(search, budget) if batch is None else batch, budget)
+    choice = resolved(
+        problem, gradient=search.wants_gradient, batch=batch, budget=budget, precision=precision,
+        wanted=backend,
+    )  # fmt: skip
+    problem = choice.problem
+    _check_gradient(problem, search)
+    problem.check()
     place = _new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
-    rounds = Rounds(problem, search, batch, seed, table)
+    rounds = Rounds(problem, search, batch, seed, table, precision, place)
 
     def prepare() -> None:
         if earlier is not None:
             rounds.warm(earlier)
 
     ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
-    return _play(rounds, ends, seed, place, progress, target, prepare)
+    return _play(rounds, ends, seed, choice, progress, target, prepare)
 
 
 @suggests_options
@@ -106,6 +122,8 @@ def simulate(
     batch: int = 1024,
     seed: int = 0,
     folder: str | Path | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
     progress: bool | None = None,
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
@@ -128,7 +146,8 @@ def simulate(
         points = np.stack([problem.space.flatten(problem.space.coerce(row)) for row in listed])
     return falsify(
         problem, searches.Listed(points), len(points),
-        batch=batch, seed=seed, folder=folder, progress=progress,
+        batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
+        progress=progress,
     )  # fmt: skip
 
 
@@ -186,16 +205,25 @@ def resume(
         )
     if not snapshot and len(run.table) and run.stopped != "running":
         raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+    if rows > len(run.table):
+        raise ValueError(
+            f"the run of {run.name!r} cannot go on: its search had seen {rows} simulations, of "
+            f"which its table has {len(run.table)}; files of {run.folder} are missing or damaged"
+        )
+    choice = resolved(problem, wanted=run.backend)
+    problem = choice.problem
+    _check_gradient(problem, search)
     problem.check()
-    table = run.table.resumed(rows, run.folder)
-    rounds = Rounds(problem, search, run.batch, run.seed, table)
+    with _writing(run.folder):
+        table = run.table.resumed(rows, run.folder)
+    rounds = Rounds(problem, search, run.batch, run.seed, table, run.precision, run.folder)
 
     def prepare() -> None:
         if snapshot:
             rounds.resume(snapshot)
 
     ends = _Ends(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
-    return _play(rounds, ends, run.seed, run.folder, progress, run.target, prepare)
+    return _play(rounds, ends, run.seed, choice, progress, run.target, prepare)
 
 
 class _Ends(NamedTuple):
@@ -231,13 +259,14 @@ def _play(
     rounds: Rounds,
     ends: _Ends,
     seed: int,
-    place: Path | None,
+    choice: Choice,
     progress: bool | None,
     target: str | None,
     prepare: Callable[[], None],
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
-    problem, search = rounds.problem, rounds.search
+    problem, search, place = rounds.problem, rounds.search, rounds.folder
+    chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
 
     def run(stopped: str) -> Run:
         return Run(
@@ -260,10 +289,14 @@ def _play(
             space_data=_described(problem),
             acceptance=rounds.acceptance,
             snapshot=rounds.snapshot,
+            precision=rounds.precision,
+            backend=choice.backend,
+            notes=(*chosen, *rounds.engine.notes),
         )
 
     if place is not None:
-        write_record(run("running"), place)
+        with _writing(place):
+            write_record(run("running"), place)
     stopped, cause = None, None
     try:
         with Progress(problem.name, ends.budget, progress) as bar:
@@ -276,24 +309,50 @@ def _play(
                 rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)))
                 bar.update(len(rounds.table), rounds.found, rounds.best)
                 stopped = ends.reached(rounds)
-                if place is not None and stopped is None:
-                    rounds.save(place, seldom=True)
+                if stopped is None:
+                    rounds.save(seldom=True)
     except KeyboardInterrupt:
         stopped = "interrupted"
     except Exception as error:
         stopped, cause = f"{type(error).__name__}: {error}", error
     result = run(stopped)
-    rounds.table.close()
-    if place is not None:
-        rounds.save(place)
-        write_record(result, place)
+    try:
+        rounds.table.close()
+        rounds.save()
+        if place is not None:
+            write_record(result, place)
+    except OSError as error:
+        cause = cause or error
     if cause is not None:
         raise RunError(
-            f"the run of {problem.name!r} broke down after {len(rounds.table)} simulations, which "
-            f"are in the .run of this error{f' and in {place}' if place else ''}: {cause}",
-            result,
+            _broke_down(problem.name, len(rounds.table), place, cause), result
         ) from cause
     return result
+
+
+def _broke_down(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
+    told = f"the run of {name!r} broke down after {simulations} simulations: {cause}. "
+    if place is None:
+        return f"{told}They are in the .run of this error"
+    if isinstance(cause, OSError):
+        return (
+            f"{told}All of them are in the .run of this error, and in {place} those up to the last "
+            "whole batch that could be written: make room there and resume it, or save the run "
+            "elsewhere"
+        )
+    return f"{told}They are in the .run of this error and in {place}, which can be resumed"
+
+
+@contextmanager
+def _writing(place: Path | None) -> Iterator[None]:
+    """Turn what a file system refuses into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
+            "can be, or none to keep the run in memory"
+        ) from error
 
 
 def _usual_batch(search: Search, budget: int) -> int:
@@ -326,14 +385,19 @@ def _check_search(problem: Any, search: Any) -> Search:
         search = searches.named(search)
     if not isinstance(search, Search):
         raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
+    if not getattr(problem.system, "backends", ()):
+        _check_gradient(problem, search)
+    problem.space.check_where()
+    search.check(cube_of(problem.space))
+    return search
+
+
+def _check_gradient(problem: Problem, search: Search) -> None:
     if problem.black_box and search.wants_gradient:
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
             f"search {search!r} needs one; use one that does not, such as 'cross_entropy'"
         )
-    problem.space.check_where()
-    search.check(cube_of(problem.space))
-    return search
 
 
 def _check_rule(search: Search, rule: StoppingRule | None) -> None:
@@ -390,5 +454,6 @@ def _new_folder(folder: str | Path | None) -> Path | None:
     place = Path(folder)
     if place.exists() and (not place.is_dir() or any(place.iterdir())):
         raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
-    place.mkdir(parents=True, exist_ok=True)
+    with _writing(place):
+        place.mkdir(parents=True, exist_ok=True)
     return place

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from verifai_jax.errors import unknown_name
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
@@ -95,6 +96,23 @@ class Problem:
         """Whether the system runs on the host, out of JAX's sight."""
         return bool(getattr(self.system, "black_box", False))
 
+    def on_backend(self, backend: str) -> "Problem":
+        """The same problem on one backend of its system, made once: it keeps what it compiles.
+
+        A problem whose system has one backend only, or is on this one already, is itself.
+
+        **Raises:** `UnknownNameError` for a backend that the system lacks.
+        """
+        system: Any = self.system
+        if not getattr(system, "backends", ()) or system.backend == backend:
+            return self
+        if backend not in system.backends:
+            raise unknown_name("backend", backend, (*system.backends, "auto"))
+        made = self.engines.setdefault("backends", {})
+        if backend not in made:
+            made[backend] = replace(self, system=system.with_backend(backend))
+        return made[backend]
+
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
         """The same problem with these features varied alone, all others at their nominal values.
 
@@ -108,15 +126,25 @@ class Problem:
     def check(self) -> None:
         """Trace the system and its monitor abstractly: no simulation, nothing compiles.
 
-        **Raises:** `ProblemError` for a system that raises or returns no `Trace`; what the
-        monitor says for a formula over a signal that the system does not produce.
+        A system may have its own say: `check(features)`, with features as `jax.ShapeDtypeStruct`s,
+        and, for one that JAX does not trace, `abstract(features)`, the form of its traces.
+
+        **Raises:** what the system's own check does; `ProblemError` for a system that raises or
+        returns no `Trace`; what the monitor says for a formula over a signal that the system does
+        not produce.
         """
-        if self.black_box:
-            return
         features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
         key = jax.eval_shape(lambda: jax.random.key(0))
+        if callable(fits := getattr(self.system, "check", None)):
+            fits(features)
+        abstract: Any = getattr(self.system, "abstract", None)
+        if self.black_box and abstract is None:
+            return
         try:
-            trace = jax.eval_shape(self.system, features, key)
+            if self.black_box:
+                trace = abstract(features)
+            else:
+                trace = jax.eval_shape(self.system, features, key)
         except Exception as error:
             raise ProblemError(
                 f"the system of problem {self.name!r} raised {type(error).__name__} when JAX "

@@ -13,6 +13,7 @@ import numpy as np
 
 from verifai_jax.engine import Engine, Evaluation, engine_for
 from verifai_jax.host import HostEngine
+from verifai_jax.journal import Journal
 from verifai_jax.problem import Problem
 from verifai_jax.proposals import Proposals, units
 from verifai_jax.rulebook import Objective
@@ -38,13 +39,22 @@ class Rounds:
     """
 
     def __init__(
-        self, problem: Problem, search: Search, batch: int, seed: int, table: ErrorTable
+        self,
+        problem: Problem,
+        search: Search,
+        batch: int,
+        seed: int,
+        table: ErrorTable,
+        precision: str = "float32",
+        folder: Path | None = None,
     ) -> None:
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
+        self.precision, self.folder = precision, folder
+        self._journal = Journal(folder) if folder is not None and problem.black_box else None
         self.engine = (
-            HostEngine(problem)
+            HostEngine(problem, precision, self._journal)
             if problem.black_box
-            else engine_for(problem, batch, gradient=search.wants_gradient)
+            else engine_for(problem, batch, search.wants_gradient, precision)
         )
         self.search_key, self.simulation_key = run_keys(seed)
         self.found = self.judged = 0
@@ -88,8 +98,13 @@ class Rounds:
         proper = evaluation.status == Status.OK
         told = rho
         if self._objective is not None:
-            told = self._objective(evaluation.rho, evaluation.rho < 0).astype(np.float32)
-        self._proposals.tell(told, proper, evaluation.gradient)
+            told = self._objective(evaluation.rho, evaluation.rho < 0)
+        gradient = evaluation.gradient
+        self._proposals.tell(
+            told.astype(np.float32),  # Searches compute in float32, whatever the simulations do.
+            proper,
+            None if gradient is None else gradient.astype(np.float32),
+        )
         self.table.append(self._columns(evaluation, rho, violated))
         self.found += int(np.sum(violated))
         self.judged += int(np.sum(proper))
@@ -112,13 +127,19 @@ class Rounds:
         self._proposals.warm(units(self.problem.space, proper), rho)
         self._keep()
 
-    def save(self, folder: Path, seldom: bool = False) -> None:
-        """Write the snapshot to `folder`; if `seldom`, only when the last one is a second old."""
+    def save(self, seldom: bool = False) -> None:
+        """Write the snapshot to the folder; if `seldom`, only when the last one is a second old.
+
+        **Raises:** `OSError` where it cannot be written.
+        """
         now = time.perf_counter()
-        if seldom and now - self._saved < 1.0:
+        if self.folder is None or (seldom and now - self._saved < 1.0):
             return
         self._saved = now
-        write_snapshot(self.snapshot, folder)
+        write_snapshot(self.snapshot, self.folder)
+        if self._journal is not None:
+            # Only now: rows of the table that the snapshot does not know are simulated again.
+            self._journal.clear()
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on where `snapshot` was taken; the table must hold its rows already.
@@ -165,6 +186,8 @@ class Rounds:
             for i, name in enumerate(self.problem.formulas):
                 columns[f"rho.{name}"] = evaluation.rho[:, i]
         columns |= {"violated": violated, "status": STATUS_NAMES[evaluation.status]}
+        if evaluation.gradient is not None:
+            columns["gradient_finite"] = np.all(np.isfinite(evaluation.gradient), axis=1)
         if evaluation.messages is not None:
             columns["message"] = np.array(evaluation.messages, dtype=object)
         return columns

@@ -7,7 +7,7 @@ run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.engine import judge, simulation_key, verdict
+from verifai_jax.engine import in_precision, judge, simulation_key, verdict
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem import Problem
 from verifai_jax.rates import Rate, at_any_time, clopper_pearson
@@ -90,7 +90,8 @@ class Run:
     `search_data` and `space_data`: the search and the space as plain data, None for one of the
     user's own; `acceptance`: share of
     proposed points that the constraint of the space let through, None without one; `snapshot`: what
-    `resume` goes on from.
+    `resume` goes on from; `precision` of the simulations; `backend` that simulated, None for a
+    system that has one only; `notes` on what was decided by itself, for people.
     """
 
     name: str
@@ -112,6 +113,9 @@ class Run:
     space_data: Mapping[str, Any] | None = None
     acceptance: float | None = None
     snapshot: Mapping[str, Any] | None = None
+    precision: str = "float32"
+    backend: str | None = None
+    notes: Sequence[str] = ()
 
     @property
     def simulations(self) -> int:
@@ -176,13 +180,13 @@ class Run:
         return analyze(self, **options)
 
     def replay(
-        self, row: "int | pd.Series | Mapping[str, Any]", precision: str = "float32"
+        self, row: "int | pd.Series | Mapping[str, Any]", precision: str | None = None
     ) -> Replay:
         """Simulate a row of the table again and keep its trace.
 
         - `row`: a row number, or a row of `table.all` (its index is the row number), or any
           mapping with the feature columns.
-        - `precision`: `"float32"` as in the search, or `"float64"`.
+        - `precision`: `"float32"` or `"float64"`; that of the run when left out.
 
         **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
         in the table.
@@ -199,6 +203,7 @@ class Run:
             number, values = int(row), self.table.all.iloc[int(row)]
         else:
             number, values = getattr(row, "name", None), row
+        precision = self.precision if precision is None else precision
         return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
 
     def summary(self) -> str:
@@ -242,10 +247,8 @@ def replay(
 
     **Raises:** `ValueError` for a precision other than float32 and float64.
     """
-    if precision not in ("float32", "float64"):
-        raise ValueError(f"precision must be 'float32' or 'float64'; got {precision!r}")
     key = simulation_key(key, 0 if number is None else number)
-    with jax.enable_x64(precision == "float64"):
+    with in_precision(precision):
         features = problem.space.from_row(row)
         if problem.black_box:
             trace = problem.system(features, key)
@@ -291,7 +294,16 @@ _RECORDED = (
     "prior",
     "target",
 )
-_ADDED = ("budget", "search_data", "space_data", "acceptance")  # Absent from the records of 0.1.
+# Absent from the records of 0.1.
+_ADDED = (
+    "budget",
+    "search_data",
+    "space_data",
+    "acceptance",
+    "precision",
+    "backend",
+    "notes",
+)
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
@@ -323,6 +335,8 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
                     f"the run in {folder} is of another problem: its {what} is {recorded!r}, "
                     f"the given one's {given!r}"
                 )
+        if record.get("backend") is not None:
+            problem = problem.on_backend(record["backend"])
     return Run(
         table=ErrorTable.load(folder, features),
         folder=folder,
@@ -359,6 +373,11 @@ def _summary(run: Run) -> str:
         if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
             number, message = raised.index[0], raised["message"].iloc[0]
             lines.append(f"               first in row {number}: {message}")
+    if "gradient_finite" in run.table.all:
+        lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
+        if lost:
+            lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
+    lines.extend(f"  note         {note}" for note in run.notes)
     if run.acceptance is not None:
         lines.append(f"  constraint   let through {100 * run.acceptance:.3g} % of all proposals")
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 STREAM = "rows.arrows"
 FINISHED = "table.parquet"
-RESERVED = ("row", "rho", "violated", "status", "message")
+RESERVED = ("row", "rho", "violated", "status", "message", "gradient_finite")
 
 
 class ErrorTable:
@@ -61,10 +61,13 @@ class ErrorTable:
             self._stream.append(self._batches[-1])
 
     def close(self) -> None:
-        """Turn the stream on disk into a Parquet file."""
+        """Turn the stream on disk into a Parquet file.
+
+        **Raises:** `OSError` where it cannot be written; the stream then stays as it is.
+        """
         if self._stream is not None:
-            self._stream.close(self.all)
-            self._stream = None
+            stream, self._stream = self._stream, None
+            stream.close(self.all)
 
     @property
     def all(self) -> "pd.DataFrame":
@@ -166,8 +169,10 @@ class _Stream:
 
     def close(self, frame: "pd.DataFrame") -> None:
         if self._writer is not None:
-            self._writer.close()
-            self._file.close()
+            try:
+                self._writer.close()
+            finally:
+                self._file.close()
         _write(frame, self.folder)
         (self.folder / STREAM).unlink(missing_ok=True)
 
@@ -175,8 +180,12 @@ class _Stream:
 def _write(frame: "pd.DataFrame", folder: Path) -> None:
     # A reader never meets a half-written file under the final name.
     partial = folder / f"{FINISHED}.part"
-    frame.to_parquet(partial)
-    partial.replace(folder / FINISHED)
+    try:
+        frame.to_parquet(partial)
+        partial.replace(folder / FINISHED)
+    except OSError:
+        partial.unlink(missing_ok=True)  # What little room there is, others need.
+        raise
 
 
 def _read(folder: Path) -> "pd.DataFrame":

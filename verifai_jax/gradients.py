@@ -1,0 +1,79 @@
+"""How a robustness is differentiated: forward or reverse, by dimension and by model.
+
+    derivative = Derivative(dim)
+    gradient, auxiliary = derivative(objective, u)      # objective(u) -> (value, auxiliary)
+
+Forward mode takes a sweep for each coordinate, several at a time, and works for every model.
+Reverse mode takes one sweep whatever their number, but keeps what the way back needs, and JAX has
+none for a loop that ends by its own condition, such as a constraint solver's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+FORWARD_LIMIT = 4
+"""Coordinates up to which forward sweeps are no slower than one reverse."""
+SWEEPS = 8
+"""Forward sweeps at a time: more fill the cache, fewer repeat the simulation more often."""
+
+
+@dataclass(frozen=True)
+class Derivative:
+    """The gradient of an objective over `dim` coordinates; `reverse` says by which mode."""
+
+    dim: int
+    forced_forward: bool = False
+
+    @property
+    def reverse(self) -> bool:
+        """Whether one reverse sweep is taken."""
+        return self.dim > FORWARD_LIMIT and not self.forced_forward
+
+    def forward_instead(self) -> "Derivative":
+        """The same by forward sweeps, for a model that reverse mode refuses."""
+        return replace(self, forced_forward=True)
+
+    def told(self) -> str:
+        """What forward mode costs, for people."""
+        return (
+            f"gradient by {self.dim} forward sweeps for each simulation, because reverse mode does "
+            "not work through a loop of this system"
+        )
+
+    def __call__(
+        self, objective: Callable[..., tuple[Array, Any]], u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " d"], Any]:
+        """Gradient and auxiliary output at `u`."""
+        if self.reverse:
+            return jax.grad(objective, has_aux=True)(u)
+        return _forward(objective, u)
+
+
+def reverse_refused(error: Exception) -> bool:
+    """Whether this is JAX's refusal to differentiate a loop of unknown length in reverse."""
+    return "Reverse-mode differentiation does not work" in str(error)
+
+
+def _forward(
+    objective: Callable[..., tuple[Array, Any]], u: Float[Array, " d"]
+) -> tuple[Float[Array, " d"], Any]:
+    def sweep(direction: Array) -> Any:
+        return jax.jvp(objective, (u,), (direction,), has_aux=True)
+
+    # Only the tangents depend on the direction: the simulation itself is done once for each block.
+    sweeps = jax.vmap(sweep, out_axes=(None, 0, None))
+    d = u.shape[0]
+    directions = jnp.eye(d, dtype=u.dtype)
+    if d <= SWEEPS:
+        _, derivative, auxiliary = sweeps(directions)
+        return derivative, auxiliary
+    missing = -d % SWEEPS
+    blocks = jnp.pad(directions, ((0, missing), (0, 0))).reshape(-1, SWEEPS, d)
+    _, derivative, auxiliary = sweeps(blocks[0])
+    rest = jax.lax.map(lambda block: sweeps(block)[1], blocks[1:])
+    return jnp.concatenate([derivative, rest.ravel()])[:d], auxiliary
