@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from verifai_jax.errors import require
 from verifai_jax.systems.mujoco_bindings import Bindings
 from verifai_jax.systems.mujoco_derived import constants
 from verifai_jax.systems.mujoco_loop import Lived, Loop, Sampled
+from verifai_jax.systems.mujoco_model import mjx_module
 from verifai_jax.trace import Status, Trace
 
 # What MJX decides once from the model's values, and features may change: it has to see that there
@@ -36,7 +36,7 @@ class Physics(NamedTuple):
 
 def rollout(loop: Loop, features: Any, key: Any) -> Trace:
     """Simulate once."""
-    mjx = require("mujoco.mjx", extra="mujoco")
+    mjx = mjx_module()
     model, blank = prepared(loop.bindings, features)
     start = loop.start(features, key)
     physics = Physics(
@@ -139,7 +139,7 @@ def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
 
 def _put(bindings: Bindings) -> tuple[Any, Any]:
     """The model as it is compiled, on the device, in the present precision; made once."""
-    mjx = require("mujoco.mjx", extra="mujoco")
+    mjx = mjx_module()
     precision = bool(jax.config.read("jax_enable_x64"))
     if precision not in bindings.kept:
         compiled = copy.copy(bindings.model.compiled)
@@ -197,5 +197,5 @@ def reverse_hint(compiled: Any) -> str | None:
 
 def constrained(compiled: Any) -> bool:
     """Whether a model can have active constraints: contacts, limits, friction, equalities."""
-    data = require("mujoco.mjx", extra="mujoco").make_data(compiled, impl="jax")
+    data = mjx_module().make_data(compiled, impl="jax")
     return bool(data._impl.efc_J.size)

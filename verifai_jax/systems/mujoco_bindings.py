@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.errors import check_names
 from verifai_jax.systems.mujoco_derived import Solids, bodies_of_geoms, rebuilt
-from verifai_jax.systems.mujoco_model import Model, Place, place
+from verifai_jax.systems.mujoco_model import Model, Place, movable, place
 from verifai_jax.waveform import is_waveform
 
 STATE = ("qpos", "qvel", "act")
@@ -63,6 +63,8 @@ class Bindings:
     parameters: tuple[Binding, ...]
     state: tuple[Binding, ...]
     applied: tuple[Binding, ...]
+    # The bodies whose mass and inertia come from geoms that features change.
+    solids: tuple[Solids, ...]
     # What a backend has made of the model, by whatever it depends on.
     kept: dict[Any, Any] = field(default_factory=dict, repr=False)
 
@@ -85,18 +87,6 @@ class Bindings:
     def moves_constants(self) -> bool:
         """Whether constants that MuJoCo derives from the model differ between rows."""
         return bool(self.arrays & _DERIVED_FROM)
-
-    @cached_property
-    def solids(self) -> tuple[Solids, ...]:
-        """The bodies whose mass and inertia come from geoms that features change."""
-        geoms = {
-            int(i) // width
-            for array, width in (("geom_size", 3), ("geom_pos", 3), ("geom_quat", 4))
-            for binding in self.parameters
-            if binding.place.array == array
-            for i in binding.place.index
-        }
-        return bodies_of_geoms(self.model, geoms)
 
     def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
         """The model's arrays for this row of features, in the shapes that the model has them.
@@ -202,9 +192,34 @@ def bindings(model: Model, bind: Bound | None) -> Bindings:
                     )
                 _claim(taken, where, feature)
                 sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
-    made = Bindings(model, *(tuple(group) for group in sorted_.values()))
-    _ = made.solids
-    return made
+    parameters, state, applied = (tuple(group) for group in sorted_.values())
+    solids = bodies_of_geoms(model, _geoms(parameters))
+    model = movable(model, _moving(model, parameters, solids))
+    return Bindings(model, parameters, state, applied, solids)
+
+
+def _geoms(parameters: Iterable[Binding]) -> set[int]:
+    """The geoms whose size or place features change."""
+    widths = {"geom_size": 3, "geom_pos": 3, "geom_quat": 4}
+    return {
+        int(i) // widths[binding.place.array]
+        for binding in parameters
+        if binding.place.array in widths
+        for i in binding.place.index
+    }
+
+
+def _moving(model: Model, parameters: Iterable[Binding], solids: Iterable[Solids]) -> set[int]:
+    """The bodies whose centre of mass or axes features move."""
+    moving = set()
+    for binding in parameters:
+        array, rows = binding.place.array, binding.place.index
+        if array in ("body_ipos", "body_iquat"):
+            moving |= set((rows // (3 if array == "body_ipos" else 4)).tolist())
+        if array in ("jnt_pos", "jnt_axis"):
+            moving |= {int(model.compiled.jnt_bodyid[row]) for row in rows // 3}
+    placed = {b.place.array for b in parameters} & {"geom_pos", "geom_quat"}
+    return moving | {solid.body for solid in solids if placed or len(solid.geoms) > 1}
 
 
 def _claim(taken: dict[tuple[str, int], str], where: Place, feature: str) -> None:

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.errors import require
-from verifai_jax.systems.mujoco_model import Model
+from verifai_jax.systems.mujoco_model import Model, mjx_module
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
@@ -84,11 +83,6 @@ def _check_solid(compiled: Any, solid: Solids) -> None:
         raise ValueError(
             f"a geom of body {name!r} is bound, whose mass comes from a shape other than sphere, "
             f"capsule, ellipsoid, cylinder and box; {advice}"
-        )
-    if compiled.body_simple[solid.body] and len(solid.geoms) > 1:
-        raise ValueError(
-            f"a geom of body {name!r} is bound, which has several and their centre at its origin; "
-            f"MuJoCo fixes that when it compiles; {advice}"
         )
     names = ("geom_size", "geom_pos", "geom_quat", "body_mass", "body_inertia", "body_ipos")
     with jax.enable_x64():
@@ -219,7 +213,7 @@ def constants(model: Any) -> Any:
 
     Source: MuJoCo, engine_setconst.c (set0 and setFixed); see "Computation: Model" in its manual.
     """
-    mjx = require("mujoco.mjx", extra="mujoco")
+    mjx = mjx_module()
     masses = model.body_mass
     subtree = masses
     for body in range(model.nbody - 1, 0, -1):

@@ -8,8 +8,12 @@ A path is `kind/name/field`, with an index `[i]` or a slice `[i:j]` where a fiel
 numbers. MuJoCo is imported when a model is loaded, not before.
 """
 
+import contextlib
+import copy
+import io
 import re
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +127,7 @@ def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> 
                 f"signal {contacts[0]!r} needs a sensor that a compiled MjModel cannot be given: "
                 "give the MJCF file, its text or an MjSpec instead"
             )
-        spec, compiled = None, _copy(source)
+        spec, compiled = None, copy.copy(source)
     else:
         spec = _spec(mujoco, source)
         plain = spec.compile()
@@ -138,10 +142,46 @@ def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> 
     return Model(compiled, spec, tuple(f"__contact{k}" for k in range(len(contacts))))
 
 
-def _copy(compiled: Any) -> Any:
-    import copy
+def movable(model: Model, bodies: Collection[int]) -> Model:
+    """The same model, in which the centre of mass of these bodies can move away from their origin.
 
-    return copy.copy(compiled)
+    MuJoCo leaves out parts of the mass matrix that are zero as compiled ("simple" bodies).
+
+    **Raises:** `ValueError` where there is no spec to compile again.
+    """
+    mujoco = require("mujoco", extra="mujoco")
+    old = model.compiled
+    simple = [body for body in bodies if old.body_simple[body]]
+    if not simple:
+        return model
+    if model.spec is None or int(model.spec.compiler.inertiafromgeom) == 1:
+        raise ValueError(
+            f"the centre of mass of body {old.body(simple[0]).name!r} lies at its origin, which "
+            "MuJoCo fixes when it compiles: give the MJCF, without inertiafromgeom, not an MjModel"
+        )
+    spec = model.spec.copy()
+    for body in spec.bodies:
+        if body.id in simple:
+            body.explicitinertial = True
+            body.mass, body.inertia = old.body_mass[body.id], old.body_inertia[body.id]
+            body.ipos = old.body_ipos[body.id] + np.array([1e-2, 2e-2, 3e-2])
+            body.iquat = old.body_iquat[body.id]
+    new = spec.compile()
+    for name in ("mass", "inertia", "ipos", "iquat"):
+        getattr(new, f"body_{name}")[:] = getattr(old, f"body_{name}")
+    for name in ("iterations", "ls_iterations", "disableflags"):
+        setattr(new.opt, name, getattr(old.opt, name))
+    mujoco.mj_setConst(new, mujoco.MjData(new))
+    return replace(model, compiled=new)
+
+
+def mjx_module() -> Any:
+    """The module `mujoco.mjx`, imported without what it prints about packages it can do without.
+
+    **Raises:** `MissingExtra`.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        return require("mujoco.mjx", extra="mujoco")
 
 
 def _spec(mujoco: Any, source: Any) -> Any:

@@ -8,6 +8,7 @@ worked through in two halves: while one is stepped, the other's policy is evalua
 
 import contextlib
 import ctypes
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -201,8 +202,11 @@ def _kind(leaf: Any) -> Any:
 def _no_warnings() -> Iterator[None]:
     """Keep MuJoCo from writing MUJOCO_LOG.TXT: what is not finite is reported by the status."""
     mujoco = require("mujoco", extra="mujoco")
-    del mujoco
-    yield
-
-
-_ = ctypes
+    before = mujoco.get_mju_user_warning()
+    # The threads that step call it without Python: a C function that takes a text and does nothing.
+    c = ctypes.CDLL(None if os.name == "posix" else "msvcrt")
+    mujoco.set_mju_user_warning(ctypes.CFUNCTYPE(None, ctypes.c_char_p)(("strlen", c)))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
