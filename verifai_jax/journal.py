@@ -3,7 +3,7 @@
     journal = Journal(folder)
     journal.add(row, point, judged)                     # appended and flushed
     journal.recall(first, points)                       # {i: judged} of those that are there
-    journal.clear()                                     # the table and its snapshot have them
+    journal.settle(rows)                                # the table and its snapshot have so many
 
 For simulators of which one simulation takes minutes: a run that is killed in the middle of a batch
 does not simulate its finished rows again. A row is recalled only for the same point.
@@ -36,6 +36,7 @@ class Journal:
         self.path = folder / JOURNAL
         self._file: IO[str] | None = None
         self._known = _read(self.path)
+        self._last = max(self._known, default=-1)
 
     def add(self, row: int, point: Float[np.ndarray, " d"], judged: Judged) -> None:
         """Keep a row; it is on disk when this returns.
@@ -50,6 +51,7 @@ class Journal:
             "holds": np.asarray(judged.holds).tolist(),
             "message": judged.message,
         }
+        self._last = max(self._last, row)
         if self._file is None:
             self._file = open(self.path, "a")  # noqa: SIM115 - lives as long as the run
         self._file.write(json.dumps(entry) + "\n")
@@ -66,13 +68,14 @@ class Journal:
                 found[i] = judged
         return found
 
-    def clear(self) -> None:
-        """Forget all rows: the table has them."""
-        self._known = {}
+    def settle(self, rows: int) -> None:
+        """The table and its snapshot have `rows` rows now: those need not be kept here."""
         if self._file is not None:
             self._file.close()
             self._file = None
-        self.path.unlink(missing_ok=True)
+        if self._last < rows:
+            self._known = {}
+            self.path.unlink(missing_ok=True)
 
 
 def _fingerprint(point: Any) -> str:

@@ -139,7 +139,7 @@ class Rounds:
         write_snapshot(self.snapshot, self.folder)
         if self._journal is not None:
             # Only now: rows of the table that the snapshot does not know are simulated again.
-            self._journal.clear()
+            self._journal.settle(int(self.snapshot.get("rows", 0)))
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on where `snapshot` was taken; the table must hold its rows already.
