@@ -3,8 +3,8 @@
 - `rebuilt`: mass, centre and inertia of bodies whose geoms change, at constant density (or at the
   mass that a geom states); for both backends.
 - `constants`: what `mj_setConst` computes and MJX reads: `body_subtreemass`, `body_invweight0`,
-  `dof_invweight0`, `tendon_length0`, `tendon_invweight0`, `actuator_acc0`, `geom_rbound` and the
-  mean inertia, in JAX. The native backend calls `mj_setConst` itself.
+  `dof_invweight0`, `tendon_length0`, `tendon_invweight0`, `actuator_acc0` and `geom_rbound`, in
+  JAX. The native backend calls `mj_setConst` itself.
 """
 
 import math
@@ -241,7 +241,6 @@ def constants(model: Any) -> Any:
             part = slice(start, start + 3)
             dofs = dofs.at[part].set(jnp.mean(dofs[part]))
     moment, pull = data._impl.actuator_moment, data._impl.ten_J
-    mean = jnp.mean(jnp.diag(mjx.full_m(model, data)))
     return model.tree_replace(
         {
             "body_invweight0": jnp.stack(bodies),
@@ -249,7 +248,6 @@ def constants(model: Any) -> Any:
             "tendon_length0": data.ten_length,
             "tendon_invweight0": jnp.einsum("ti,ij,tj->t", pull, inverse, pull),
             "actuator_acc0": jnp.linalg.norm(moment @ inverse, axis=-1),
-            "stat.meaninertia": mean,
         }
     )
 
