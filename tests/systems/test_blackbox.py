@@ -43,6 +43,10 @@ def test_refuses_what_cannot_be_called():
         ({"signals": ("x", "y")}, r"have the signals x, y; got x, v \(y missing; v not expected\)"),
         ({"signals": {"x": 1, "v": 3}}, r"signal 'v' must be \[time, 3\]; got \[5, 2\]"),
         ({"signals": {"x": 2, "v": 2}}, r"signal 'x' must be \[time, 2\]; got \[5\]"),
+        (
+            {"signals": ("x", "v")},
+            r"\[time\]; got \[5, 2\]; declare .*signals={'v': 2, ...}",
+        ),
         ({"dt": 0.2}, "must have the sampling period dt=0.2; got dt=0.1"),
         ({"length": 6}, "must have 6 samples; got 5"),
     ],
@@ -53,8 +57,11 @@ def test_a_trace_that_is_not_as_declared(declared, match):
 
     with pytest.raises(ValueError, match=match):
         blackbox(simulate, **declared)({})
-    assert blackbox(simulate, signals=("v", "x"), dt=0.1, length=5)({}).length == 5
-    assert blackbox(simulate, signals={"v": 2, "x": 1})({}).length == 5
+    system = blackbox(simulate, signals={"v": 2, "x": 1}, dt=0.1, length=5)
+    assert system({}).length == 5
+    form = system.abstract({})
+    assert {name: leaf.shape for name, leaf in form.signals.items()} == {"x": (5,), "v": (5, 2)}
+    assert blackbox(simulate).abstract is None
 
 
 def test_a_period_is_not_sample_times():

@@ -32,7 +32,7 @@ class Declared:
 
     **Arguments:**
 
-    - `signals`: names, or names with their number of components (1 for a scalar).
+    - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
 
@@ -49,22 +49,37 @@ class Declared:
             named = not isinstance(signals, str) and all(isinstance(n, str) for n in signals)
             if not named or not len(signals):
                 raise ValueError(f"signals must be names, such as ('x', 'theta'); got {signals!r}")
-            if isinstance(signals, Mapping):
-                for name, width in signals.items():
-                    if not isinstance(width, int) or width < 1:
-                        raise ValueError(
-                            f"signals must say how many components {name!r} has, at least 1; "
-                            f"got {width!r}"
-                        )
+            for name, width in self.widths.items():
+                if not isinstance(width, int) or width < 1:
+                    raise ValueError(
+                        f"signals must say how many components {name!r} has, at least 1; "
+                        f"got {width!r}"
+                    )
         if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
             raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
         if length is not None and (not isinstance(length, int) or length < 1):
             raise ValueError(f"length must be an integer of at least 1; got {length!r}")
 
+    @property
+    def widths(self) -> dict[str, int]:
+        """Number of components of each declared signal."""
+        signals = () if self.signals is None else self.signals
+        return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """A function of the features that gives a trace's form; None unless all is declared."""
+        if self.signals is None or self.dt is None or self.length is None:
+            return None
+        shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
+        signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
+        return lambda features: Trace(signals, dt=self.dt)
+
     def accept(self, trace: Any) -> Trace:
         """What a simulator returned, its signals as NumPy arrays, if it is as declared.
 
-        **Raises:** `TypeError` for anything but a trace of numbers; see `check`.
+        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
+        not as declared; both say what was expected and what came.
         """
         if not isinstance(trace, Trace):
             raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
@@ -72,45 +87,36 @@ class Declared:
         for name, signal in signals.items():
             if signal.dtype.kind not in "biuf":
                 raise TypeError(f"signal {name!r} must hold real numbers; got {signal.dtype}")
-        self.check(trace)
-        return replace(trace, signals=signals)
-
-    def check(self, trace: Trace) -> None:
-        """Refuse a trace that is not as declared.
-
-        **Raises:** `ValueError` that says what was expected and what came.
-        """
         if self.signals is not None:
-            self._check_signals(trace.signals)
+            self._check_signals(signals)
         if self.dt is not None:
+            wanted = f"the trace must have the sampling period dt={self.dt}"
             if trace.dt is None:
-                raise ValueError(
-                    f"the trace must have the sampling period dt={self.dt}; it has sample times"
-                )
+                raise ValueError(f"{wanted}; it has sample times")
             if not math.isclose(trace.dt, self.dt, rel_tol=1e-6):
-                raise ValueError(
-                    f"the trace must have the sampling period dt={self.dt}; got dt={trace.dt}"
-                )
+                raise ValueError(f"{wanted}; got dt={trace.dt}")
         if self.length is not None and trace.length != self.length:
             raise ValueError(f"the trace must have {self.length} samples; got {trace.length}")
+        return replace(trace, signals=signals)
 
-    def _check_signals(self, signals: Mapping[str, Any]) -> None:
-        assert self.signals is not None
-        if set(signals) != set(self.signals):
-            missing = [name for name in self.signals if name not in signals]
-            extra = [name for name in signals if name not in self.signals]
-            lacks = f"{', '.join(missing)} missing" if missing else ""
-            exceeds = f"{', '.join(extra)} not expected" if extra else ""
+    def _check_signals(self, signals: Mapping[str, np.ndarray]) -> None:
+        widths = self.widths
+        if signals.keys() != widths.keys():
+            missing = ", ".join(name for name in widths if name not in signals)
+            extra = ", ".join(name for name in signals if name not in widths)
+            how = [f"{missing} missing"] * bool(missing) + [f"{extra} not expected"] * bool(extra)
             raise ValueError(
-                f"the trace must have the signals {', '.join(self.signals)}; got "
-                f"{', '.join(signals)} ({'; '.join(filter(None, (lacks, exceeds)))})"
+                f"the trace must have the signals {', '.join(widths)}; got "
+                f"{', '.join(signals)} ({'; '.join(how)})"
             )
-        if isinstance(self.signals, Mapping):
-            for name, width in self.signals.items():
-                shape = np.shape(signals[name])
-                if (shape[1] if len(shape) == 2 else 1) != width:
-                    wanted = "[time]" if width == 1 else f"[time, {width}]"
-                    raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}")
+        for name, width in widths.items():
+            shape = signals[name].shape
+            if shape[1:] != (() if width == 1 else (width,)):
+                wanted = "[time]" if width == 1 else f"[time, {width}]"
+                hint = ""
+                if not isinstance(self.signals, Mapping):
+                    hint = f"; declare vectors by signals={{{name!r}: {shape[1]}, ...}}"
+                raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}{hint}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +152,12 @@ class BlackBox:
 
         `key`: a JAX random key, or an integer seed.
         """
-        return self.simulation(jax.tree.map(_plain, features), seed_of(key))
+        return self.simulation(plain_leaves(features), seed_of(key))
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,13 +173,18 @@ class PooledBlackBox:
 
         **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
         """
-        return only(self.simulate_each([jax.tree.map(_plain, features)], [seed_of(key)]))
+        return only(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
 
     def simulate_each(
         self, features: Sequence[Any], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
         """Each index exactly once, as its simulation ends; see `simulations.Each`."""
         return self.pool.outcomes(features, seeds)
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract
 
     def close(self) -> None:
         """End the workers. The next simulation starts new ones."""
@@ -196,6 +212,11 @@ class VectorisedBlackBox:
         if self.seeded:
             seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
         return self._simulate(features, seeds, len(keys))
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of one trace, if it is declared; see `Problem.check`."""
+        return self.declared.abstract
 
     def _simulate(self, features: Any, seeds: np.ndarray, n: int) -> Trace:
         trace = self.function(features, seeds) if self.seeded else self.function(features)
@@ -228,7 +249,7 @@ class VectorisedBlackBox:
             whole[name] = np.broadcast_to(np.asarray(value), shape)
         signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
         trace = stacked(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
-        self.declared.check(jax.tree.map(lambda leaf: leaf[0], trace))
+        self.declared.accept(jax.tree.map(lambda leaf: leaf[0], trace))
         return trace
 
 
@@ -331,6 +352,11 @@ def seed_of(key: Any) -> int:
     if key is None:
         return 0
     return int(jax.random.bits(key))
+
+
+def plain_leaves(features: Any) -> Any:
+    """The same features with plain Python numbers and NumPy arrays."""
+    return jax.tree.map(_plain, features)
 
 
 def _plain(leaf: Any) -> Any:

@@ -1,0 +1,377 @@
+"""A simulator that answers a run over the network; needs nothing but Python and NumPy.
+
+    from verifai_jax.remote_client import serve
+
+    def simulate(features, seed):
+        return {"x": x, "v": v, "dt": 0.02}
+
+    serve(simulate, port=4567)
+
+or `python -m verifai_jax.remote_client --address 127.0.0.1:4567 mysimulator:simulate`.
+
+This file imports nothing of `verifai_jax`, so it may be copied to where that is not installed, or
+run by its path, which starts faster. `docs/remote.md` says what goes over the wire.
+"""
+
+import argparse
+import hashlib
+import hmac
+import importlib
+import importlib.util
+import json
+import logging
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+log = logging.getLogger("verifai_jax.remote_client")
+
+PROTOCOL = 1
+FLUSH_SECONDS = 0.005  # Results may wait for others that long.
+FLUSH_BYTES = 1 << 18
+SHORTEST, LONGEST = 0.05, 2.0  # Seconds between two tries to connect.
+RESERVED = ("dt", "times", "valid")
+
+
+class Refused(ConnectionError):
+    """The server does not want this client, and will not another time."""
+
+
+class Waveform:
+    """A function of time by its control points: what a `Signal` feature arrives as.
+
+    `wind(time)`, in seconds; `wind.over(4.0)(time)` where the feature has no duration. With `hold`
+    `"linear"` the first control point is the value at 0 and the last that at the end; with
+    `"constant"` each is held for an equal part of the duration.
+    """
+
+    def __init__(self, knots: Any, hold: str, duration: float | None) -> None:
+        self.knots, self.hold, self.duration = np.asarray(knots, np.float64), hold, duration
+
+    def over(self, duration: float) -> "Waveform":
+        """The same control points over so many seconds."""
+        return Waveform(self.knots, self.hold, float(duration))
+
+    def __call__(self, time: float) -> Any:
+        """The value at a time in seconds; the first and the last hold outside the duration."""
+        if self.duration is None:
+            raise ValueError("this signal has no duration: call features[...].over(seconds)(time)")
+        count = len(self.knots)
+        place = time / self.duration
+        if self.hold == "constant" or count == 1:
+            return self.knots[min(max(int(np.floor(place * count + 1e-5)), 0), count - 1)]
+        place = min(max(place, 0.0), 1.0) * (count - 1)
+        left = min(int(place), count - 2)
+        return self.knots[left] + (self.knots[left + 1] - self.knots[left]) * (place - left)
+
+
+def serve(
+    simulate: Callable[[dict[str, Any], int], Any],
+    host: str = "127.0.0.1",
+    port: int = 4567,
+    token: str | None = None,
+    capacity: int = 32,
+    reconnect: bool | float = True,
+    name: str | None = None,
+) -> None:
+    """Simulate whatever the run at `host` and `port` asks for, until it is interrupted.
+
+    **Arguments:**
+
+    - `simulate(features, seed) -> result`: features are numbers, arrays, dictionaries of these and
+      `Waveform`s; `seed` is an integer in `[0, 2^32)`, the same on every replay. The result is a
+      dictionary of signals, `[time]` or `[time, k]`, and `dt` in seconds (or `times`, and `valid`,
+      how many samples count); or anything with `.signals` and these as attributes. What it raises
+      becomes a row with that message.
+    - `token`: the server's; the environment variable `VERIFAI_JAX_TOKEN` when left out. It is
+      proved, not sent.
+    - `capacity`: how many points may wait here at most.
+    - `reconnect`: connect again, however often, when the server goes away; or for how many seconds
+      to try before giving up; or False.
+    - `name`: what the server's log calls this client.
+
+    **Raises:** `Refused` for a wrong token or another protocol; `ConnectionError` when no run could
+    be reached at all and `reconnect` allows no more tries.
+    """
+    token = os.environ.get("VERIFAI_JAX_TOKEN") if token is None else token
+    patience = float("inf") if reconnect is True else float(reconnect)
+    since, pause, served = time.monotonic(), SHORTEST, False
+    while True:
+        connection = None
+        try:
+            connection = _Connection(host, port, token, capacity, name)
+            connection.work(simulate)
+        except KeyboardInterrupt:
+            return
+        except Refused:
+            raise
+        except (OSError, EOFError) as error:
+            reason = error
+        finally:
+            if connection is not None:
+                connection.socket.close()
+        if connection is not None:
+            since, pause, served = time.monotonic(), SHORTEST, True
+        if time.monotonic() - since + pause > patience:
+            if served:
+                return
+            raise ConnectionError(f"no run at {host}:{port} to simulate for: {reason}")
+        if pause == SHORTEST:
+            log.info("no run at %s port %s (%s); it is tried again", host, port, reason)
+        try:
+            time.sleep(pause)
+        except KeyboardInterrupt:
+            return
+        pause = min(2 * pause, LONGEST)
+
+
+class _Connection:
+    """One connection, from the greeting to its end."""
+
+    def __init__(
+        self, host: str, port: int, token: str | None, capacity: int, name: str | None
+    ) -> None:
+        self.socket = socket.create_connection((host, port), timeout=10.0)
+        self.welcome = False  # Whether the server has handed out a point.
+        self.capacity = capacity
+        self._received = bytearray()
+        self._points: deque[dict[str, Any]] = deque()
+        self._unsent: list[bytes] = []
+        try:
+            self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            self._greet(token, name)
+            self.socket.settimeout(None)
+        except BaseException:
+            self.socket.close()
+            raise
+
+    def work(self, simulate: Callable[[dict[str, Any], int], Any]) -> None:
+        """Simulate until the server closes the connection."""
+        flushed = time.monotonic()
+        while True:
+            while not self._points:
+                self._flush()
+                self._receive()
+                flushed = time.monotonic()
+            point = self._points.popleft()
+            self._unsent.append(answer(point, simulate))
+            late = time.monotonic() - flushed > FLUSH_SECONDS
+            many = 4 * len(self._unsent) >= self.capacity
+            if late or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
+                self._flush()
+                flushed = time.monotonic()
+                if select.select([self.socket], [], [], 0)[0]:
+                    self._receive()
+
+    def _greet(self, token: str | None, name: str | None) -> None:
+        while not (hello := self._frame()):
+            self._read()
+        if hello.get("type") == "error":
+            raise Refused(f"the server refuses: {hello.get('message')}")
+        if hello.get("type") != "hello" or hello.get("protocol") != PROTOCOL:
+            spoken = hello.get("protocol")
+            raise Refused(f"this client speaks protocol {PROTOCOL}, the server {spoken!r}")
+        greeting: dict[str, Any] = {
+            "type": "hello",
+            "protocol": PROTOCOL,
+            "capacity": self.capacity,
+            "name": name or f"{socket.gethostname()}:{os.getpid()}",
+        }
+        if hello.get("challenge"):
+            if token is None:
+                raise Refused("the server asks for a token; give token=..., or VERIFAI_JAX_TOKEN")
+            challenge = str(hello["challenge"]).encode()
+            greeting["proof"] = hmac.new(token.encode(), challenge, hashlib.sha256).hexdigest()
+        self.socket.sendall(_framed(greeting))
+
+    def _flush(self) -> None:
+        if self._unsent:
+            data, self._unsent = b"".join(self._unsent), []
+            self.socket.sendall(data)
+
+    def _receive(self) -> None:
+        """Wait for something to come, and take up what has."""
+        self._read()
+        while message := self._frame():
+            match message.get("type"):
+                case "work":
+                    self.welcome = True
+                    self._points.extend(message["points"])
+                case "bye":
+                    raise EOFError("the run has ended")
+                case "error":
+                    log.warning("the server says: %s", message.get("message"))
+                    if message.get("fatal") and not self.welcome:
+                        raise Refused(f"the server refuses: {message.get('message')}")
+
+    def _read(self) -> None:
+        data = self.socket.recv(1 << 18)
+        if not data:
+            raise EOFError("the server has closed the connection")
+        self._received += data
+
+    def _frame(self) -> dict[str, Any] | None:
+        if len(self._received) < 4:
+            return None
+        end = 4 + struct.unpack_from(">I", self._received)[0]
+        if len(self._received) < end:
+            return None
+        text = bytes(self._received[4:end])
+        del self._received[:end]
+        return json.loads(text)
+
+
+def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], Any]) -> bytes:
+    """Simulate one point of a `work` message: the frame to send back."""
+    try:
+        return encoded(point["id"], simulate(features_of(point["features"]), point["seed"]))
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+        return _framed({"type": "result", "id": point["id"], "error": message})
+
+
+def features_of(value: Any) -> Any:
+    """Features from their JSON: lists are arrays, objects of control points `Waveform`s."""
+    if isinstance(value, dict):
+        if value.keys() == {"knots", "hold", "duration"}:
+            return Waveform(**value)
+        return {name: features_of(inner) for name, inner in value.items()}
+    return np.asarray(value) if isinstance(value, list) else value
+
+
+def encoded(number: int, result: Any) -> bytes:
+    """A result as a frame whose arrays are raw bytes.
+
+    **Raises:** `TypeError` for something that is no result.
+    """
+    if isinstance(result, Mapping):
+        signals = result.get("signals")
+        if not isinstance(signals, Mapping):
+            signals = {name: v for name, v in result.items() if name not in RESERVED}
+        about = {name: result.get(name) for name in RESERVED}
+    else:
+        signals = getattr(result, "signals", None)
+        about = {name: getattr(result, name, None) for name in RESERVED}
+    if not isinstance(signals, Mapping) or not signals:
+        raise TypeError(
+            "simulate must return a dictionary of signals and dt, such as {'x': x, 'dt': 0.02}; "
+            f"it returned {type(result).__name__}"
+        )
+    raw: list[bytes] = []
+    at = 0
+
+    def place(name: str, value: Any) -> dict[str, Any]:
+        nonlocal at
+        array = np.asarray(value)
+        if array.dtype.kind not in "biuf":
+            raise TypeError(f"{name} must be an array of numbers; got {array.dtype}")
+        # The wire knows these; anything else (float16, unsigned) becomes a double.
+        kind = array.dtype.newbyteorder("<").str
+        if kind not in ("<f8", "<f4", "<i8", "<i4", "<i2", "|i1", "|u1", "|b1"):
+            kind = "<f8"
+        data = array.astype(kind, order="C", copy=False).tobytes()
+        raw.append(data + bytes(-len(data) % 8))
+        at += len(raw[-1])
+        return {"$array": kind, "shape": array.shape, "at": at - len(raw[-1])}
+
+    header: dict[str, Any] = {"type": "result", "id": number}
+    header["signals"] = {str(name): place(f"signal {name!r}", v) for name, v in signals.items()}
+    if about["dt"] is not None:
+        header["dt"] = float(about["dt"])
+    if about["times"] is not None:
+        header["times"] = place("times", about["times"])
+    if about["valid"] is not None:
+        header["valid"] = int(about["valid"])
+    return b"".join((_framed({**header, "bytes": at}), *raw))
+
+
+def _framed(header: Mapping[str, Any]) -> bytes:
+    text = json.dumps(header, separators=(",", ":")).encode()
+    return struct.pack(">I", len(text)) + text
+
+
+def address_of(text: str) -> tuple[str, int]:
+    """`HOST:PORT`, with an IPv6 address in brackets: `[::1]:4567`.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit():
+        raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:4567; got {text!r}")
+    return host.removeprefix("[").removesuffix("]"), int(port)
+
+
+def function_of(text: str) -> Callable[..., Any]:
+    """The function named by `MODULE:NAME` or `FILE.py:NAME`.
+
+    **Raises:** `ValueError` where there is none.
+    """
+    place, _, name = text.rpartition(":")
+    if place.endswith(".py"):
+        spec = importlib.util.spec_from_file_location(Path(place).stem, place)
+        if spec is None or spec.loader is None or not Path(place).exists():
+            raise ValueError(f"no file {place}")
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[spec.name] = module
+        spec.loader.exec_module(module)
+    elif place:
+        module = importlib.import_module(place)
+    else:
+        raise ValueError(f"a simulator is MODULE:FUNCTION or FILE.py:FUNCTION; got {text!r}")
+    if not callable(getattr(module, name, None)):
+        raise ValueError(f"{place} has no function {name!r}")
+    return getattr(module, name)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The command line: `--address HOST:PORT MODULE:FUNCTION`."""
+    parser = argparse.ArgumentParser(
+        prog="remote_client", description="Simulate what a verifai_jax run asks for."
+    )
+    parser.add_argument("simulator", help="MODULE:FUNCTION or FILE.py:FUNCTION")
+    parser.add_argument("--address", default="127.0.0.1:4567", help="HOST:PORT of the run")
+    parser.add_argument("--capacity", type=int, default=32, help="points that may wait here")
+    parser.add_argument("--processes", type=int, default=1, help="how many of these to run")
+    parser.add_argument(
+        "--reconnect", type=float, default=float("inf"), help="seconds to look for a run again"
+    )
+    given = parser.parse_args(arguments)
+    # Run by its path, the folder of this file would hide modules of other names: `trace`, `search`.
+    here = str(Path(__file__).parent)
+    sys.path[:] = [os.getcwd(), *(place for place in sys.path if place not in ("", here))]
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    try:
+        host, port = address_of(given.address)
+        simulate = function_of(given.simulator)
+    except ValueError as error:
+        parser.error(str(error))
+    same = ["--address", given.address, "--capacity", str(given.capacity)]
+    same += ["--reconnect", str(given.reconnect), given.simulator]
+    others = [
+        subprocess.Popen([sys.executable, __file__, *same]) for _ in range(given.processes - 1)
+    ]
+    try:
+        serve(simulate, host, port, capacity=given.capacity, reconnect=given.reconnect)
+    except ConnectionError as error:
+        print(error, file=sys.stderr)
+        return 1
+    finally:
+        for other in others:
+            other.terminate()
+            other.wait()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
