@@ -31,7 +31,8 @@ ALLOWED = {
     "gradients": set(),
     "backends": {"engine", "host", "problem", "run"},
     "problem": {"features", "mtl", "trace", "errors", "rulebook"},
-    "engine": {"problem", "devices", "gradients", "mtl", "packing", "trace"},
+    "carried": {"mtl", "problem", "trace"},
+    "engine": {"carried", "problem", "devices", "gradients", "mtl", "packing", "trace"},
     "host": {"engine", "journal", "problem", "mtl", "systems", "trace"},
     "run": {
         "analysis",

@@ -19,6 +19,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from verifai_jax.carried import carried_monitor
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.gradients import Derivative, reverse_refused
 from verifai_jax.mtl import robustness, satisfied, smooth
@@ -230,7 +231,11 @@ class Engine:
     def _evaluate_row(self, u: Array, key: Array, temperature: Array) -> Any:
         if not self.gradient:
             features = self.problem.space.unflatten(u)
-            rho, status = judge(self.problem, self.problem.system(features, key))
+            carried = carried_monitor(self.problem)
+            if carried is not None:
+                rho, status = carried(features, key)
+            else:
+                rho, status = judge(self.problem, self.problem.system(features, key))
             return rho.astype(u.dtype), status, features, ()
 
         def objective(u: Array) -> tuple[Array, Any]:

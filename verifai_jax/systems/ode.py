@@ -61,6 +61,18 @@ class Ode:
         features = bound(features, self.duration)
         return _Rollout(self, features).trace(floating(self.initial(features, key), "initial"))
 
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the end of the duration.
+        Returns the carry and the status.
+        """
+        features = bound(features, self.duration)
+        rollout = _Rollout(self, features)
+        return rollout.folded(floating(self.initial(features, key), "initial"), carry, update)
+
 
 @dataclass(frozen=True, eq=False)
 class _Rollout:
@@ -73,35 +85,38 @@ class _Rollout:
         loop = self.loop
         memory = jax.tree.map(jnp.asarray, loop.controller_memory)
         vouched = self.check(state, memory)
-        last, age, samples = self.run(state, memory)
-        # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the
-        # last state is finite, all were. A state frozen at its end is covered by the same check.
-        finite = jnp.array(True)
-        for leaf in jax.tree.leaves(last):
-            finite &= jnp.all(jnp.isfinite(leaf))
+        last, age, _, samples = self.run(state, memory, None, lambda _, seen: (None, seen))
         ends = loop.terminate is not None
         return Trace(
             samples,
             dt=loop.dt,
             valid=age + 1 if ends else None,
-            status=jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
+            status=_status(last),
             held=ends,
             finite=vouched,
         )
 
-    def run(self, state: Any, memory: Any) -> tuple[Any, Any, Any]:
-        """The last state, how many steps were lived, and the samples."""
+    def folded(self, state: Any, carry: Any, update: Any) -> Any:
+        memory = jax.tree.map(jnp.asarray, self.loop.controller_memory)
+        self.check(state, memory)
+        last, _, carry, _ = self.run(state, memory, carry, lambda c, seen: (update(c, seen), None))
+        return carry, _status(last)
+
+    def run(self, state: Any, memory: Any, kept: Any, keep: Any) -> tuple[Any, Any, Any, Any]:
+        """The last state, how many steps were lived, and what `keep` made of the samples."""
         loop, start = self.loop, state
 
         def sample(carry: Any, k: Int[Array, ""]) -> Any:
-            state, memory, held, age = carry
+            (state, memory, held, age), kept = carry
             time, frozen = self.now(k, age, state)
             control, next_memory = self.decide(k, age, time, state, memory, held)
             seen = self.seen(time, state, control)
             next_state = self.step(time, self.safe(frozen, state, start), control)
-            kept = None if held is None else control
-            following = (next_state, next_memory, kept, age + 1)
-            return _where(frozen, (state, memory, kept, age), following), seen
+            applied = None if held is None else control
+            following = (next_state, next_memory, applied, age + 1)
+            after = _where(frozen, (state, memory, applied, age), following)
+            kept, output = keep(kept, seen)
+            return (after, kept), output
 
         # A controller that runs at every sample holds nothing between samples.
         held = None
@@ -111,13 +126,13 @@ class _Rollout:
             held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
         # One iteration more than there are steps: it samples the final state and moves nothing,
         # which is cheaper than copying all samples to append one.
-        (state, _, _, age), samples = jax.lax.scan(
+        ((state, _, _, age), kept), outputs = jax.lax.scan(
             sample,
-            (state, memory, held, jnp.int32(0)),
+            ((state, memory, held, jnp.int32(0)), kept),
             jnp.arange(loop.steps + 1),
             unroll=loop.unroll,
         )
-        return state, age, samples
+        return state, age, kept, outputs
 
     def decide(self, k: Any, age: Any, time: Any, state: Any, memory: Any, held: Any) -> Any:
         """The control from sample `k` on, and what the controller then remembers."""
@@ -214,6 +229,15 @@ class _Rollout:
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
                 raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
         return tuple(vouched)
+
+
+def _status(last: Any) -> Int[Array, ""]:
+    # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the last
+    # state is finite, all were. A state frozen at its end is covered by the same check.
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(last):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    return jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
 
 
 def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
