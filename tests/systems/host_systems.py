@@ -45,7 +45,9 @@ def troublesome(features):
         case 10:
             die_once(features["file"])
         case 11:
-            return Trace({"x": np.array([float(features["wind"](t)) for t in (0.0, 1.0)])}, dt=1.0)
+            wind = features["wind"]
+            assert (wind.hold, wind.duration) == ("linear", 2.0)
+            return Trace({"x": wind.knots}, dt=1.0)
     return decay(features)
 
 

@@ -87,7 +87,7 @@ def test_seeds_and_waveforms_arrive(troublesome):
     assert got == [[0, 7], [1, 2**32 - 1], [2, 3], [3, 4], [4, 5]]
     wind = Waveform(np.array([1.0, 3.0], np.float32), "linear", 2.0)
     (outcome,) = outcomes(troublesome, [{"a": 11, "wind": wind}])
-    np.testing.assert_array_equal(outcome.trace["x"], [1.0, 2.0])
+    np.testing.assert_array_equal(outcome.trace["x"], [1.0, 3.0])
 
 
 def test_a_caller_that_stops_ends_what_runs(troublesome):
