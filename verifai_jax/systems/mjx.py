@@ -58,10 +58,7 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         inputs, rest = decide(data)
         data = data.replace(**{name: v.reshape(getattr(data, name).shape) for name, v in inputs})
         data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-        if data._impl.efc_J.size:
-            data = mjx.solve(model, data)
-        else:
-            data = data.replace(qacc=data.qacc_smooth)
+        data = solved(model, data) if data._impl.efc_J.size else data.replace(qacc=data.qacc_smooth)
         data = mjx.sensor_acc(model, data)
         moved = _integrator(mjx, model)(model, data)
         after = {name: getattr(moved, name) for name in Physics._fields}
@@ -116,6 +113,51 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         held=ends,
         finite=loop.vouched(),
     )
+
+
+@jax.custom_jvp
+def _attached(value: Array, other: Array) -> Array:
+    """`value`, with the derivative of `other`; which is not even computed without derivatives."""
+    return value
+
+
+_attached.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
+
+
+def solved(model: Any, data: Any) -> Any:
+    """The data after MJX's constraint solver, with derivatives in forward and in reverse mode.
+
+    The accelerations minimise a convex cost, so their derivative is that of one Newton step from
+    the minimum (implicit function theorem). The iterations themselves, a loop of unknown length,
+    are not differentiated; the result has to be converged for the derivative to be exact.
+    """
+    mjx = mjx_module()
+    create, update = _solver()
+    constant_model, constant = jax.lax.stop_gradient((model, data))
+    found = mjx.solve(constant_model, constant)
+    newton = model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
+    constant_newton = constant_model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
+    start = data.replace(qacc=found.qacc)
+    here = create(newton, start, grad=False)
+    residual = here.Ma - data.qfrc_smooth - here.qfrc_constraint
+    zero = jnp.zeros_like(residual)
+    curved = jax.lax.stop_gradient(here).replace(Ma=residual, qfrc_constraint=zero)
+    step = update(constant_newton, constant.replace(qfrc_smooth=zero), curved).Mgrad
+    qacc = _attached(found.qacc, -step)
+    there = create(newton, start.replace(qacc=qacc), grad=False)
+    return data.tree_replace(
+        {
+            "qacc": qacc,
+            "qfrc_constraint": _attached(found.qfrc_constraint, there.qfrc_constraint),
+            "_impl.efc_force": _attached(found._impl.efc_force, there.efc_force),
+        }
+    )
+
+
+def _solver() -> tuple[Any, Any]:
+    from mujoco.mjx._src import solver
+
+    return solver.Context.create, solver._update_gradient
 
 
 def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
@@ -187,11 +229,11 @@ def _integrator(mjx: Any, model: Any) -> Any:
 
 def reverse_hint(compiled: Any) -> str | None:
     """Why reverse mode does not work on a model, and what makes it work; None where it does."""
-    if not constrained(compiled) or compiled.opt.iterations == 1:
+    if compiled.opt.integrator != 1 or not constrained(compiled):  # 1: Runge-Kutta
         return None
     return (
-        "MJX solves constraints in a loop of unknown length, which has no reverse-mode derivative: "
-        "give solver_iterations=1 (one Newton step with a fixed line search), or use forward mode"
+        "MJX solves constraints in a loop of unknown length, which has no reverse-mode derivative "
+        'inside its Runge-Kutta steps: give the model integrator="implicitfast" or "Euler"'
     )
 
 

@@ -132,8 +132,8 @@ def _geom(
         return jnp.asarray(getattr(compiled, name)[geom], leaves["body_mass"].dtype)
 
     size = leaf("geom_size")
-    total = size.dtype.type(mass) if mass is not None else density * _volume(kind, size)
-    return jnp.asarray(total), leaf("geom_pos"), total * _inertia(kind, size), leaf("geom_quat")
+    total = jnp.asarray(mass if mass is not None else density * _volume(kind, size), size.dtype)
+    return total, leaf("geom_pos"), total * _inertia(kind, size), leaf("geom_quat")
 
 
 def _volume(kind: int, size: Float[Array, "3"]) -> Float[Array, ""]:
@@ -151,7 +151,7 @@ def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
     """Principal moments for unit mass, in the geom's frame."""
     a, b, _c = size
     if kind == _SPHERE:
-        return jnp.full(3, 0.4) * a**2
+        return jnp.full(3, 0.4, size.dtype) * a**2
     if kind == _CYLINDER:
         side = (3 * a**2 + 4 * b**2) / 12
         return jnp.stack([side, side, a**2 / 2])
@@ -167,8 +167,9 @@ def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _together(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
-    mass = sum(part[0] for part in parts)
-    centre = sum(part[0] * part[1] for part in parts) / mass
+    masses, places = (jnp.stack([part[i] for part in parts]) for i in range(2))
+    mass = jnp.sum(masses)
+    centre = masses @ places / mass
     full = jnp.zeros((3, 3), centre.dtype)
     for own, place, moments, quat in parts:
         turn, arm = _rotation(quat), place - centre
@@ -177,7 +178,7 @@ def _together(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
     moments, axes = jnp.linalg.eigh(full)
     # A rotation, not a reflection.
     axes = axes.at[:, 2].multiply(jnp.sign(jnp.linalg.det(axes)))
-    return jnp.asarray(mass), centre, moments, _quaternion(axes)
+    return mass, centre, moments, _quaternion(axes)
 
 
 def _rotation(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -217,13 +217,12 @@ class Loop:
             return dict(self.signals(state.time, state, ctrl, features))
         arrays = {**state._asdict(), "sensordata": sensors, "ctrl": ctrl}
         seen = {}
-        for name in self.places if self.signals is None else self.signals:
-            if name in self.places:
+        for name, chosen in (self.signals or self.places).items():
+            if callable(chosen):
+                seen[name] = chosen(state.time, state, ctrl, features)
+            else:
                 where = self.places[name]
                 seen[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
-            else:
-                assert self.signals is not None
-                seen[name] = self.signals[name](state.time, state, ctrl, features)
         return seen
 
     def vouched(self) -> tuple[str, ...]:

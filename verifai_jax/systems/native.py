@@ -11,7 +11,7 @@ import ctypes
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -76,11 +76,13 @@ class Native:
             self.batches[size, number] = module.Batch(self.loop.compiled, size)
         return self.batches[size, number]
 
-    def _trace(self, results: list[tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]]) -> Trace:
+    def _trace(self, results: list["_Results"]) -> Trace:
         signals = {
-            name: np.concatenate([result[0][name] for result in results]) for name in results[0][0]
+            name: np.concatenate([result.signals[name] for result in results])
+            for name in results[0].signals
         }
-        age, finite = (np.concatenate([result[i] for result in results]) for i in (1, 2))
+        age = np.concatenate([result.age for result in results])
+        finite = np.concatenate([result.finite for result in results])
         status = np.where(finite, Status.OK, Status.NONFINITE).astype(np.int32)
         ends = self.loop.terminate is not None
         form = Trace(
@@ -129,6 +131,14 @@ class _Program:
             unknown = (k == 0) & self.loop.late
             arrays["sensordata"] = jnp.where(unknown, 0.0, arrays["sensordata"])
         return self.loop.sample(k, arrays, lived, features)
+
+
+class _Results(NamedTuple):
+    """Signals `[n, time, ...]`, periods lived `[n]`, and whether all was finite `[n]`."""
+
+    signals: dict[str, np.ndarray]
+    age: np.ndarray
+    finite: np.ndarray
 
 
 class _Part:
@@ -181,13 +191,13 @@ class _Part:
             ids = None if still.all() else still
             self.batch.step(ids, nstep=self.loop.substeps, stage=self.program.stage)
 
-    def results(self) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-        """Signals `[n, time, ...]`, periods lived `[n]`, and whether all was finite `[n]`."""
+    def results(self) -> "_Results":
+        """What came of these rows."""
         signals = {
             name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
             for name in self.samples[0]
         }
-        return signals, np.asarray(self.lived.age), np.asarray(self.lived.finite)
+        return _Results(signals, np.asarray(self.lived.age), np.asarray(self.lived.finite))
 
 
 def _rows(features: Any, first: int, count: int) -> Any:
