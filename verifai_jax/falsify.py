@@ -23,7 +23,7 @@ from verifai_jax.progress import Progress
 from verifai_jax.proposals import cube_of, units
 from verifai_jax.rates import StoppingRule
 from verifai_jax.rounds import Rounds
-from verifai_jax.run import Run, load, write_record
+from verifai_jax.run import RECORD, Run, load, write_record
 from verifai_jax.search import Search
 from verifai_jax.table import ErrorTable
 
@@ -452,7 +452,9 @@ def _new_folder(folder: str | Path | None) -> Path | None:
     if folder is None:
         return None
     place = Path(folder)
-    if place.exists() and (not place.is_dir() or any(place.iterdir())):
+    # A process that dies before its first record leaves a part of one.
+    leftover = {f"{RECORD}.part"}
+    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
         raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
     with _writing(place):
         place.mkdir(parents=True, exist_ok=True)
