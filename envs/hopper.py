@@ -1,12 +1,14 @@
 """A hopper: one leg of thigh, shank and foot under a torso, in the vertical plane.
 
-    system = hopper(duration=4.0)                  # the trained network runs it at 1.5 m/s
-    system({"mass_scale": 1.2, "friction": 0.6}, key)
+    system = hopper("torso_mass", "friction", duration=4.0)
+    system({"torso_mass": 5.0, "friction": 0.6}, key)
 
 The model is `hopper.xml`, 9 kg and 1.5 m tall, with three torque motors and two contact points
-under its foot. `HopperTask` is what the network was trained on (`envs/train_hopper.py`), in MJX.
+under its foot. `HopperTask` is what the network was trained on (`envs/train_hopper.py`), in MJX;
+`hopper` is what is tested, in MJX or native MuJoCo.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,10 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.errors import require
-from verifai_jax.rl import Continuous
+from verifai_jax.errors import check_names, require
+from verifai_jax.rl import Continuous, Policy, load_policy
+from verifai_jax.systems.mujoco_bindings import scaled
+from verifai_jax.systems.mujoco_system import MuJoCo, mujoco
 
 Scalar = Float[Array, ""]
+Controller = Callable[..., Float[Array, "3"]]
 
 MODEL_FILE = Path(__file__).with_name("hopper.xml")
 POLICY_FILE = Path(__file__).with_name("hopper_policy.npz")
@@ -29,8 +34,30 @@ CONTROL_PERIOD = 0.02  # s; the model's own step is 0.005 s
 PHYSICS_STEPS = 4
 SPEED = 1.5  # m/s; going faster earns nothing
 LOW, BENT = 0.6, 0.9  # m and rad: hip lower, or torso farther from upright, is a fall
-# Knee slightly bent, the foot flat and 1 cm above the floor: x, hip height, pitch, then the joints.
-STANCE = np.array([0.0, 1.01, 0.0, -0.2, 0.4, -0.2])
+# The knee slightly bent, the flat foot 4 cm above the floor: x, hip height, pitch, joint angles.
+STANCE = np.array([0.0, 1.03, 0.0, -0.2, 0.4, -0.2])
+
+# What features set, and what it is on an ordinary day.
+BINDINGS = {
+    "torso_mass": "body/torso/mass",  # kg
+    "friction": "geom/floor/friction[0]",
+    "strength": [scaled(f"actuator/{joint}/gear[0]") for joint in ("hip", "knee", "ankle")],
+    "damping": [scaled(f"joint/{joint}/damping") for joint in ("hip", "knee", "ankle")],
+    "foot": "geom/foot/size[1]",  # m, half its length
+    "pitch0": "joint/rooty/qpos",  # rad
+    "speed0": "joint/rootx/qvel",  # m/s
+    "push": "body/torso/force[0]",  # N forward on the torso; a number or a Signal
+}
+NOMINAL = {
+    "torso_mass": 4.0,
+    "friction": 0.9,
+    "strength": 1.0,
+    "damping": 1.0,
+    "foot": 0.14,
+    "pitch0": 0.0,
+    "speed0": 0.0,
+    "push": 0.0,
+}
 
 
 class State(NamedTuple):
@@ -47,12 +74,74 @@ def observe(qpos: Float[Array, "6"], qvel: Float[Array, "6"]) -> Float[Array, "1
     return jnp.concatenate([qpos[1:], jnp.clip(qvel, -10.0, 10.0)])
 
 
+def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
+    """A trained network; the one that is shipped when left out."""
+    policy = policy if isinstance(policy, Policy) else load_policy(policy)
+    if policy.action != Continuous(-1.0, 1.0, 3) or policy.layers[0][0].shape[0] != 11:
+        raise ValueError(
+            "a hopper's policy sees 11 numbers and has 3 actions in [-1, 1]; "
+            f"got {policy.layers[0][0].shape[0]} and {policy.action}"
+        )
+
+    def control(time: Scalar, state: Any, features: Any) -> Float[Array, "3"]:
+        return policy.act(observe(state.qpos, state.qvel))
+
+    return control
+
+
+def lying(state: Any, features: Any) -> Bool[Array, ""]:
+    """Whether it has fallen so far that knee or torso are about to touch the floor."""
+    return (state.qpos[1] < 0.45) | (jnp.abs(state.qpos[2]) > 1.5)
+
+
+def hopper(
+    *varied: str,
+    controller: Controller | None = None,
+    duration: float = 4.0,
+    backend: str = "auto",
+) -> MuJoCo:
+    """The closed loop as a system with signals `x`, `height`, `pitch` and `speed`.
+
+    Begins at rest in `STANCE`, and ends when it lies on the floor. `x` and `height` (m) are the
+    hip's, `speed` (m/s) the hip's forward, `pitch` (rad) the torso's, positive when it nods.
+
+    - `varied`: the features that it has, of those in `BINDINGS`.
+    - `controller(time, state, features) -> control`: three torques in parts of the motors'
+      greatest, every 0.02 s; `neural()` when left out.
+    - `duration`: simulated seconds, a multiple of 0.02 s.
+    - `backend`: as for `mujoco`.
+
+    **Raises:** `UnknownNameError` for a feature that is not in `BINDINGS`.
+    """
+    check_names("feature of the hopper", varied, BINDINGS)
+
+    def initial(features: Any, key: Any, qpos: Any, qvel: Any) -> tuple[Any, Any]:
+        return qpos + jnp.asarray(STANCE - model().qpos0, qpos.dtype), qvel
+
+    return mujoco(
+        MODEL_FILE,
+        duration=duration,
+        control_period=CONTROL_PERIOD,
+        bind={name: BINDINGS[name] for name in varied},
+        controller=neural() if controller is None else controller,
+        initial=initial,
+        signals={
+            "x": "joint/rootx/qpos",
+            "height": "joint/rootz/qpos",
+            "pitch": "joint/rooty/qpos",
+            "speed": "joint/rootx/qvel",
+        },
+        terminate=lying,
+        backend=backend,
+    )
+
+
 @dataclass(frozen=True)
 class HopperTask:
     """Run at 1.5 m/s, upright, with little torque; 6 s, cut short by a fall.
 
     Each step of 0.02 s earns up to 2.5: 1 for being up, 1 for each m/s up to `SPEED`, less for
-    pitch, torque and its change. About once a second the robot is kicked forward or back.
+    lean, torque and its change. About once a second the robot is kicked forward or back.
 
     - `kick`: the greatest change of speed by a kick, in m/s.
     """
@@ -68,7 +157,7 @@ class HopperTask:
     def reset(self, key: Key[Array, ""]) -> State:
         """Near `STANCE`, nearly at rest."""
         pose, speed = jax.random.split(key)
-        spread = jnp.array([0.0, 0.0, 0.1, 0.1, 0.1, 0.1])
+        spread = jnp.array([0.0, 0.0, 0.05, 0.05, 0.05, 0.05])
         qpos = jnp.asarray(STANCE, jnp.float32) + spread * _even(pose, 6)
         spread = jnp.array([0.5, 0.1, 0.3, 0.3, 0.3, 0.3])
         return State(qpos, spread * _even(speed, 6), jnp.zeros(6), jnp.zeros(3))
@@ -88,8 +177,8 @@ class HopperTask:
         kicked = jax.random.bernoulli(often, CONTROL_PERIOD) * self.kick * _even(much, 1)[0]
         qpos, qvel = data.qpos, data.qvel.at[0].add(kicked)
         speed = (qpos[0] - state.qpos[0]) / CONTROL_PERIOD
-        reward = 1.0 + jnp.clip(speed, -1.0, SPEED) - 0.5 * qpos[2] ** 2
-        reward -= 0.1 * jnp.sum(action**2) + 0.25 * jnp.sum((action - state.control) ** 2)
+        reward = 1.0 + jnp.clip(speed, -1.0, SPEED) - 2.0 * qpos[2] ** 2
+        reward -= 0.05 * jnp.sum(action**2) + 0.1 * jnp.sum((action - state.control) ** 2)
         fallen = (qpos[1] < LOW) | (jnp.abs(qpos[2]) > BENT) | ~jnp.all(jnp.isfinite(qpos))
         return State(qpos, qvel, data.qacc_warmstart, action), reward, fallen
 
