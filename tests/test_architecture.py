@@ -73,6 +73,17 @@ ALLOWED = {
         "search",
         "table",
     },
+    "trials": {
+        "devices",
+        "engine",
+        "errors",
+        "falsify",
+        "problem",
+        "proposals",
+        "run",
+        "search",
+        "trace",
+    },
     "analysis": {
         "engine",
         "errors",

@@ -61,6 +61,8 @@ from verifai_jax.systems import sin_cos as sin_cos
 from verifai_jax.table import ErrorTable as ErrorTable
 from verifai_jax.trace import Status as Status
 from verifai_jax.trace import Trace as Trace
+from verifai_jax.trials import Trials as Trials
+from verifai_jax.trials import repeat as repeat
 from verifai_jax.waveform import Waveform as Waveform
 
 _claim_cores()

@@ -10,6 +10,7 @@ small enough for the cache, so that there is one executable for each (problem, b
 """
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -155,6 +156,15 @@ class Engine:
         """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
         return self._run("verdicts", u, key, first, 1.0)
 
+    def told_row(
+        self, u: Float[Array, " d"], key: Key[Array, ""], temperature: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, " d"] | tuple[()]]:
+        """One row under `vmap`: what a search is told of it. Least robustness, status, gradient."""
+        rho, status, _, gradient = self._evaluate_row(u.astype(self.precision), key, temperature)
+        if self.gradient:
+            gradient = gradient.astype(jnp.float32)
+        return jnp.min(rho), status, gradient
+
     def _run(self, mode: str, u: Any, key: Any, first: int, temperature: Any) -> Any:
         with in_precision(self.precision):
             arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(temperature))
@@ -183,16 +193,23 @@ class Engine:
             return packing.pack(one_row(u.astype(self.precision), key, temperature))
 
         program = self._batched(packed_row)
+        # A new function object each time: JAX remembers what it traced by the function.
+        return self.differentiable(lambda: jax.jit(partial(program)).lower(*arguments)).compile()
+
+    def differentiable(self, trace: Callable[[], Any]) -> Any:
+        """The result of `trace`, which traces rows of this engine, in a mode that works.
+
+        Where the system refuses reverse mode, it is traced again in forward mode.
+        """
         try:
-            # A new function object each time: JAX remembers what it traced by the function.
-            return jax.jit(partial(program)).lower(*arguments).compile()
+            return trace()
         except ValueError as error:
             if not (self.gradient and self._derivative.reverse and reverse_refused(error)):
                 raise
         self._derivative = self._derivative.forward_instead()
         hint = getattr(self.problem.system, "reverse_hint", "")
         self.notes = (f"{self._derivative.told()}{f': {hint}' if hint else ''}",)
-        return jax.jit(partial(program)).lower(*arguments).compile()
+        return trace()
 
     def _batched(self, one_row: Any) -> Any:
         """Spread `one_row(u, key, temperature)` over chunks of lanes and over the devices."""

@@ -89,12 +89,12 @@ def falsify(
     when the loop breaks down.
     """
     started = time.perf_counter()
-    _check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
-    search = _check_search(problem, search)
+    check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    search = check_search(problem, search)
     _check_rule(search, stop_when)
     earlier = _earlier(warm_start, problem)
     in_precision(precision)
-    batch = min(_usual_batch(search, budget) if batch is None else batch, budget)
+    batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     choice = resolved(
         problem, gradient=search.wants_gradient, batch=batch, budget=budget, precision=precision,
         wanted=backend,
@@ -191,11 +191,11 @@ def resume(
                 f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
             )
         search = searches.from_json(run.search_data)
-    search = _check_search(problem, search)
+    search = check_search(problem, search)
     _check_same_space(run, problem)
     _check_rule(search, stop_when)
     budget = run.budget if budget is None else budget
-    _check_options(budget, run.batch, run.seed, max_seconds, stop_after)
+    check_options(budget, run.batch, run.seed, max_seconds, stop_after)
     snapshot = run.snapshot or {}
     rows = int(snapshot.get("rows", 0))
     if budget <= rows:
@@ -355,7 +355,7 @@ def _writing(place: Path | None) -> Iterator[None]:
         ) from error
 
 
-def _usual_batch(search: Search, budget: int) -> int:
+def usual_batch(search: Search, budget: int) -> int:
     """Twenty rounds or more for a search that learns; a power of two, so that shapes are few."""
     if not search.learns:
         return search.most_at_once
@@ -366,7 +366,7 @@ def _is_integer(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
-def _check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
+def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
     for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
         if name == "stop_after" and value is None:
             continue
@@ -378,7 +378,7 @@ def _check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_af
         raise ValueError(f"max_seconds must be positive; got {max_seconds!r}")
 
 
-def _check_search(problem: Any, search: Any) -> Search:
+def check_search(problem: Any, search: Any) -> Search:
     if not isinstance(problem, Problem):
         raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
     if isinstance(search, str):

@@ -337,8 +337,10 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
                 )
         if record.get("backend") is not None:
             problem = problem.on_backend(record["backend"])
+    begun = ErrorTable.exists(folder) or record["stopped"] != "running"
     return Run(
-        table=ErrorTable.load(folder, features),
+        # A run that was cut off before its first batch came to the disk has no rows yet.
+        table=ErrorTable.load(folder, features) if begun else ErrorTable(features),
         folder=folder,
         problem=problem,
         snapshot=read_snapshot(folder),

@@ -118,6 +118,11 @@ class ErrorTable:
         table._fill(_read(folder))
         return table
 
+    @staticmethod
+    def exists(folder: Path) -> bool:
+        """Whether there is a table in `folder`, finished or growing."""
+        return (folder / FINISHED).exists() or (folder / STREAM).exists()
+
     def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
         """A table with the first `rows` rows of this one, to which more can be appended.
 
@@ -192,7 +197,7 @@ def _read(folder: Path) -> "pd.DataFrame":
     import pandas as pd
 
     finished, stream = folder / FINISHED, folder / STREAM
-    if not finished.exists() and not stream.exists():
+    if not ErrorTable.exists(folder):
         raise FileNotFoundError(f"no error table in {folder}: neither {FINISHED} nor {STREAM}")
     parts = [pd.read_parquet(finished)] if finished.exists() else []
     if stream.exists():

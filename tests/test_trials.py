@@ -1,0 +1,62 @@
+"""Many seeds in one program ask for what runs with these seeds would."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+
+SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
+
+
+def hill(features, key):
+    height = 1 - jnp.exp(-20 * ((features["a"] - 0.8) ** 2 + (features["b"] - 0.3) ** 2))
+    return vj.Trace({"x": height[None]}, dt=1.0)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return vj.Problem("hill", SPACE, hill, "x >= 0.05")
+
+
+@pytest.mark.parametrize("name", ["uniform", "cross_entropy", "gradient"])
+def test_agrees_with_runs_of_the_same_seeds(problem, name):
+    trials = vj.repeat(problem, name, 96, batch=16, seeds=[0, 3, 5], stop_early=False)
+    assert trials.rho.shape == (3, 96)
+    for seed, rho in zip(trials.seeds, trials.rho, strict=True):
+        run = vj.falsify(problem, name, 96, batch=16, seed=int(seed))
+        np.testing.assert_allclose(rho, run.table.all["rho"], atol=2e-4)
+
+
+def test_says_how_soon_and_how_surely(problem):
+    trials = vj.repeat(problem, "gradient", 300, batch=4, seeds=12)
+    assert trials.falsified == 12
+    assert trials.median_simulations < 60
+    assert trials.mean_simulations == trials.first_failure.mean()
+    assert "falsified from 12 of 12 seeds" in repr(trials)
+    # Uniform sampling: geometric with the failing share of the space.
+    uniform = vj.repeat(problem, "uniform", 2048, batch=64, seeds=40)
+    share = np.mean(vj.falsify(problem, "uniform", 20_000, batch=1024).table.all["rho"] < 0)
+    assert 0.5 < uniform.mean_simulations * share < 2.0
+
+
+def test_gives_up_at_the_budget():
+    safe = vj.Problem("safe", SPACE, hill, "x >= -1")
+    trials = vj.repeat(safe, "uniform", 20, batch=8, seeds=3)
+    assert trials.rho.shape == (3, 24)
+    assert (trials.falsified, trials.median_simulations) == (0, np.inf)
+    assert np.isnan(trials.mean_simulations)
+
+
+def test_refuses_what_needs_the_host(problem):
+    cases = [
+        ({"system": vj.blackbox(lambda f: None)}, "is a black box, which no compiled program"),
+        ({"space": vj.FeatureSpace(SPACE, where=lambda f: f["a"] > 0)}, r"has a constraint"),
+        ({"spec": {"p": "x > 0", "q": "x < 2"}, "priority": ("p", "q")}, "has a priority"),
+    ]
+    for change, message in cases:
+        parts = {"space": SPACE, "system": hill, "spec": "x > 0", **change}
+        with pytest.raises(ValueError, match=message):
+            vj.repeat(vj.Problem("hill", **parts), "uniform", 8)
+    with pytest.raises(ValueError, match="seeds must be a number of them"):
+        vj.repeat(problem, "uniform", 8, seeds=[])
