@@ -70,7 +70,8 @@ class Point:
     batch: Batch
     index: int
     text: bytes
-    losses: int = 0  # Clients that vanished while they simulated it.
+    losses: int = 0  # Clients that vanished while they simulated it,
+    lost: float = 0.0  # and when the last one did.
     handed: float = 0.0
     ahead: int = 0  # Points that its client had to simulate before.
 
@@ -85,8 +86,10 @@ class Client:
         self.challenge = secrets.token_hex(16)
         self.greeted = False
         self.leaving = False  # It is sent away: what it says is not read any more.
-        self.deadline = time.monotonic() + GREETING_SECONDS
+        self.since = time.monotonic()
+        self.deadline = self.since + GREETING_SECONDS
         self.out = bytearray()
+        self.writing = False  # Whether the selector waits for room to send.
         self.capacity = self.parallel = self.window = 1
         self.has: dict[int, Point] = {}  # In the order in which they were handed out.
         self.answered: dict[int, None] = {}
@@ -94,7 +97,13 @@ class Client:
         self.faults = 0
 
     @property
+    def here(self) -> bool:
+        """Whether points may be handed to it."""
+        return self.greeted and not self.leaving
+
+    @property
     def room(self) -> int:
+        """How many more points it may have now."""
         return min(self.window, self.capacity) - len(self.has)
 
     def running(self) -> list[Point]:
@@ -271,8 +280,10 @@ class Server(threading.Thread):
             # The rest of what it sends has to be read, or it would be reset before it reads why.
             with contextlib.suppress(OSError):
                 client.socket.shutdown(socket.SHUT_WR)
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.out else 0)
-        self._selector.modify(client.socket, wanted, client)
+        if client.writing != bool(client.out):
+            client.writing = bool(client.out)
+            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.out else 0)
+            self._selector.modify(client.socket, wanted, client)
 
     def _send_away(self, client: Client, why: str) -> None:
         """Tell a client why, and close the connection when it has had time to read it."""
@@ -305,6 +316,7 @@ class Server(threading.Thread):
                 self.waiting.appendleft(point)
                 continue
             point.losses += 1
+            point.lost = time.monotonic()
             if point.losses <= self.rules.retries:
                 self.lost.append(point)
                 continue
@@ -423,20 +435,35 @@ class Server(threading.Thread):
     # Points
 
     def _hand_out(self) -> None:
-        free = [c for c in self.clients if c.greeted and not c.leaving and c.room > 0]
-        if not free or not (self.waiting or self.lost):
+        if not (self.waiting or self.lost) or not self._free():
             return
-        # A point that was lost goes to a client that has answered already, if there is one: a
-        # client that dies of everything must not use up the attempts of every point.
-        proven = any(client.answered for client in self.clients)
-        for client in free:
-            if self.lost and (client.answered or not proven):
-                self._hand(client, self.lost, 1)
-        while free and self.waiting:
+        self._hand_out_lost()
+        while self.waiting and (free := self._free()):
             share = -(-len(self.waiting) // len(free))
             for client in free:
                 self._hand(client, self.waiting, min(share, client.room))
-            free = [client for client in free if client.room > 0 and client in self.clients]
+
+    def _hand_out_lost(self) -> None:
+        """Points whose client vanished: to one that has answered, or was here already.
+
+        A client that dies of everything, and comes back at once, must not use up the attempts of
+        every point; so a lost point waits for a better one, if there is any.
+        """
+        points, self.lost = self.lost, deque()
+        for point in points:
+            able = [
+                client
+                for client in self.clients
+                if client.here and (client.answered or client.since < point.lost)
+            ]
+            free = [client for client in (able or self._free()) if client.room > 0]
+            if free:
+                self._hand(free[0], deque([point]), 1)
+            else:
+                self.lost.append(point)
+
+    def _free(self) -> list[Client]:
+        return [client for client in self.clients if client.here and client.room > 0]
 
     def _hand(self, client: Client, points: deque[Point], most: int) -> None:
         now, texts = time.monotonic(), []
@@ -494,7 +521,7 @@ class Server(threading.Thread):
         self._flush(client)
 
     def _look_for_clients(self, now: float) -> None:
-        here = any(client.greeted and not client.leaving for client in self.clients)
+        here = any(client.here for client in self.clients)
         wanted = any(not p.batch.cancelled for p in itertools.chain(self.waiting, self.lost))
         if here or not wanted:
             self._alone_since, self._remind = None, REMINDER

@@ -189,7 +189,7 @@ def _raw_array(name: str, value: dict[str, Any], raw: bytes) -> np.ndarray:
     dtype, count = np.dtype(kind), math.prod(shape)
     if not isinstance(at, int) or at < 0 or at + count * dtype.itemsize > len(raw):
         raise WireError(
-            f"{name} needs {count * dtype.itemsize} bytes from {brief(at)}; {len(raw)} came"
+            f"{name} needs {brief(count * dtype.itemsize)} bytes from {brief(at)}; {len(raw)} came"
         )
     return np.frombuffer(raw, dtype, count, at).reshape(shape)
 
@@ -208,11 +208,11 @@ def plain(value: Any) -> Any:
         return [plain(inner) for inner in value]
     if value is None or isinstance(value, str | bool | int | float):
         return value
-    try:
-        return np.asarray(value).tolist()
-    except Exception as error:
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
         kind = type(value).__name__
-        raise TypeError(f"a feature of type {kind} cannot be sent to a simulator") from error
+        raise TypeError(f"a feature of type {kind} cannot be sent to a simulator")
+    return array.tolist()
 
 
 def _without_nan(value: Any) -> Any:
