@@ -1,5 +1,6 @@
 """Runs that are killed, and disks that do not take what is written to them."""
 
+import json
 import os
 import random
 import signal
@@ -42,6 +43,19 @@ def full_disk(folder, name):
     (folder / name).symlink_to("/dev/full")
 
 
+class Full:
+    """A writer to a disk that has no room."""
+
+    def __init__(self, file):
+        self.file = file
+
+    def write_batch(self, batch):
+        self.file.write(bytes(99))
+
+    def close(self):
+        pass
+
+
 def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     rows = vj.ErrorTable.append
@@ -51,16 +65,11 @@ def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, m
         if len(self) == 48 and self._stream is not None:
             self._stream._file.close()
             self._stream._file = open("/dev/full", "wb")  # noqa: SIM115 - closed by the table
-            sink = self._stream._file
-            self._stream._writer = type(
-                "Full",
-                (),
-                {"write_batch": lambda _, b: sink.write(bytes(99)), "close": lambda _: 0},
-            )()
+            self._stream._writer = Full(self._stream._file)
         rows(self, columns)
 
     monkeypatch.setattr(vj.ErrorTable, "append", append)
-    with pytest.raises(vj.RunError, match="broke down after 64 simulations.*[Nn]o space") as raised:
+    with pytest.raises(vj.RunError, match=r"broke down after 64 .*[Nn]o space") as raised:
         vj.falsify(problem, "cross_entropy", 160, batch=16, folder=folder)
     monkeypatch.undo()
     assert "make room there and resume it, or save the run elsewhere" in str(raised.value)
@@ -78,7 +87,7 @@ def test_a_disk_that_is_full_at_the_end(problem, whole, tmp_path, name):
     folder = tmp_path / "run"
     vj.falsify(problem, "cross_entropy", 64, batch=16, folder=folder)
     full_disk(folder, name)
-    with pytest.raises((vj.RunError, ValueError), match="[Nn]o space") as raised:
+    with pytest.raises((vj.RunError, ValueError), match=r"[Nn]o space") as raised:
         vj.resume(folder, problem, budget=160)
     if isinstance(raised.value, vj.RunError):
         assert raised.value.run.table.all.equals(whole)
@@ -102,6 +111,16 @@ def test_a_damaged_folder_is_told(problem, tmp_path):
         vj.resume(run.folder, problem, budget=160)
 
 
+def test_a_kill_before_the_first_rows_is_resumed(problem, whole, tmp_path):
+    run = vj.falsify(problem, "cross_entropy", 32, batch=16, folder=tmp_path)
+    record = json.loads((tmp_path / RECORD).read_text())
+    (tmp_path / RECORD).write_text(json.dumps({**record, "stopped": "running"}))
+    (tmp_path / "table.parquet").unlink()
+    (tmp_path / STATE).unlink()
+    assert len(run.table) == 32
+    assert vj.resume(tmp_path, problem, budget=160).table.all.equals(whole)
+
+
 def test_a_kill_before_the_first_record_does_not_block_the_folder(problem, tmp_path):
     (tmp_path / f"{RECORD}.part").write_text("{")
     assert len(vj.falsify(problem, "uniform", 32, folder=tmp_path).table) == 32
@@ -120,7 +139,7 @@ if __name__ == "__main__":
         vj.resume(folder, slow_problem(sys.argv[1]))
     else:
         vj.falsify(
-            slow_problem(sys.argv[1]), "cross_entropy", 12_000, batch=16, folder=folder, progress=False
+            slow_problem(sys.argv[1]), "cross_entropy", 12_000, batch=16, folder=folder
         )
 """
 

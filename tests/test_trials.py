@@ -58,5 +58,5 @@ def test_refuses_what_needs_the_host(problem):
         parts = {"space": SPACE, "system": hill, "spec": "x > 0", **change}
         with pytest.raises(ValueError, match=message):
             vj.repeat(vj.Problem("hill", **parts), "uniform", 8)
-    with pytest.raises(ValueError, match="seeds must be a number of them"):
+    with pytest.raises(ValueError, match="seeds must be a number or a list"):
         vj.repeat(problem, "uniform", 8, seeds=[])

@@ -158,12 +158,10 @@ class Engine:
 
     def told_row(
         self, u: Float[Array, " d"], key: Key[Array, ""], temperature: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, " d"] | tuple[()]]:
+    ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, " d"] | None]:
         """One row under `vmap`: what a search is told of it. Least robustness, status, gradient."""
         rho, status, _, gradient = self._evaluate_row(u.astype(self.precision), key, temperature)
-        if self.gradient:
-            gradient = gradient.astype(jnp.float32)
-        return jnp.min(rho), status, gradient
+        return jnp.min(rho), status, gradient.astype(jnp.float32) if self.gradient else None
 
     def _run(self, mode: str, u: Any, key: Any, first: int, temperature: Any) -> Any:
         with in_precision(self.precision):

@@ -73,8 +73,8 @@ class Trials:
 
     def __repr__(self) -> str:
         return (
-            f"{self.name}: {self.search} falsified from {self.falsified} of {len(self.seeds)} seeds "
-            f"within {self.rho.shape[1]} simulations; mean {self.mean_simulations:.4g}, "
+            f"{self.name}: {self.search} falsified from {self.falsified} of {len(self.seeds)} "
+            f"seeds within {self.rho.shape[1]} simulations; mean {self.mean_simulations:.4g}, "
             f"median {self.median_simulations:.4g} simulations to the first failure"
         )
 
@@ -109,9 +109,7 @@ def repeat(
     search = check_search(problem, search)
     every = np.arange(seeds) if isinstance(seeds, int | np.integer) else np.asarray(seeds)
     if every.ndim != 1 or not len(every) or every.dtype.kind not in "iu" or every.min() < 0:
-        raise ValueError(
-            f"seeds must be a number of them, or integers of at least 0; got {seeds!r}"
-        )
+        raise ValueError(f"seeds must be a number or a list of integers >= 0; got {seeds!r}")
     if (traced := _traced(problem, backend)) is None:
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which no compiled program can "
@@ -178,7 +176,6 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
             temperature: Any = search.temperature(state) if search.wants_gradient else 1.0
             simulate = jax.vmap(engine.told_row, in_axes=(0, 0, None))
             rho, status, gradient = simulate(u, keys, jnp.float32(temperature))
-            gradient = gradient if search.wants_gradient else None
             told = Evaluated(u, rho.astype(jnp.float32), status == Status.OK, gradient)
             return search.tell(state, cube, told) if search.learns else state, rho
 
@@ -188,12 +185,14 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
     def on_device(state: Any, keys: Any, first: Any) -> Any:
         # Blocks of seeds whose simulations fit the cache together.
         together = max(1, CHUNK // batch)
-        return jax.lax.map(lambda seed: one_seed(*seed, first), (state, keys), batch_size=together)
+        return jax.lax.map(
+            lambda seed: one_seed(seed[0], seed[1], first), (state, keys), batch_size=together
+        )
 
     split, whole = PartitionSpec("seed"), PartitionSpec()
     on_devices = jax.shard_map(
         on_device,
-        mesh=Mesh(np.array(engine.devices), ("seed",)),
+        mesh=Mesh(np.array(jax.devices()), ("seed",)),
         in_specs=(split, split, whole),
         out_specs=split,
         check_vma=False,
@@ -210,4 +209,4 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
             programs[len(keys)] = traced.compile()
         return programs[len(keys)](state, keys, first)
 
-    return start, advance, len(engine.devices)
+    return start, advance, len(jax.devices())
