@@ -101,15 +101,12 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         (physics, lived),
         jnp.arange(loop.periods + 1),
     )
-    finite = lived.finite
-    for part in (physics.qpos, physics.qvel, physics.act):
-        finite &= jnp.all(jnp.isfinite(part))
     ends = loop.terminate is not None
     return Trace(
         signals,
         dt=loop.control_period,
         valid=lived.age + 1 if ends else None,
-        status=jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
+        status=jnp.where(lived.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
         held=ends,
         finite=loop.vouched(),
     )

@@ -193,33 +193,28 @@ def bindings(model: Model, bind: Bound | None) -> Bindings:
                 _claim(taken, where, feature)
                 sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
     parameters, state, applied = (tuple(group) for group in sorted_.values())
-    solids = bodies_of_geoms(model, _geoms(parameters))
+    solids = bodies_of_geoms(model, _rows(parameters, "geom_size", "geom_pos", "geom_quat"))
     model = movable(model, _moving(model, parameters, solids))
     return Bindings(model, parameters, state, applied, solids)
 
 
-def _geoms(parameters: Iterable[Binding]) -> set[int]:
-    """The geoms whose size or place features change."""
-    widths = {"geom_size": 3, "geom_pos": 3, "geom_quat": 4}
+def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
+    """Which elements features change in these arrays."""
     return {
-        int(i) // widths[binding.place.array]
+        int(i) // (4 if binding.place.array.endswith("quat") else 3)
         for binding in parameters
-        if binding.place.array in widths
+        if binding.place.array in arrays
         for i in binding.place.index
     }
 
 
 def _moving(model: Model, parameters: Iterable[Binding], solids: Iterable[Solids]) -> set[int]:
     """The bodies whose centre of mass or axes features move."""
-    moving = set()
-    for binding in parameters:
-        array, rows = binding.place.array, binding.place.index
-        if array in ("body_ipos", "body_iquat"):
-            moving |= set((rows // (3 if array == "body_ipos" else 4)).tolist())
-        if array in ("jnt_pos", "jnt_axis"):
-            moving |= {int(model.compiled.jnt_bodyid[row]) for row in rows // 3}
-    placed = {b.place.array for b in parameters} & {"geom_pos", "geom_quat"}
-    return moving | {solid.body for solid in solids if placed or len(solid.geoms) > 1}
+    joints = _rows(parameters, "jnt_pos", "jnt_axis")
+    placed = _rows(parameters, "geom_pos", "geom_quat")
+    moving = _rows(parameters, "body_ipos", "body_iquat")
+    moving |= {int(model.compiled.jnt_bodyid[joint]) for joint in joints}
+    return moving | {s.body for s in solids if len(s.geoms) > 1 or placed & set(s.geoms)}
 
 
 def _claim(taken: dict[tuple[str, int], str], where: Place, feature: str) -> None:

@@ -232,9 +232,11 @@ def constants(model: Any) -> Any:
         if model.body_weldid[body] == 0:
             bodies.append(jnp.zeros(2, masses.dtype))
             continue
-        moved, turned = mjx.jac(model, data, data.xipos[body], body)
-        spread = [jnp.einsum("ik,ij,jk->", j, inverse, j) / 3 for j in (moved, turned)]
-        bodies.append(jnp.stack(spread))
+        if model.body_simple[body] == 2:  # It slides and does not turn.
+            bodies.append(jnp.array([1.0, 0.0], masses.dtype) / masses[body])
+            continue
+        jacobians = mjx.jac(model, data, data.xipos[body], body)
+        bodies.append(jnp.stack([jnp.einsum("ik,ij,jk->", j, inverse, j) / 3 for j in jacobians]))
     dofs = jnp.diag(inverse)
     for joint, kind in enumerate(model.jnt_type):
         first = int(model.jnt_dofadr[joint])

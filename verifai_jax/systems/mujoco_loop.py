@@ -22,6 +22,10 @@ Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
 
 
+# MuJoCo's mjMAXVAL: what is larger it calls unstable, and a control that is it takes for zero.
+HUGE = 1e10
+
+
 class State(NamedTuple):
     """What controller, signals and terminate see of a simulation, on both backends.
 
@@ -182,7 +186,7 @@ class Loop:
         signals = self.seen(state, sensors, inputs["ctrl"], features)
         finite = lived.finite
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
-            finite &= jnp.all(jnp.isfinite(value))
+            finite &= jnp.all(jnp.abs(value) <= HUGE)
         after = Lived(memory, lived.age + 1, finite)
         kept = Lived(lived.memory, lived.age, finite)
         after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, kept)

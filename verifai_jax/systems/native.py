@@ -35,25 +35,35 @@ class Native:
     def simulate(self, features: Any, keys: Any) -> Trace:
         """A batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
         count = len(keys)
+        # Few sizes, for which programs are compiled; the rows that fill one up are never stepped.
+        size = 1 << (count - 1).bit_length()
+        filled = np.minimum(np.arange(size), count - 1)
         program = self._program(features)
-        halves = 2 if count >= HALVED and count % 2 == 0 else 1
-        size = count // halves
+        features = jax.tree.map(lambda leaf: np.asarray(leaf)[filled], features)
         with _no_warnings():
             parts = [
-                _Part(self, program, i, _rows(features, i * size, size), keys[i * size :][:size])
-                for i in range(halves)
+                _Part(
+                    self,
+                    program,
+                    number,
+                    jax.tree.map(lambda leaf, part=part: leaf[part], features),
+                    keys[filled[part]],
+                    alive=np.arange(size)[part] < count,
+                )
+                for number, part in enumerate(_split(size))
             ]
-            ahead = parts[1:]
-            parts[0].look(0)
+            first, others = parts[0], parts[1:]
+            first.look(0)
             for k in range(self.loop.periods + 1):
-                for part in ahead:
+                for part in others:
                     part.look(k)
-                parts[0].go()
+                first.go()
                 if k < self.loop.periods:
-                    parts[0].look(k + 1)
-                for part in ahead:
+                    first.look(k + 1)
+                for part in others:
                     part.go()
-        return self._trace([part.results() for part in parts])
+        trace = self._trace([part.results() for part in parts])
+        return jax.tree.map(lambda leaf: leaf[:count], trace)
 
     def _program(self, features: Any) -> "_Program":
         leaves, form = jax.tree.flatten(features)
@@ -83,7 +93,9 @@ class Native:
         }
         age = np.concatenate([result.age for result in results])
         finite = np.concatenate([result.finite for result in results])
-        status = np.where(finite, Status.OK, Status.NONFINITE).astype(np.int32)
+        failed = np.concatenate([result.failed for result in results])
+        status = np.where(finite, Status.OK, Status.NONFINITE)
+        status = np.where(failed, Status.ERROR, status).astype(np.int32)
         ends = self.loop.terminate is not None
         form = Trace(
             {name: signal[0] for name, signal in signals.items()},
@@ -134,17 +146,27 @@ class _Program:
 
 
 class _Results(NamedTuple):
-    """Signals `[n, time, ...]`, periods lived `[n]`, and whether all was finite `[n]`."""
+    """Signals `[n, time, ...]`, and by row: periods lived, all finite, refused by MuJoCo."""
 
     signals: dict[str, np.ndarray]
     age: np.ndarray
     finite: np.ndarray
+    failed: np.ndarray
 
 
 class _Part:
     """A half of the rows, or all of them, on their way through a simulation."""
 
-    def __init__(self, native: Native, program: _Program, number: int, features: Any, keys: Any):
+    def __init__(
+        self,
+        native: Native,
+        program: _Program,
+        number: int,
+        features: Any,
+        keys: Any,
+        alive: np.ndarray,
+    ) -> None:
+        self.alive, self.failed = alive, np.zeros(len(alive), bool)
         self.loop, self.program = native.loop, program
         count = len(keys)
         self.batch = native.batch(count, number)
@@ -168,6 +190,7 @@ class _Part:
         self.lived = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.lived()
         )
+        self.refused = require("mujoco.batch", extra="mujoco").SimulationError
         self.samples: list[dict[str, Any]] = []
         self.sampled: Any = None
 
@@ -184,12 +207,21 @@ class _Part:
     def go(self) -> None:
         """Step to the next sample what has not ended, under the control that was decided."""
         self.samples.append(self.sampled.signals)
-        still = ~(np.asarray(self.sampled.frozen) | ~np.asarray(self.lived.finite))
+        ended = np.asarray(self.sampled.frozen) | ~np.asarray(self.lived.finite)
         for name, value in self.sampled.inputs.items():
             self.batch.bind(name)[...] = np.asarray(value).reshape(self.batch.bind(name).shape)
-        if still.any():
-            ids = None if still.all() else still
-            self.batch.step(ids, nstep=self.loop.substeps, stage=self.program.stage)
+        going = self.alive & ~self.failed & ~ended
+        if not going.any():
+            return
+        try:
+            self.batch.step(
+                None if going.all() else going,
+                nstep=self.loop.substeps,
+                stage=self.program.stage,
+            )
+        except self.refused as error:
+            # MuJoCo raised in these rows, which keep their state; the others went on.
+            self.failed[error.ids] = True
 
     def results(self) -> "_Results":
         """What came of these rows."""
@@ -197,11 +229,14 @@ class _Part:
             name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
             for name in self.samples[0]
         }
-        return _Results(signals, np.asarray(self.lived.age), np.asarray(self.lived.finite))
+        age, finite = np.asarray(self.lived.age), np.asarray(self.lived.finite)
+        return _Results(signals, age, finite, self.failed)
 
 
-def _rows(features: Any, first: int, count: int) -> Any:
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[first : first + count], features)
+def _split(size: int) -> list[slice]:
+    if size < HALVED:
+        return [slice(0, size)]
+    return [slice(0, size // 2), slice(size // 2, size)]
 
 
 def _kind(leaf: Any) -> Any:
