@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.errors import suggests_options
+from verifai_jax.systems.horizon import checkpointed_scan
 from verifai_jax.systems.integrators import integrator
 from verifai_jax.systems.structure import (
     check_like,
@@ -126,10 +127,10 @@ class _Rollout:
             held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
         # One iteration more than there are steps: it samples the final state and moves nothing,
         # which is cheaper than copying all samples to append one.
-        ((state, _, _, age), kept), outputs = jax.lax.scan(
+        ((state, _, _, age), kept), outputs = checkpointed_scan(
             sample,
             ((state, memory, held, jnp.int32(0)), kept),
-            jnp.arange(loop.steps + 1),
+            loop.steps + 1,
             unroll=loop.unroll,
         )
         return state, age, kept, outputs

@@ -1,0 +1,49 @@
+"""A scan over a long horizon whose reverse-mode memory grows with the root of its length.
+
+    carry, outputs = checkpointed_scan(step, carry, length)             # step(carry, k)
+
+A reverse sweep needs what every step computed. Kept for all steps at once that is soon more than
+the memory there is; here only the carry of every segment is kept, and the steps of a segment are
+taken again on the way back.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+LONG = 512
+"""Steps up to which a scan is left whole: the way back then costs no second simulation."""
+
+
+def checkpointed_scan(
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, length: int, *, unroll: int = 1
+) -> tuple[Any, Any]:
+    """`lax.scan` of `step(carry, k)` over `k = 0 ... length - 1`, in segments where it is long.
+
+    Forward results are those of one scan.
+    """
+    if length <= LONG:
+        return jax.lax.scan(step, carry, jnp.arange(length), unroll=unroll)
+    each = _segment(length)
+    whole = length // each * each
+
+    @jax.checkpoint
+    def segment(carry: Any, first: Any) -> Any:
+        return jax.lax.scan(step, carry, first + jnp.arange(each), unroll=unroll)
+
+    carry, parts = jax.lax.scan(segment, carry, jnp.arange(0, whole, each))
+    outputs = jax.tree.map(lambda leaf: leaf.reshape(whole, *leaf.shape[2:]), parts)
+    if whole == length:
+        return carry, outputs
+    carry, rest = jax.lax.scan(step, carry, jnp.arange(whole, length), unroll=unroll)
+    return carry, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), outputs, rest)
+
+
+def _segment(length: int) -> int:
+    """A segment near the root of the length, that divides it if one does."""
+    root = math.isqrt(length)
+    divisors = [n for n in range(root // 2, 2 * root) if length % n == 0]
+    return min(divisors, key=lambda n: abs(n - root), default=root)
