@@ -1,10 +1,11 @@
-"""A simulation as an animated GIF, for problems that know how to draw a frame of themselves."""
+"""A simulation as an animated GIF: MuJoCo's picture of it, or what the problem draws itself."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.report.mujoco_scene import can_draw, film, record
 from verifai_jax.report.style import new_figure
 
 if TYPE_CHECKING:
@@ -17,11 +18,15 @@ MOST_FRAMES = 150
 def animate(replay: "Replay", path: str | Path) -> Path:
     """Write the simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
 
-    The problem's `draw(axes, trace, sample, features)` draws one frame.
+    The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
+    system that is a MuJoCo model.
 
-    **Raises:** `ValueError` for a problem without `draw`.
+    **Raises:** `ValueError` for any other problem without `draw`; `mujoco_scene.NoRenderer` where
+    MuJoCo cannot draw.
     """
     draw = replay.problem.draw
+    if draw is None and can_draw(replay.problem.system):
+        return film(record(replay), path)
     if draw is None:
         raise ValueError(
             f"problem {replay.problem.name!r} cannot be animated: it has no draw function "

@@ -1,10 +1,12 @@
 """The pictures of a run in its folder: features.png, robustness.png, worst.png, worst.gif."""
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from verifai_jax.report.animation import animate
 from verifai_jax.report.budget import plot_budget
+from verifai_jax.report.mujoco_scene import NoRenderer, can_draw, film, record, strip
 from verifai_jax.report.scatter import plot_features
 from verifai_jax.report.worst import plot_replay
 
@@ -28,7 +30,11 @@ def draw_run(run: "Run", folder: str | Path) -> list[Path]:
 
 
 def draw_replay(replay: "Replay", folder: str | Path, name: str | None = None) -> list[Path]:
-    """Draw one simulation into `folder`, animated too where its problem can; returns the paths."""
+    """Draw one simulation into `folder`, animated too where its problem can; returns the paths.
+
+    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo cannot draw,
+    one line is logged that says what to do, and its pictures are left out.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     name = name or ("replay" if replay.row is None else f"row-{replay.row}")
@@ -36,4 +42,11 @@ def draw_replay(replay: "Replay", folder: str | Path, name: str | None = None) -
     plot_replay(replay, paths[0])
     if replay.problem.draw is not None:
         paths.append(animate(replay, folder / f"{name}.gif"))
+    elif can_draw(replay.problem.system):
+        try:
+            motion = record(replay)
+            paths.append(strip(motion, folder / f"{name}-strip.png"))
+            paths.append(film(motion, folder / f"{name}.gif"))
+        except NoRenderer as error:
+            logging.getLogger(__name__).warning("%s", error)
     return paths

@@ -81,10 +81,14 @@ def record(replay: "Replay") -> Motion:
     def positions(time: Any, state: Any, control: Any, features: Any) -> dict[str, Any]:
         return {"qpos": state.qpos}
 
-    recorder = replace(system, loop=replace(loop, signals=positions))
+    # Kept with the problem, as it is compiled once.
+    engines = replay.problem.engines
+    if "recorder" not in engines:
+        recorder = replace(system, loop=replace(loop, signals=positions))
+        engines["recorder"] = recorder if recorder.black_box else jax.jit(recorder)
+    simulate = engines["recorder"]
     precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
     with jax.enable_x64(precise):
-        simulate = recorder if recorder.black_box else jax.jit(recorder)
         trace = simulate(features, getattr(replay, "key", None))
         qpos = np.asarray(trace["qpos"], np.float64)[:samples]
         clock = np.asarray(replay.trace.clock(), np.float64)
@@ -200,7 +204,7 @@ def frames(
         for sample in samples:
             data.time = motion.clock[sample]
             data.qpos[:] = motion.qpos[sample]
-            mujoco.mj_forward(model, data)
+            mujoco.mj_fwdPosition(model, data)
             picture = draw(data, view, option, _arrows(motion, data, sample))
             drawn.append(_labelled(picture, motion, sample))
     return drawn
@@ -241,7 +245,8 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
                 kind = mujoco.mjtGeom.mjGEOM_ARROW
                 mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), ARROW)
                 # An arrow is drawn half as long as its geom says.
-                mujoco.mjv_connector(geom, kind, 0.01 * model.stat.extent, tail, 2 * tip - tail)
+                thick = 0.05 * float(np.linalg.norm(tip - tail))
+                mujoco.mjv_connector(geom, kind, thick, tail, 2 * tip - tail)
                 scene.ngeom += 1
             mujoco.mjr_render(area, scene, pen)
             pixels = np.empty((height, width, 3), np.uint8)
@@ -255,19 +260,22 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """An arrow for each body that is pushed, its tip near the body's centre of mass.
+    """An arrow for each body that is pushed, its tip where the body begins.
 
     The greatest force of the motion is drawn a fifth of the model's extent long.
     """
-    forces, extent = motion.pushes[..., :3], motion.model.stat.extent
+    model, forces = motion.model, motion.pushes[..., :3]
     greatest = float(np.linalg.norm(forces, axis=-1).max(initial=0.0))
     arrows = []
     for body, force in enumerate(forces[sample]):
-        length = float(np.linalg.norm(force))
-        if length > 0.02 * greatest:
-            way = force / length
-            tip = data.xipos[body] - 0.05 * extent * way
-            arrows.append((tip - 0.2 * extent * length / greatest * way, tip))
+        strength = float(np.linalg.norm(force))
+        if strength > 0.02 * greatest:
+            way = force / strength
+            # The first size of most shapes is their radius or half their width.
+            radius = model.geom_size[model.geom_bodyid == body, 0].max(initial=0.0)
+            tip = data.xipos[body] - 1.2 * radius * way
+            longest = max(0.2 * model.stat.extent, 3.0 * radius)
+            arrows.append((tip - longest * strength / greatest * way, tip))
     return arrows
 
 
