@@ -166,6 +166,7 @@ def run(*arguments, stdin=None):
     )
 
 
+@pytest.mark.slow  # Ctrl-C is tested with such a function, too.
 def test_a_function_of_the_script_itself(tmp_path):
     done = run(script(tmp_path, SCRIPT + "\n    if __name__ == '__main__':\n        main()\n"))
     assert done.returncode == 0, done.stderr

@@ -159,6 +159,11 @@ class BlackBox:
         """The form of the traces, if it is declared; see `Problem.check`."""
         return self.simulation.declared.abstract
 
+    @property
+    def check(self) -> Callable[[Any], None] | None:
+        """A function that refuses features which do not fit, if the simulator has one."""
+        return getattr(self.simulation.function, "check", None)
+
 
 @dataclass(frozen=True, eq=False)
 class PooledBlackBox:
@@ -185,6 +190,11 @@ class PooledBlackBox:
     def abstract(self) -> Callable[[Any], Trace] | None:
         """The form of the traces, if it is declared; see `Problem.check`."""
         return self.simulation.declared.abstract
+
+    @property
+    def check(self) -> Callable[[Any], None] | None:
+        """A function that refuses features which do not fit, if the simulator has one."""
+        return getattr(self.simulation.function, "check", None)
 
     def close(self) -> None:
         """End the workers. The next simulation starts new ones."""

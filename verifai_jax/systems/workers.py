@@ -350,8 +350,11 @@ def _setup(simulation: Any, function: Any) -> bytes:
                 "workers"
             )
     module = getattr(function, "__module__", None) or type(function).__module__
-    file = getattr(sys.modules.get(module), "__file__", None)
-    return pickle.dumps((pickled, main, module, file))
+    # Those that are loaded by their file are not found by their name: a target of the command line.
+    files = {n: m.__file__ for n, m in sys.modules.items() if n.startswith("_target_")}
+    files = {name: file for name, file in files.items() if name.encode() in pickled}
+    files.setdefault(module, getattr(sys.modules.get(module), "__file__", None))
+    return pickle.dumps((pickled, main, files))
 
 
 def _guard() -> str:
@@ -371,11 +374,12 @@ def work(fd: int) -> None:
     simulation, problem = None, ""
     _preparing = True
     try:
-        pickled, main, module, file = pickle.loads(pipe.recv_bytes())
+        pickled, main, files = pickle.loads(pipe.recv_bytes())
         if main is not None:
             spawn.prepare(main)
-        elif module not in sys.modules:
-            _import(module, file)
+        for module, file in files.items():
+            if module not in sys.modules:
+                _import(module, file)
         simulation = pickle.loads(pickled)
     except BaseException as error:
         problem = f"a worker process could not import the simulator: {_text(error)}"
