@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from verifai_jax.cli import main
+from verifai_jax.doctor import bad_pairs
 from verifai_jax.run import load
 
 ROOT = Path(__file__).parent.parent
@@ -162,6 +163,23 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
         assert "does not say which problem of this project" in result.output
     output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")
     assert "robustness" in output
+
+
+def test_precision_of_a_run(call, tmp_path):
+    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", "32", "--precision", "float64",
+         "--out", str(tmp_path / "run"), "--no-pictures")  # fmt: skip
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (record["precision"], record["backend"]) == ("float64", None)
+    output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=1)
+    assert "has no backends to choose from; got backend 'native'" in output
+
+
+def test_doctor_knows_what_does_not_go_together():
+    assert bad_pairs({"brax": "0.14.2", "mujoco": "3.4.0", "jax": "0.10.2"}) == []
+    (told,) = bad_pairs({"brax": "0.14.2", "mujoco": "4.0.0", "gymnax": None, "jax": "0.10.2"})
+    assert told.startswith("brax 0.14.2 with mujoco 4.0.0: its spring")
+    (told,) = bad_pairs({"gymnax": "0.0.9", "jax": "0.10.2"})
+    assert "pip install 'gymnax>=1.0.1'" in told
 
 
 def test_doctor(call):

@@ -56,7 +56,13 @@ from verifai_jax.run import Replay as Replay
 from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load
 from verifai_jax.systems import blackbox as blackbox
+from verifai_jax.systems import gymnax as gymnax
+from verifai_jax.systems import mjx as mjx
+from verifai_jax.systems import mujoco as mujoco
+from verifai_jax.systems import native as native
 from verifai_jax.systems import ode as ode
+from verifai_jax.systems import remote as remote
+from verifai_jax.systems import scaled as scaled
 from verifai_jax.systems import sin_cos as sin_cos
 from verifai_jax.table import ErrorTable as ErrorTable
 from verifai_jax.trace import Status as Status

@@ -60,6 +60,8 @@ def main(traceback: bool) -> None:
 @click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
 @click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
+@click.option("--precision", type=click.Choice(["float32", "float64"]), help="[default: float32]")
+@click.option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
 @click.option("--out", type=click.Path(path_type=Path), help="Run folder [runs/NAME-1, -2, ...].")
 @click.option("--pictures/--no-pictures", default=True, help="Draw pictures into the run folder.")
 def falsify(
@@ -76,6 +78,8 @@ def falsify(
     decide: float | None,
     warm_start: Path | None,
     resume: Path | None,
+    precision: str | None,
+    backend: str | None,
     out: Path | None,
     pictures: bool,
 ) -> None:
@@ -95,6 +99,7 @@ def falsify(
     if resume is not None:
         fixed = {"--search": search, "--batch": batch, "--seed": seed, "--out": out}
         fixed |= {"--set": options or None, "--warm-start": warm_start}
+        fixed |= {"--precision": precision, "--backend": backend}
         for option, value in fixed.items():
             if value is not None:
                 raise click.UsageError(f"{option} is fixed in the run that --resume goes on with")
@@ -113,6 +118,8 @@ def falsify(
             seed=0 if seed is None else seed,
             warm_start=None if warm_start is None else load(warm_start),
             folder=out or _next_folder(problem.name),
+            precision=precision or "float32",
+            backend=backend,
             target=target,
             **ends,
         )
@@ -267,7 +274,7 @@ def monitor(
 
 @main.command()
 def doctor() -> None:
-    """Report versions, devices, cores and the compile cache."""
+    """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
     from verifai_jax.doctor import report
 
     click.echo(report())

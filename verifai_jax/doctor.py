@@ -1,4 +1,4 @@
-"""What this machine offers: versions, devices, cores, compile cache.
+"""What this machine offers: versions, devices, cores, compile cache, rendering.
 
 >>> print(report())
 verifai_jax 0.1.0
@@ -8,10 +8,61 @@ verifai_jax 0.1.0
 import importlib.metadata
 import os
 import platform
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from verifai_jax.devices import available_cores, cache_folder
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
+EXTRAS = {
+    "mujoco": "mujoco",
+    "mujoco-mjx": "mujoco",
+    "brax": "brax",
+    "gymnax": "gymnax",
+    "gymnasium": "gymnasium",
+}
+"""Optional package -> the extra of verifai_jax that installs it."""
+
+
+class BadPair(NamedTuple):
+    """Versions that are known not to work together: `[least, below)` of each, None for no bound."""
+
+    package: str
+    versions: tuple[str | None, str | None]
+    other: str
+    others: tuple[str | None, str | None]
+    what: str
+
+
+BAD_PAIRS = (
+    BadPair(
+        "brax",
+        (None, "0.15"),
+        "mujoco",
+        ("4.0", None),
+        "its spring, positional and generalized pipelines fail on models with several joints at "
+        "one body (ant, humanoid); inverted pendulums and hopper work",
+    ),
+    BadPair(
+        "gymnax",
+        (None, "1.0"),
+        "jax",
+        ("0.5", None),
+        "pip fell back to an old gymnax, whose step returns other values; "
+        "pip install 'gymnax>=1.0.1'",
+    ),
+    BadPair(
+        "gymnax",
+        ("1.0", "1.1"),
+        "jax",
+        ("0.12", None),
+        "gymnax asks for jax below 0.12: environments may not import; use Python 3.11 with "
+        "jax 0.10",
+    ),
+)
 
 
 def report() -> str:
@@ -25,11 +76,13 @@ def report() -> str:
         f"Python      {platform.python_version()} on {platform.system()} {platform.machine()}",
     ]
     for package in PACKAGES:
-        try:
-            version = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            version = "missing: pip install verifai_jax installs it"
+        version = _version(package) or "missing: pip install verifai_jax installs it"
         lines.append(f"{package:<12}{version}")
+    installed = {package: _version(package) for package in (*PACKAGES, *EXTRAS)}
+    for package, extra in EXTRAS.items():
+        missing = f"not installed: pip install 'verifai_jax[{extra}]'"
+        lines.append(f"{package:<12}{installed[package] or missing}")
+    lines += [f"  advice: {told}" for told in bad_pairs(installed)]
     devices = jax.devices()
     lines.append(f"devices     {len(devices)} x {devices[0].platform}")
     cores = available_cores()
@@ -40,7 +93,71 @@ def report() -> str:
             "verifai_jax was imported, or VERIFAI_JAX_CORES says so; import verifai_jax first"
         )
     lines.append(f"cache       {_cache_state()}")
+    if installed["mujoco"]:
+        lines.append(f"rendering   {_rendering()}")
     return "\n".join(lines)
+
+
+def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
+    """What is known to go wrong between these versions."""
+    return [
+        f"{pair.package} {installed[pair.package]} with {pair.other} {installed[pair.other]}: "
+        f"{pair.what}"
+        for pair in BAD_PAIRS
+        if _within(installed.get(pair.package), *pair.versions)
+        and _within(installed.get(pair.other), *pair.others)
+    ]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _within(version: str | None, least: str | None, below: str | None) -> bool:
+    if version is None:
+        return False
+    number = _number(version)
+    return (least is None or number >= _number(least)) and (
+        below is None or number < _number(below)
+    )
+
+
+def _number(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+RENDER = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+with mujoco.Renderer(model, 8, 8) as renderer:
+    renderer.update_scene(mujoco.MjData(model))
+    renderer.render()
+"""
+
+
+def _rendering() -> str:
+    # In a process of its own: a graphics library that fails may take the process with it.
+    wanted = os.environ.get("MUJOCO_GL", "egl")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", RENDER],
+            env={**os.environ, "MUJOCO_GL": wanted},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    except subprocess.TimeoutExpired:
+        return f"MUJOCO_GL={wanted} does not answer; MuJoCo scenes are not drawn"
+    if done.returncode == 0:
+        return f"MuJoCo scenes without a screen (MUJOCO_GL={wanted})"
+    last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    return (
+        f"no MuJoCo scenes with MUJOCO_GL={wanted} ({last[:100]}); install libEGL (Mesa), or try "
+        "MUJOCO_GL=osmesa"
+    )
 
 
 def _cache_state() -> str:
