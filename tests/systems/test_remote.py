@@ -17,10 +17,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import verifai_jax as vj
 from verifai_jax import remote_client
-from verifai_jax.systems import server, wire
+from verifai_jax.systems import connection, server, wire
+from verifai_jax.systems.blackbox import Declared
 from verifai_jax.systems.remote import remote
 from verifai_jax.trace import Status
 from verifai_jax.waveform import Waveform
@@ -244,6 +247,40 @@ def test_json_has_no_nan(alien):
         wire.trace_of(message)
 
 
+WHOLE = (
+    remote_client.encoded(1, {"x": np.ones(3), "dt": 0.1}),
+    wire.frame({**GOOD, "valid": 2}),
+    wire.frame({**GOOD, "dt": None, "times": [0, 1]}),
+)
+
+
+@given(
+    st.sampled_from(WHOLE),
+    st.lists(st.tuples(st.floats(0, 1), st.binary(max_size=3)), min_size=1, max_size=5),
+)
+@settings(max_examples=300, deadline=None)
+def test_whatever_comes_is_a_trace_or_a_clear_error(data, changes):
+    for place, new in changes:
+        at = int(place * len(data))
+        data = data[:at] + new + data[at + 1 :]
+    with contextlib.suppress(ValueError, TypeError):  # WireError is a ValueError
+        for message in decoded(data, most=1 << 16) if data else ():
+            Declared(("x",), 0.1).accept(wire.trace_of(message))
+
+
+def test_what_a_stranger_says_cannot_garble_a_log(system, caplog):
+    peer = Peer(system.address, name="\x1b[31mred\r\n")
+    asked = Asked(system, 2)
+    peer.put({**GOOD, "id": peer.points(1)[0]["id"], "signals": {"\x1b[2J\n": [1]}})
+    peer.get()
+    peer.put({"type": "result", "id": peer.points(1)[0]["id"], "error": "\x1b[2J" + "a" * 9000})
+    for outcome in asked.all():
+        assert outcome.message.isprintable()
+        assert len(outcome.message) <= 2000
+    assert "[31mred" in caplog.text
+    assert "\x1b" not in caplog.text
+
+
 def test_features_arrive_as_they_are():
     wave = Waveform(np.array([0.5, -1.0, 2.0], np.float32), "linear", 4.0)
     steps = Waveform(np.arange(4.0), "constant", 2.0)
@@ -327,7 +364,7 @@ def test_a_client_never_has_more_than_its_capacity(system):
 
 
 def test_a_slow_client_is_given_no_more_than_it_works_on(system, monkeypatch):
-    monkeypatch.setattr(server, "SWIFT", 0.0)
+    monkeypatch.setattr(connection, "SWIFT", 0.0)
     peer = Peer(system.address, capacity=32)
     asked = Asked(system, 3)
     for _ in range(3):
@@ -471,7 +508,7 @@ def test_bad_greetings(system, hello, match):
 
 
 def test_one_that_does_not_greet_is_sent_away(system, monkeypatch):
-    monkeypatch.setattr(server, "GREETING_SECONDS", 0.2)
+    monkeypatch.setattr(connection, "GREETING_SECONDS", 0.2)
     peer = Peer(system.address, greet=False)
     peer.socket.sendall(b"\0\0")
     assert peer.refusal() == "no hello came within 0.2 s"

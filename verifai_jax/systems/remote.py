@@ -9,18 +9,21 @@
 `verifai_jax.remote_client` is the other side in Python, `docs/remote.md` the protocol for others.
 """
 
+import atexit
 import ipaddress
 import logging
 import queue
 import socket
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, Self
 
 from verifai_jax.errors import suggests_options
 from verifai_jax.systems import wire
 from verifai_jax.systems.blackbox import Declared, Names, only, plain_leaves, seed_of
-from verifai_jax.systems.server import Batch, Rules, Server
+from verifai_jax.systems.connection import Batch, Rules
+from verifai_jax.systems.server import Server
 from verifai_jax.systems.simulations import Outcome
 from verifai_jax.trace import Trace
 
@@ -28,6 +31,15 @@ log = logging.getLogger("verifai_jax.remote")
 
 MOST_BYTES = 16 << 20
 BOTH = ("127.0.0.1", "::1")
+
+_opened: "weakref.WeakSet[Remote]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    # Otherwise clients would be cut off rather than told that the run has ended.
+    for system in list(_opened):
+        system.close()
 
 
 class Remote:
@@ -109,6 +121,7 @@ class Remote:
             if self._server is None or not self._server.is_alive():
                 self._server = Server(self.rules, _listen(self.host, self.port))
                 self._server.start()
+                _opened.add(self)
                 where = " and ".join(
                     f"{s.getsockname()[0]} port {s.getsockname()[1]}"
                     for s in self._server.listening

@@ -6,124 +6,28 @@ inbox and takes outcomes from a queue. What goes over the wire is `wire`'s.
 """
 
 import contextlib
-import hashlib
-import hmac
 import itertools
 import logging
-import math
 import queue
-import secrets
 import selectors
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
-from verifai_jax.systems import wire
-from verifai_jax.systems.blackbox import Declared
+from verifai_jax.systems import connection, wire
+from verifai_jax.systems.connection import Batch, Client, Point, Rules, keep_alive
 from verifai_jax.systems.simulations import Outcome
 from verifai_jax.trace import Status
 
 log = logging.getLogger("verifai_jax.remote")
 
 TICK = 0.1  # Seconds between two looks at the clock.
-GREETING_SECONDS = 10.0
-GREETING_BYTES = 4096  # Before it has proved its token, a client may not fill our memory.
-LINGER_SECONDS = 2.0  # How long a client that is sent away has to read why.
-# Seconds from a point to its result that make a client's window grow, or shrink: enough points wait
-# at a fast one to keep it busy, and none at a slow one while others idle.
-SWIFT, SLOW = 0.05, 0.2
 MOST_FAULTS = 100
 MOST_CLIENTS = 256
-REMEMBERED = 4096  # Answered points that a client may answer again without being told off.
 REMINDER = 10.0  # Seconds without a client until the log says so; then twice as long, up to 60.
-
-
-@dataclass(frozen=True)
-class Rules:
-    """What a server demands of its clients; see `remote`."""
-
-    token: str | None
-    timeout: float | None
-    retries: int
-    patience: float | None
-    most_bytes: int
-    declared: Declared
-
-
-@dataclass(eq=False)
-class Batch:
-    """The points of one call, whose outcomes go to the caller's thread."""
-
-    outcomes: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
-    cancelled: bool = False
-
-
-@dataclass(eq=False)
-class Point:
-    """One simulation: where its outcome goes, and what has happened to it so far."""
-
-    id: int
-    batch: Batch
-    index: int
-    text: bytes
-    losses: int = 0  # Clients that vanished while they simulated it,
-    lost: float = 0.0  # and when the last one did.
-    handed: float = 0.0
-    ahead: int = 0  # Points that its client had to simulate before.
-
-
-class Client:
-    """One connection."""
-
-    def __init__(self, sock: socket.socket, address: Any) -> None:
-        self.socket = sock
-        self.name = f"{address[0]}:{address[1]}"
-        self.frames = wire.Frames(GREETING_BYTES)
-        self.challenge = secrets.token_hex(16)
-        self.greeted = False
-        self.leaving = False  # It is sent away: what it says is not read any more.
-        self.since = time.monotonic()
-        self.deadline = self.since + GREETING_SECONDS
-        self.out = bytearray()
-        self.writing = False  # Whether the selector waits for room to send.
-        self.capacity = self.parallel = self.window = 1
-        self.has: dict[int, Point] = {}  # In the order in which they were handed out.
-        self.answered: dict[int, None] = {}
-        self.progress = 0.0  # When it last showed that it works.
-        self.faults = 0
-
-    @property
-    def here(self) -> bool:
-        """Whether points may be handed to it."""
-        return self.greeted and not self.leaving
-
-    @property
-    def room(self) -> int:
-        """How many more points it may have now."""
-        return min(self.window, self.capacity) - len(self.has)
-
-    def running(self) -> list[Point]:
-        """The points that it is simulating now, if it goes by their order."""
-        return list(itertools.islice(self.has.values(), self.parallel))
-
-    def send(self, data: bytes) -> None:
-        self.out += data
-
-    def tell(self, message: str, number: int | None = None, fatal: bool = False) -> None:
-        about = {"type": "error", "message": message, "id": number, "fatal": fatal}
-        self.send(wire.frame(about))
-
-    def flush(self) -> None:
-        if self.out:
-            try:
-                sent = self.socket.send(self.out)
-            except (BlockingIOError, InterruptedError):
-                return
-            del self.out[:sent]
 
 
 class Server(threading.Thread):
@@ -202,7 +106,7 @@ class Server(threading.Thread):
     def _close(self, ended: BaseException) -> None:
         for client in self.clients:
             with contextlib.suppress(OSError):
-                client.send(wire.frame({"type": "bye"}))
+                client.out += wire.frame({"type": "bye"})
                 client.flush()
             client.socket.close()
         for sock in (*self.listening, self._wake, self._waker):
@@ -237,14 +141,14 @@ class Server(threading.Thread):
             self._refused_until = time.monotonic() + 1.0
             return
         sock.setblocking(False)
-        _keep_alive(sock)
+        keep_alive(sock)
         client = Client(sock, address)
         self.clients.add(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
         if len(self.clients) > MOST_CLIENTS:
             self._send_away(client, f"there are {MOST_CLIENTS} clients already")
         else:
-            client.send(wire.frame(self._hello(client)))
+            client.hello(self.rules)
         self._flush(client)
 
     def _attend(self, client: Client, events: int) -> None:
@@ -289,11 +193,12 @@ class Server(threading.Thread):
         """Tell a client why, and close the connection when it has had time to read it."""
         if client.leaving:
             return
+        why = wire.printable(why, 1000)
         log.warning("simulator %s is sent away: %s", client.name, why)
         client.tell(why, fatal=True)
         self._release(client, "was sent away")
         client.leaving = True
-        client.deadline = time.monotonic() + LINGER_SECONDS
+        client.deadline = time.monotonic() + connection.LINGER_SECONDS
 
     def _drop(self, client: Client, how: str) -> None:
         if client not in self.clients:
@@ -331,7 +236,8 @@ class Server(threading.Thread):
         for message in client.frames.feed(data):
             match message.header["type"]:
                 case "hello" if not client.greeted:
-                    self._greet(client, message.header)
+                    client.greet(message.header, self.rules)
+                    log.info("simulator %s is here", client.name)
                 case "result" if client.greeted:
                     self._take_back(client, message)
                 case _ if not client.greeted:
@@ -340,54 +246,6 @@ class Server(threading.Thread):
                     raise wire.unknown_type(kind, ["result"])
             if client.leaving:
                 return
-
-    def _hello(self, client: Client) -> dict[str, Any]:
-        declared = self.rules.declared
-        return {
-            "type": "hello",
-            "protocol": wire.PROTOCOL,
-            "challenge": None if self.rules.token is None else client.challenge,
-            "most_bytes": self.rules.most_bytes,
-            "signals": declared.widths or None,
-            "dt": declared.dt,
-            "length": declared.length,
-        }
-
-    def _greet(self, client: Client, hello: dict[str, Any]) -> None:
-        if hello.get("protocol") != wire.PROTOCOL:
-            spoken = wire.brief(hello.get("protocol"))
-            raise wire.WireError(f"this server speaks protocol {wire.PROTOCOL}; got {spoken}")
-        self._authenticate(client, hello)
-        for name, most in (("capacity", 10_000), ("parallel", hello.get("capacity", 1))):
-            value = hello.get(name, 1)
-            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
-                raise wire.WireError(
-                    f"{name} must be an integer from 1 to {most}; got {wire.brief(value)}"
-                )
-            setattr(client, name, value)
-        if isinstance(hello.get("name"), str):
-            client.name = f"{wire.printable(hello['name'])} ({client.name})"
-        client.window = client.parallel
-        client.greeted, client.deadline = True, math.inf
-        client.frames.most = self.rules.most_bytes
-        log.info("simulator %s is here", client.name)
-
-    def _authenticate(self, client: Client, hello: dict[str, Any]) -> None:
-        token = self.rules.token
-        if token is None:
-            return
-        if "proof" in hello:
-            right = hmac.new(token.encode(), client.challenge.encode(), hashlib.sha256).hexdigest()
-            given = hello["proof"]
-        elif "token" in hello:
-            right, given = token, hello["token"]
-        else:
-            raise wire.WireError("this server needs a token: give it, or a proof of it, in hello")
-        # In constant time, so that nobody learns a token letter by letter.
-        if not isinstance(given, str) or not hmac.compare_digest(
-            given.encode(errors="replace"), right.encode()
-        ):
-            raise wire.WireError("the token is wrong")
 
     def _take_back(self, client: Client, message: wire.Message) -> None:
         now, number = time.monotonic(), message.header.get("id")
@@ -406,17 +264,10 @@ class Server(threading.Thread):
             try:
                 outcome = Outcome(self.rules.declared.accept(wire.trace_of(message)))
             except (ValueError, TypeError) as error:
-                outcome = Outcome(None, Status.ERROR, str(error))
-                self._blame(client, str(error), point.id)
-        del client.has[point.id]
-        client.answered[point.id] = None
-        if len(client.answered) > REMEMBERED:
-            del client.answered[next(iter(client.answered))]
-        taken = now - point.handed
-        if taken < SWIFT:
-            client.window = min(client.window + 1, client.capacity)
-        elif taken > SLOW:
-            client.window = max(client.window - 1, client.parallel)
+                wrong = wire.printable(str(error), 1000)
+                outcome = Outcome(None, Status.ERROR, wrong)
+                self._blame(client, wrong, point.id)
+        client.done(point, now)
         self._settle(point, outcome)
 
     def _blame(self, client: Client, what: str, number: int | None = None) -> None:
@@ -466,18 +317,13 @@ class Server(threading.Thread):
         return [client for client in self.clients if client.here and client.room > 0]
 
     def _hand(self, client: Client, points: deque[Point], most: int) -> None:
-        now, texts = time.monotonic(), []
-        while points and len(texts) < most:
+        handed = []
+        while points and len(handed) < most:
             point = points.popleft()
-            if point.batch.cancelled:
-                continue
-            if not client.has:
-                client.progress = now
-            point.handed, point.ahead = now, len(client.has)
-            client.has[point.id] = point
-            texts.append(point.text)
-        if texts:
-            client.send(wire.frame(b'{"type":"work","points":[' + b",".join(texts) + b"]}"))
+            if not point.batch.cancelled:
+                handed.append(point)
+        if handed:
+            client.hand(handed, time.monotonic())
             self._flush(client)
 
     # The clock
@@ -488,36 +334,26 @@ class Server(threading.Thread):
                 if client.leaving:
                     self._drop(client, "")
                 else:
-                    self._send_away(client, f"no hello came within {GREETING_SECONDS:g} s")
+                    self._send_away(
+                        client, f"no hello came within {connection.GREETING_SECONDS:g} s"
+                    )
                     self._flush(client)
             elif self.rules.timeout is not None and client.has:
-                self._look_for_overdue(client, now, self.rules.timeout)
+                self._end_overdue(client, client.overdue(now, self.rules.timeout))
         self._look_for_clients(now)
 
-    def _look_for_overdue(self, client: Client, now: float, timeout: float) -> None:
-        running = client.running()
-        if now - client.progress > timeout:
-            # It shows no progress, so all that it is simulating takes too long.
-            overdue = [point for point in running if now - point.handed > timeout]
-        else:
-            # Others come in meanwhile; each had this long, and those before it as long.
-            overdue = [
-                point
-                for point in running
-                if now - point.handed > timeout * (1 + point.ahead // client.parallel)
-            ]
+    def _end_overdue(self, client: Client, overdue: list[Point]) -> None:
         if not overdue:
             return
+        took = f"took longer than {self.rules.timeout:g} s"
         for point in overdue:
             del client.has[point.id]
-            message = f"the simulation took longer than {timeout:g} s at {client.name}"
+            message = f"the simulation {took} at {client.name}"
             self._settle(point, Outcome(None, Status.TIMEOUT, message))
         # What else it simulates at the moment is no suspect, but it will not be answered here.
-        for point in reversed(client.has.values()):
-            self.waiting.appendleft(point)
+        self.waiting.extendleft(reversed(client.has.values()))
         client.has.clear()
-        ids = ", ".join(str(point.id) for point in overdue)
-        self._send_away(client, f"point {ids} took longer than {timeout:g} s")
+        self._send_away(client, f"point {', '.join(str(point.id) for point in overdue)} {took}")
         self._flush(client)
 
     def _look_for_clients(self, now: float) -> None:
@@ -546,15 +382,3 @@ class Server(threading.Thread):
                 alone,
                 f"[{host}]:{port}" if ":" in host else f"{host}:{port}",
             )
-
-
-def _keep_alive(sock: socket.socket) -> None:
-    """Let the system notice a peer whose machine is gone, within half a minute."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    # Not every system has each of them.
-    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3)):
-        if hasattr(socket, name):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 25_000)
