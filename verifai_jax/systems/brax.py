@@ -211,7 +211,7 @@ def brax(
     - `features`: which feature sets which part of the environment's `sys`, by attributes joined by
       dots: `{"gravity": "opt.gravity[2]", "mass": "link.inertia.mass[pole]"}`. An entry is named by
       its number; of a link (`link...`) or of MuJoCo's arrays (`body_...`, `geom_...`) also by the
-      name that the model gives it. Nothing that MuJoCo or Brax once derived from it is computed again.
+      name that the model gives it. Nothing that was once derived from it is computed again.
     - `configure(sys, features) -> sys`: for anything else; for an environment without `sys`,
       `(env, features) -> env`, with a copy of it.
     - `initial`: which feature sets which entry of the initial position or velocity, by number or by
@@ -361,7 +361,7 @@ def _moment(state: Any, name: str) -> Moment:
         raise ValueError(
             f"{name}: reset, step and initial must return a brax State; got {outline(state)}"
         )
-    return Moment(state, state.obs, jnp.asarray(state.reward), jnp.asarray(state.done, bool))
+    return Moment(state, state.obs, state.reward, state.done)
 
 
 def _named(state: Any) -> dict[str, Any]:

@@ -26,12 +26,12 @@ Decide = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 class Moment(NamedTuple):
-    """What an environment shows after its reset or a step."""
+    """What an environment shows after its reset or a step: one reward, and whether it is over."""
 
     state: Any
     observation: Any
-    reward: Float[Array, ""]
-    over: Bool[Array, ""]
+    reward: Any
+    over: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,11 @@ class Episode:
     see: Callable[..., Mapping[str, Any]]
     steps: int
     dt: float
+
+    def after(self, time: Any, state: Any, action: Any, key: Any) -> Moment:
+        """The moment that a step leads to, `over` as a truth value."""
+        moment = self.step(time, state, action, key)
+        return moment._replace(over=jnp.asarray(moment.over, bool))
 
 
 class _Keys(NamedTuple):
@@ -90,7 +95,7 @@ def rollout(episode: Episode, key: Any) -> Trace:
         seen = episode.see(time, moment, action)
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
-        following = _cast(episode.step(time, state, action, step_key), moment)
+        following = _cast(episode.after(time, state, action, step_key), moment)
         return _where(frozen, carry, (following, after, age + 1)), seen
 
     # One iteration more than there are steps samples the end and moves nothing.
@@ -117,7 +122,7 @@ def _settled(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]
     memory = jax.tree.map(jnp.asarray, episode.memory)
     action, after = jax.eval_shape(episode.decide, first.observation, memory, keys.decide)
     check_like(after, memory, "policy", "(action, memory), its memory in the form of policy_memory")
-    following = jax.eval_shape(episode.step, jnp.zeros(()), first.state, action, keys.step)
+    following = jax.eval_shape(episode.after, jnp.zeros(()), first.state, action, keys.step)
     if jax.tree.structure(first) != jax.tree.structure(following):
         raise ValueError(
             f"{episode.name}: a step must return a state in the form that the start has: "

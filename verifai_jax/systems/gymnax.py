@@ -94,7 +94,7 @@ class Gymnax:
             if self.initial is not None:
                 state = self._placed(state, at_time(features, 0.0), key)
                 observation = self.env.observe(key, state, None, params)
-            return Moment(state, observation, jnp.zeros(()), jnp.array(False))
+            return Moment(state, observation, 0.0, False)
 
         def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
             params = params_at(time)
@@ -102,7 +102,7 @@ class Gymnax:
             observation, state, reward, over, _ = self.env.step_env(key, state, action, params)
             if self.truncate:
                 over = over | self.env.is_truncated(state, params)
-            return Moment(state, observation, jnp.asarray(reward), jnp.asarray(over, bool))
+            return Moment(state, observation, reward, over)
 
         def see(time: Any, moment: Moment, action: Any) -> Any:
             named = {n: v for n, v in _fields(moment.state).items() if n != "time"}
