@@ -28,7 +28,7 @@ PLACES: dict[str, Any] = {
     "height": "joint/ball/qpos[2]",
     "friction": "geom/ball/friction[0]",
     "radius": "geom/ball/size[0]",
-    "drag": "joint/ball/damping[0]",
+    "drag": [f"joint/ball/damping[{i}]" for i in range(3)],
     "wind": "body/ball/force[0]",
 }
 

@@ -1,4 +1,4 @@
-"""What a thrown or rolled ball must do.
+"""What a ball must do that is thrown, or rolled and braked.
 
 verifai-jax falsify specs/ball.py:over --search uniform
 verifai-jax falsify specs/ball.py:halt --search cross_entropy
