@@ -184,6 +184,20 @@ def test_what_text_encodes_is_the_trace():
     np.testing.assert_array_equal(trace["v"], [[1, 2], [3, 4], [5, 6]])
 
 
+def test_the_frame_in_the_manual():
+    text = (ROOT / "docs" / "remote.md").read_text()
+    length, header, raw = re.search(r"\n((?:\w\w ){4})({.*})\n([\w\w ]+)\n", text).groups()
+    data = bytes.fromhex(length) + header.encode() + bytes.fromhex(raw)
+    (message,) = decoded(data)
+    np.testing.assert_array_equal(wire.trace_of(message)["x"], [0.0, 1.0])
+    for block in re.findall(r"```json\n(.*?)```", text, re.DOTALL):
+        decoder, at = json.JSONDecoder(), 0
+        while block[at:].strip():
+            at += len(block[at:]) - len(block[at:].lstrip())
+            example, at = decoder.raw_decode(block, at)
+            assert example["type"] in ("hello", "work", "result")
+
+
 @pytest.mark.parametrize(
     ("data", "match"),
     [

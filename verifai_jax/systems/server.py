@@ -25,7 +25,8 @@ from verifai_jax.trace import Status
 log = logging.getLogger("verifai_jax.remote")
 
 TICK = 0.1  # Seconds between two looks at the clock.
-MOST_FAULTS = 100
+MOST_LOGGED = 20  # Faults of one client.
+MOST_UNREAD = 1 << 20  # Bytes that a client may leave unread while it gives cause for more.
 MOST_CLIENTS = 256
 REMINDER = 10.0  # Seconds without a client until the log says so; then twice as long, up to 60.
 
@@ -130,6 +131,7 @@ class Server(threading.Thread):
 
     def _accept(self, listening: Any) -> None:
         if time.monotonic() < self._refused_until:
+            time.sleep(0.01)  # The socket stays ready for as long as nobody takes the connection.
             return
         try:
             sock, address = listening.accept()
@@ -140,8 +142,12 @@ class Server(threading.Thread):
             log.warning("no further client can connect: %s", error)
             self._refused_until = time.monotonic() + 1.0
             return
-        sock.setblocking(False)
-        keep_alive(sock)
+        try:
+            sock.setblocking(False)
+            keep_alive(sock)
+        except OSError:  # It is gone already.
+            sock.close()
+            return
         client = Client(sock, address)
         self.clients.add(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
@@ -257,7 +263,7 @@ class Server(threading.Thread):
             else:
                 self._blame(client, f"no point {wire.brief(number)} was handed to this client")
             return
-        problem = message.header.get("error")
+        problem, wrong = message.header.get("error"), ""
         if problem is not None:
             outcome = Outcome(None, Status.ERROR, wire.printable(problem, 2000))
         else:
@@ -266,17 +272,20 @@ class Server(threading.Thread):
             except (ValueError, TypeError) as error:
                 wrong = wire.printable(str(error), 1000)
                 outcome = Outcome(None, Status.ERROR, wrong)
-                self._blame(client, wrong, point.id)
         client.done(point, now)
         self._settle(point, outcome)
+        if wrong:
+            self._blame(client, wrong, point.id)
 
     def _blame(self, client: Client, what: str, number: int | None = None) -> None:
         """Tell a client of a fault that concerns one result only."""
-        about = "" if number is None else f" (point {number})"
-        log.warning("simulator %s%s: %s", client.name, about, what)
         client.faults += 1
-        if client.faults > MOST_FAULTS:
-            raise wire.WireError(f"more than {MOST_FAULTS} results were wrong; the last: {what}")
+        if client.faults <= MOST_LOGGED:
+            about = "" if number is None else f" (point {number})"
+            last = "; no more of its faults are logged" if client.faults == MOST_LOGGED else ""
+            log.warning("simulator %s%s: %s%s", client.name, about, what, last)
+        if len(client.out) > MOST_UNREAD:
+            raise wire.WireError("it is told of faults and does not read them")
         client.tell(what, number)
 
     def _settle(self, point: Point, outcome: Outcome) -> None:
