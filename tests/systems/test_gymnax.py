@@ -134,7 +134,6 @@ def test_gradient_that_the_environment_stops_is_refused():
     system = gymnax("CartPole-v1", lean, steps=5, initial={"theta0": "theta"})
     with pytest.raises(ValueError, match=r"CartPole-v1: the environment stops gradients between"):
         jax.eval_shape(jax.grad(lambda t: system({"theta0": t}, KEY)["x"][-1]), 0.1)
-    assert "would be zero, not true" in system.reverse_hint
 
 
 def test_falsified_in_batches():

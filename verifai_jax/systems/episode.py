@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.errors import check_names, unknown_name
+from verifai_jax.systems.horizon import checkpointed_scan
 from verifai_jax.systems.structure import check_like, check_signals, outline
 from verifai_jax.trace import Status, Trace
 from verifai_jax.waveform import is_waveform
@@ -99,8 +100,8 @@ def rollout(episode: Episode, key: Any) -> Trace:
         return _where(frozen, carry, (following, after, age + 1)), seen
 
     # One iteration more than there are steps samples the end and moves nothing.
-    (last, _, age), samples = jax.lax.scan(
-        sample, (first, memory, jnp.int32(0)), jnp.arange(episode.steps + 1)
+    (last, _, age), samples = checkpointed_scan(
+        sample, (first, memory, jnp.int32(0)), episode.steps + 1
     )
     sound = jnp.array(True)
     for leaf in _floats(last):
@@ -280,6 +281,28 @@ def _entry(observation: Any, at: Any, signal: str, name: str) -> Any:
 def _plain(value: Any) -> Any:
     """A vector of one entry as that entry, so that formulas need no index."""
     return value[0] if getattr(value, "shape", None) == (1,) else value
+
+
+def check_features(
+    features: Any, bound: Sequence[str], functions: Sequence[Any], name: str, how: str
+) -> None:
+    """Refuse names of features that do not exist, and features that nothing would read.
+
+    - `bound`: features that set something, `functions`: what a user may have given, and would read
+      any of them; `how`: how one is bound, in words.
+
+    **Raises:** `UnknownNameError`, `ValueError`.
+    """
+    if not isinstance(features, Mapping):
+        if bound:
+            raise ValueError(f"features must be a dictionary; got {outline(features)}")
+        return
+    check_names("feature", bound, features)
+    if any(map(callable, functions)):
+        return
+    for feature in features:
+        if feature not in bound:
+            raise ValueError(f"feature {feature!r} changes nothing in {name}: bind it by {how}")
 
 
 def at_time(features: Any, time: Any) -> Any:

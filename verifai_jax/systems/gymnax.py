@@ -28,6 +28,7 @@ from verifai_jax.systems.episode import (
     Episode,
     Moment,
     at_time,
+    check_features,
     check_signals_option,
     deciding,
     inputs_used,
@@ -74,15 +75,10 @@ class Gymnax:
         """Simulated seconds."""
         return self.steps * self.dt
 
-    @property
-    def reverse_hint(self) -> str:
-        """Why derivatives may not exist."""
-        return f"{self.env.name}: {_STOPS}" if not self.env.transition_gradients_enabled else ""
-
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one episode, not reset at its end."""
         features = bound(features, self.duration)
-        self._check(features)
+        self.check(features)
         fixed = None if varies(features) else self._configured(features, 0.0)
 
         def params_at(time: Any) -> Any:
@@ -161,23 +157,19 @@ class Gymnax:
         check_names(f"part of {self.env.name}'s state", self.initial.values(), known)
         return state.replace(**{part: features[name] for name, part in self.initial.items()})
 
-    def _check(self, features: Any) -> None:
-        """Refuse names of features that do not exist, and features that nothing would read."""
-        initial = self.initial if isinstance(self.initial, Mapping) else {}
-        if not isinstance(features, Mapping):
-            if self.features or initial:
-                raise ValueError(f"features must be a dictionary; got {outline(features)}")
-            return
-        check_names("feature", [*self.features, *initial], features)
-        functions = (self.configure, self.signals, None if initial else self.initial)
-        if any(map(callable, functions)):
-            return
-        for name in features:
-            if name not in self.features and name not in initial:
-                raise ValueError(
-                    f"feature {name!r} changes nothing in {self.env.name}: bind it by "
-                    f"features={{{name!r}: parameter}} or initial={{{name!r}: part of the state}}"
-                )
+    def check(self, features: Any) -> None:
+        """Refuse features that do not exist, or that nothing would read.
+
+        **Raises:** `UnknownNameError`, `ValueError`.
+        """
+        starts = self.initial if isinstance(self.initial, Mapping) else {}
+        check_features(
+            features,
+            [*self.features, *starts],
+            (self.configure, self.signals, self.initial),
+            self.env.name,
+            "features={feature: parameter} or initial={feature: part of the state}",
+        )
 
 
 @suggests_options
