@@ -18,7 +18,7 @@ from verifai_jax.host import HostEngine
 from verifai_jax.problem import Problem
 from verifai_jax.run import run_keys
 
-WORTH_MEASURING = 10.0
+WORTH_MEASURING = 5.0
 """Seconds that a run must take natively before a slow compiler is asked for a quicker program."""
 
 
@@ -67,28 +67,31 @@ def resolved(
         return Choice(problem.on_backend(traced[0]), traced[0], why)
     if not traced or not on_host:
         return Choice(problem.on_backend(candidates[0]), candidates[0])
-    kind = (batch, precision, budget)
-    if kind not in problem.engines.setdefault("backend", {}):
-        problem.engines["backend"][kind] = _fastest(problem, on_host[0], traced[0], *kind)
-    return problem.engines["backend"][kind]
+    return _fastest(problem, on_host[0], traced[0], batch, precision, budget)
 
 
 def _fastest(
     problem: Problem, on_host: str, traced: str, batch: int, precision: str, budget: int
 ) -> Choice:
-    host = problem.on_backend(on_host)
-    speed = _measured(HostEngine(host, precision), host, batch)
-    if budget / speed < WORTH_MEASURING:
-        seconds = f"{budget / speed:.1f} s for all simulations"
-        return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
-    compiled = problem.on_backend(traced)
-    try:
-        engine = engine_for(compiled, batch, precision=precision)
-        engine.compile()
-    except Exception as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
-        return Choice(host, on_host, f"{traced} cannot simulate this model: {first}")
-    other = _measured(engine, compiled, batch)
+    # Measured once for a problem, so that its runs in one process agree on the backend.
+    known = problem.engines.setdefault("speeds", {})
+    host, compiled = problem.on_backend(on_host), problem.on_backend(traced)
+    kinds = [(name, batch, precision) for name in (on_host, traced)]
+    if kinds[0] not in known:
+        known[kinds[0]] = _measured(HostEngine(host, precision), host, batch)
+    speed = known[kinds[0]]
+    if kinds[1] not in known:
+        if budget / speed < WORTH_MEASURING:
+            seconds = f"{budget / speed:.1f} s for all simulations"
+            return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
+        try:
+            engine = engine_for(compiled, batch, precision=precision)
+            engine.compile()
+        except Exception as error:
+            first = (str(error).splitlines() or [type(error).__name__])[0]
+            return Choice(host, on_host, f"{traced} cannot simulate this model: {first}")
+        known[kinds[1]] = _measured(engine, compiled, batch)
+    other = known[kinds[1]]
     told = f"measured {speed:,.0f} simulations/s on {on_host}, {other:,.0f} on {traced}"
     return Choice(compiled, traced, told) if other > speed else Choice(host, on_host, told)
 

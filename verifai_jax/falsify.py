@@ -392,11 +392,19 @@ def check_search(problem: Any, search: Any) -> Search:
     return search
 
 
+def _why_not_traced(system: Any) -> str:
+    """What a system with several backends says of those that JAX could trace."""
+    if "mjx" in getattr(system, "backends", ("mjx",)) or not hasattr(system, "why_not"):
+        return ""
+    return f". It does not run on mjx: {system.why_not('mjx')}"
+
+
 def _check_gradient(problem: Problem, search: Search) -> None:
     if problem.black_box and search.wants_gradient:
+        why = _why_not_traced(problem.system)
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
-            f"search {search!r} needs one; use one that does not, such as 'cross_entropy'"
+            f"search {search!r} needs one; use one that does not, such as 'cross_entropy'{why}"
         )
 
 

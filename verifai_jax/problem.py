@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from verifai_jax.errors import unknown_name
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
@@ -99,15 +98,13 @@ class Problem:
     def on_backend(self, backend: str) -> "Problem":
         """The same problem on one backend of its system, made once: it keeps what it compiles.
 
-        A problem whose system has one backend only, or is on this one already, is itself.
+        A problem whose system has no backends, or is on this one already, is itself.
 
-        **Raises:** `UnknownNameError` for a backend that the system lacks.
+        **Raises:** what the system's `with_backend` does, for one that it lacks.
         """
         system: Any = self.system
         if not getattr(system, "backends", ()) or system.backend == backend:
             return self
-        if backend not in system.backends:
-            raise unknown_name("backend", backend, (*system.backends, "auto"))
         made = self.engines.setdefault("backends", {})
         if backend not in made:
             made[backend] = replace(self, system=system.with_backend(backend))
