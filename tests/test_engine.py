@@ -139,7 +139,7 @@ def test_forward_and_reverse_agree(d):
 
     u = jnp.asarray(points(1, d)[0])
     wanted = jax.grad(lambda u: objective(u)[0])(u)
-    for derivative in (Derivative(d), Derivative(d).forward_instead()):
+    for derivative in (Derivative(d), Derivative(d).by("forward")):
         gradient, auxiliary = jax.jit(lambda u, f=derivative: f(objective, u))(u)
         np.testing.assert_allclose(gradient, wanted, atol=1e-6)
         np.testing.assert_allclose(auxiliary["sum"], u.sum(), rtol=1e-6)

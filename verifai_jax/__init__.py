@@ -56,6 +56,8 @@ from verifai_jax.run import Replay as Replay
 from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load
 from verifai_jax.systems import blackbox as blackbox
+from verifai_jax.systems import brax as brax
+from verifai_jax.systems import gymnasium as gymnasium
 from verifai_jax.systems import gymnax as gymnax
 from verifai_jax.systems import mjx as mjx
 from verifai_jax.systems import mujoco as mujoco

@@ -101,7 +101,7 @@ class Engine:
     - `problem`: a checked `Problem` whose system JAX can trace.
     - `batch`: rows of a call at most; fewer are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
-    - `devices`: JAX devices to split the batch over; all of the default backend when left out.
+    - `devices`: JAX devices to split the batch over; all of this process when left out.
     - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
 
     `notes` says, once compiled, what was decided and would surprise.
@@ -119,7 +119,7 @@ class Engine:
         self.batch = batch
         self.gradient = gradient
         self.precision = precision
-        devices = jax.devices() if devices is None else devices
+        devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
         per_device = -(-batch // len(self.devices))
@@ -204,7 +204,7 @@ class Engine:
         except ValueError as error:
             if not (self.gradient and self._derivative.reverse and reverse_refused(error)):
                 raise
-        self._derivative = self._derivative.forward_instead()
+        self._derivative = self._derivative.by("forward")
         hint = getattr(self.problem.system, "reverse_hint", "")
         self.notes = (f"{self._derivative.told()}{f': {hint}' if hint else ''}",)
         return trace()

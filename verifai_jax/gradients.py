@@ -27,16 +27,16 @@ class Derivative:
     """The gradient of an objective over `dim` coordinates; `reverse` says by which mode."""
 
     dim: int
-    forced_forward: bool = False
+    mode: str | None = None
 
     @property
     def reverse(self) -> bool:
         """Whether one reverse sweep is taken."""
-        return self.dim > FORWARD_LIMIT and not self.forced_forward
+        return self.mode == "reverse" or (self.mode is None and self.dim > FORWARD_LIMIT)
 
-    def forward_instead(self) -> "Derivative":
-        """The same by forward sweeps, for a model that reverse mode refuses."""
-        return replace(self, forced_forward=True)
+    def by(self, mode: str) -> "Derivative":
+        """The same by `"forward"` sweeps or by one `"reverse"` sweep, whatever the dimension."""
+        return replace(self, mode=mode)
 
     def told(self) -> str:
         """What forward mode costs, for people."""

@@ -192,7 +192,7 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
     split, whole = PartitionSpec("seed"), PartitionSpec()
     on_devices = jax.shard_map(
         on_device,
-        mesh=Mesh(np.array(jax.devices()), ("seed",)),
+        mesh=Mesh(np.array(jax.local_devices()), ("seed",)),
         in_specs=(split, split, whole),
         out_specs=split,
         check_vma=False,
@@ -209,4 +209,4 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
             programs[len(keys)] = traced.compile()
         return programs[len(keys)](state, keys, first)
 
-    return start, advance, len(jax.devices())
+    return start, advance, len(jax.local_devices())

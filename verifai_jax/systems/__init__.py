@@ -2,6 +2,9 @@
 
 from verifai_jax.systems.blackbox import BlackBox as BlackBox
 from verifai_jax.systems.blackbox import blackbox as blackbox
+from verifai_jax.systems.brax import Brax as Brax
+from verifai_jax.systems.brax import brax as brax
+from verifai_jax.systems.gymnasium import gymnasium as gymnasium
 from verifai_jax.systems.gymnax import gymnax as gymnax
 from verifai_jax.systems.mujoco_bindings import scaled as scaled
 from verifai_jax.systems.mujoco_system import MuJoCo as MuJoCo
