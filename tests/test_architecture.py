@@ -85,6 +85,7 @@ ALLOWED = {
         "trace",
     },
     "analysis": {
+        "backends",
         "engine",
         "errors",
         "features",

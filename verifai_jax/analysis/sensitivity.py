@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.backends import resolved
 from verifai_jax.engine import engine_for
 from verifai_jax.errors import check_names
 from verifai_jax.host import HostEngine
@@ -86,6 +87,7 @@ class Simulator:
     def __init__(
         self, problem: Problem, seed: int, batch: int, of: str | None, gradient: bool = False
     ) -> None:
+        problem = resolved(problem, gradient=gradient, batch=batch).problem
         problem.check()
         self.batch = batch
         self.engine = (
