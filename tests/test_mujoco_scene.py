@@ -4,6 +4,7 @@ import logging
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -92,17 +93,16 @@ def test_what_is_recorded_is_what_was_replayed(seen, motion):
 
 
 def test_the_picture_shows_the_ball_where_it_was(motion, gl):
-    plain = scene.replace(motion, caption="", decisive=None)
-    for sample, picture in zip([0, 10], scene.frames(plain, [0, 10], SIZE), strict=True):
+    for sample, picture in zip([0, 10], scene.frames(motion, [0, 10], SIZE), strict=True):
         x, z = motion.qpos[sample, 0], 1.5 + motion.qpos[sample, 1]
         right, down, width = red(picture)
         assert right == pytest.approx(FOCAL * x / 4, abs=1.5)
         assert down == pytest.approx(FOCAL * (1 - z) / 4, abs=1.5)
         assert width == pytest.approx(FOCAL * 0.4 / 4, abs=2.5)
-    (above,) = scene.frames(plain, [10], SIZE, camera="above")
+    (above,) = scene.frames(motion, [10], SIZE, camera="above")
     assert abs(red(above)[1]) < 1.5
     with pytest.raises(UnknownNameError, match="unknown camera 'sid'; did you mean 'side'"):
-        scene.frames(plain, [0], SIZE, camera="sid")
+        scene.frames(motion, [0], SIZE, camera="sid")
 
 
 def test_film_and_strip(motion, gl, tmp_path):
@@ -111,22 +111,21 @@ def test_film_and_strip(motion, gl, tmp_path):
         for frame in ImageSequence.Iterator(image):
             shown.append(image.info["duration"])
             edges.append(np.asarray(frame.convert("RGB"), int)[60, 1])
-    assert image.size == SIZE
+    assert image.size == (SIZE[0], SIZE[1] + scene.HEADER)
     # Real time, and the end stays.
     assert sum(shown) == 400 + 1500
     # The edge is red on the decisive frame, the last, alone.
     assert edges[-1][0] - edges[-1][1] > 90
     assert edges[-2][0] - edges[-2][1] < 30
     with Image.open(scene.strip(motion, tmp_path / "it.png", count=3, size=(100, 90))) as image:
-        assert image.size == (3 * 100 + 2 * 4, 90)
+        assert image.size == (3 * 100 + 2 * 4, 90 + scene.HEADER)
 
 
 def test_a_push_is_an_arrow(motion, gl):
     pushes = motion.pushes.copy()
     pushes[0, 1, 0] = 5.0
     plain, pushed = (
-        scene.frames(scene.replace(motion, pushes=p, caption="", decisive=None), [0], SIZE)[0]
-        for p in (motion.pushes, pushes)
+        scene.frames(replace(motion, pushes=p), [0], SIZE)[0] for p in (motion.pushes, pushes)
     )
     columns = np.nonzero(np.abs(pushed.astype(int) - plain).max(-1) > 40)[1]
     # It comes from the left and ends at the ball, which is in the middle.

@@ -35,6 +35,9 @@ FRAMES_PER_SECOND = 20
 MOST_FRAMES = 120
 SIZE = (480, 320)  # width and height of a frame in pixels
 COLORS = 128
+AMBIENT = 0.35
+HEADER = 24  # pixels above a frame for its caption
+BACKGROUND = np.array([232, 237, 242], np.uint8)  # where a model has no sky
 ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
 
 
@@ -49,7 +52,7 @@ class Motion:
     - `model`: a `mujoco.MjModel` of its own, with the features in place.
     - `clock`: seconds of each sample.
     - `pushes`: forces and torques on the bodies, from outside.
-    - `caption`: what is written on each frame.
+    - `caption`: what is written above the frames.
     - `decisive`: the sample that decided a failure, None for a simulation that kept its spec.
     """
 
@@ -75,34 +78,28 @@ def record(replay: "Replay") -> Motion:
     system: Any = replay.problem.system
     if not can_draw(system):
         raise ValueError(f"the system of problem {replay.problem.name!r} is no MuJoCo model")
-    features = bound(replay.features, system.duration)
-    loop, samples = system.loop, len(replay.trace.clock())
-
-    def positions(time: Any, state: Any, control: Any, features: Any) -> dict[str, Any]:
-        return {"qpos": state.qpos}
-
-    # Kept with the problem, as it is compiled once.
+    features, loop = bound(replay.features, system.duration), system.loop
+    # Kept with the problem, as they are compiled once.
     engines = replay.problem.engines
     if "recorder" not in engines:
-        recorder = replace(system, loop=replace(loop, signals=positions))
-        engines["recorder"] = recorder if recorder.black_box else jax.jit(recorder)
-    simulate = engines["recorder"]
+        engines["recorder"] = _recorder(system)
+    simulate, placed = engines["recorder"]
+    clock = np.asarray(replay.trace.clock(), np.float64)
+    samples = len(clock)
     precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
     with jax.enable_x64(precise):
         trace = simulate(features, getattr(replay, "key", None))
         qpos = np.asarray(trace["qpos"], np.float64)[:samples]
-        clock = np.asarray(replay.trace.clock(), np.float64)
-        leaves = loop.bindings.leaves(features)
-        acting = [loop.bindings.acting(features, time) for time in clock]
+        times = loop.control_period * np.arange(loop.periods + 1)
+        leaves, acting = placed(features, times)
     model = copy.copy(loop.compiled)
     for name, value in leaves.items():
         owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
         array = getattr(owner, field)
         array[...] = np.asarray(value).reshape(array.shape)
     pushes = np.zeros((samples, model.nbody, 6))
-    for push, now in zip(pushes, acting, strict=True):
-        if "xfrc_applied" in now:
-            push[...] = now["xfrc_applied"]
+    if "xfrc_applied" in acting:
+        pushes[...] = acting["xfrc_applied"][:samples]
     decided = None
     if replay.violated:
         formula = replay.problem.formulas[replay.worst]
@@ -119,6 +116,21 @@ def record(replay: "Replay") -> Motion:
     )
 
 
+def _recorder(system: Any) -> tuple[Any, Any]:
+    """The same system with its positions as the only signal; what features set, compiled."""
+    loop = system.loop
+
+    def positions(time: Any, state: Any, control: Any, features: Any) -> dict[str, Any]:
+        return {"qpos": state.qpos}
+
+    def placed(features: Any, times: Any) -> tuple[Any, Any]:
+        acting = jax.vmap(lambda time: loop.bindings.acting(features, time))(times)
+        return loop.bindings.leaves(features), acting
+
+    recorder = replace(system, loop=replace(loop, signals=positions))
+    return recorder if recorder.black_box else jax.jit(recorder), jax.jit(placed)
+
+
 def film(motion: Motion, path: str | Path, size: tuple[int, int] = SIZE, **camera: Any) -> Path:
     """Write an animated GIF, in real time where it fits into `MOST_FRAMES` frames.
 
@@ -132,7 +144,11 @@ def film(motion: Motion, path: str | Path, size: tuple[int, int] = SIZE, **camer
     count = max(2, min(MOST_FRAMES, round(seconds * FRAMES_PER_SECOND) + 1))
     instants = np.linspace(motion.clock[0], motion.clock[-1], count)
     samples = np.searchsorted(motion.clock, instants - 1e-9).clip(max=len(motion.clock) - 1)
-    drawn = frames(motion, samples.tolist(), size, **camera)
+    plain = frames(motion, samples.tolist(), size, **camera)
+    drawn = [
+        _labelled(frame, motion, sample, motion.caption)
+        for frame, sample in zip(plain, samples, strict=True)
+    ]
     # One palette for all and no dithering, so that what does not move keeps its colour and the file
     # stays small. Half of it is for the colours that there are, however few their pixels, or floor
     # and sky would take them all.
@@ -172,11 +188,12 @@ def strip(
         last = min(last, motion.decisive + max(1, last // 20))
         spread = 1.0 - (1.0 - spread) ** 1.6
     samples = np.unique(np.rint(spread * last).astype(int)).tolist()
-    drawn = frames(motion, samples, size, **camera)
-    gap = np.full((size[1], 4, 3), 255, np.uint8)
-    pieces = [piece for frame in drawn for piece in (frame, gap)][:-1]
+    pieces = []
+    for frame, sample in zip(frames(motion, samples, size, **camera), samples, strict=True):
+        labelled = _labelled(frame, motion, sample, "" if pieces else motion.caption)
+        pieces += [labelled, np.full((len(labelled), 4, 3), 255, np.uint8)]
     path = _folder_of(path)
-    Image.fromarray(np.hstack(pieces)).save(path)
+    Image.fromarray(np.hstack(pieces[:-1])).save(path)
     return path
 
 
@@ -205,8 +222,7 @@ def frames(
             data.time = motion.clock[sample]
             data.qpos[:] = motion.qpos[sample]
             mujoco.mj_fwdPosition(model, data)
-            picture = draw(data, view, option, _arrows(motion, data, sample))
-            drawn.append(_labelled(picture, motion, sample))
+            drawn.append(draw(data, view, option, _arrows(motion, data, sample)))
     return drawn
 
 
@@ -216,6 +232,8 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
 
     `arrows` are pairs of points, tail and tip.
 
+    The model's settings of light and buffers are raised to what such pictures need.
+
     **Raises:** `NoRenderer` where no OpenGL answers.
     """
     mujoco = require("mujoco", extra="mujoco")
@@ -223,6 +241,8 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     # The off-screen buffer is as large as the model says, or the window.
     asked = model.vis.global_
     asked.offwidth, asked.offheight = max(asked.offwidth, width), max(asked.offheight, height)
+    # A model that nobody has looked at yet has little light in it.
+    model.vis.headlight.ambient[:] = np.maximum(model.vis.headlight.ambient, AMBIENT)
     context = None
     try:
         context = _gl()(width, height)
@@ -250,8 +270,10 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
                 scene.ngeom += 1
             mujoco.mjr_render(area, scene, pen)
             pixels = np.empty((height, width, 3), np.uint8)
-            mujoco.mjr_readPixels(pixels, None, area, pen)
-            return pixels[::-1]
+            depth = np.empty((height, width), np.float32)
+            mujoco.mjr_readPixels(pixels, depth, area, pen)
+            # Nothing lies at the far end of the depth buffer, 0 or 1.
+            return np.where(((depth > 0) & (depth < 1))[..., None], pixels, BACKGROUND)[::-1]
 
         yield draw
     finally:
@@ -320,18 +342,19 @@ def _view(mujoco: Any, model: Any, name: str | None) -> Any:
     return view
 
 
-def _labelled(image: Frame, motion: Motion, sample: int) -> Frame:
-    """The caption and the time on a frame; a red edge from the decisive sample on."""
+def _labelled(image: Frame, motion: Motion, sample: int, caption: str) -> Frame:
+    """The caption and the time above a frame; a red edge from the decisive sample on."""
     from PIL import Image, ImageDraw, ImageFont
 
-    picture = Image.fromarray(image)
+    header = np.full((HEADER, *image.shape[1:]), BACKGROUND, np.uint8)
+    picture = Image.fromarray(np.concatenate([header, image]))
     pen = ImageDraw.Draw(picture)
     width, height = picture.size
     font = ImageFont.load_default(size=13)
     failed = motion.decisive is not None and sample >= motion.decisive
     ink = (190, 45, 65) if failed else (48, 50, 61)
-    pen.text((10, 8), motion.caption, fill=ink, font=font)
-    pen.text((width - 10, 8), f"{motion.clock[sample]:.2f} s", fill=ink, font=font, anchor="ra")
+    pen.text((10, 5), caption, fill=ink, font=font)
+    pen.text((width - 10, 5), f"{motion.clock[sample]:.2f} s", fill=ink, font=font, anchor="ra")
     if failed:
         pen.rectangle((0, 0, width - 1, height - 1), outline=ink, width=3)
     return np.asarray(picture)
