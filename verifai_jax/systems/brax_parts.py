@@ -239,5 +239,5 @@ def check_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
             raise ValueError(
                 f"feature {feature!r} sets {place}, which {name} on the backend {env.backend!r} "
                 "does not read. The mjx backend reads MuJoCo's arrays (body_mass, dof_damping, "
-                "...), the others mostly Brax's (link.inertia.mass, dof.damping, ...)"
+                "...), the others mostly Brax's (link.inertia.mass, actuator.gear, ...)"
             )
