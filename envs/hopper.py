@@ -59,14 +59,27 @@ NOMINAL = {
     "push": 0.0,
 }
 
+# The hoppers that the network was trained on: some are heavier, weaker or on smoother ground.
+TRAINED_FOR = {
+    "torso_mass": (3.5, 4.5),
+    "friction": (0.6, 1.2),
+    "strength": (0.85, 1.1),
+    "damping": (0.7, 1.5),
+}
+
 
 class State(NamedTuple):
-    """Positions and speeds of the joints, where the solver begins, and the motors' last signals."""
+    """A hopper in training.
+
+    Positions and speeds of the joints, where the solver begins, the motors' last signals, and what
+    differs from one episode to the next: see `TRAINED_FOR`.
+    """
 
     qpos: Float[Array, "6"]
     qvel: Float[Array, "6"]
     warmstart: Float[Array, "6"]
     control: Float[Array, "3"]
+    body: Float[Array, "4"]
 
 
 def observe(qpos: Float[Array, "6"], qvel: Float[Array, "6"]) -> Float[Array, "11"]:
@@ -140,6 +153,8 @@ def hopper(
 class HopperTask:
     """Run at 1.5 m/s, upright, with little torque; 6 s, cut short by a fall.
 
+    Each episode has a hopper of its own, drawn from `TRAINED_FOR`.
+
     Each step of 0.02 s earns up to 2.5: 1 for being up, 1 for each m/s up to `SPEED`, less for
     lean, torque and its change. About once a second the robot is kicked forward or back.
 
@@ -156,11 +171,13 @@ class HopperTask:
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Near `STANCE`, nearly at rest."""
-        pose, speed = jax.random.split(key)
+        pose, speed, body = jax.random.split(key, 3)
         spread = jnp.array([0.0, 0.0, 0.05, 0.05, 0.05, 0.05])
         qpos = jnp.asarray(STANCE, jnp.float32) + spread * _even(pose, 6)
         spread = jnp.array([0.5, 0.1, 0.3, 0.3, 0.3, 0.3])
-        return State(qpos, spread * _even(speed, 6), jnp.zeros(6), jnp.zeros(3))
+        least, most = jnp.array(list(TRAINED_FOR.values())).T
+        made = least + (most - least) * jax.random.uniform(body, (4,))
+        return State(qpos, spread * _even(speed, 6), jnp.zeros(6), jnp.zeros(3), made)
 
     def step(
         self, key: Key[Array, ""], state: State, action: Float[Array, "3"]
@@ -168,7 +185,7 @@ class HopperTask:
         """One control period."""
         from mujoco import mjx
 
-        model, data = _mjx()
+        model, data = _mjx(state.body)
         data = data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=action
         )
@@ -180,7 +197,8 @@ class HopperTask:
         reward = 1.0 + jnp.clip(speed, -1.0, SPEED) - 2.0 * qpos[2] ** 2
         reward -= 0.05 * jnp.sum(action**2) + 0.1 * jnp.sum((action - state.control) ** 2)
         fallen = (qpos[1] < LOW) | (jnp.abs(qpos[2]) > BENT) | ~jnp.all(jnp.isfinite(qpos))
-        return State(qpos, qvel, data.qacc_warmstart, action), reward, fallen
+        after = State(qpos, qvel, data.qacc_warmstart, action, state.body)
+        return after, reward, fallen
 
     def observe(self, state: State) -> Float[Array, "11"]:
         """See `observe`."""
@@ -200,9 +218,27 @@ def model() -> Any:
     return require("mujoco", extra="mujoco").MjModel.from_xml_path(str(MODEL_FILE))
 
 
+def _mjx(body: Float[Array, "4"]) -> tuple[Any, Any]:
+    """The model of one episode, and a blank state, in MJX.
+
+    Constants that MuJoCo derives from masses soften contacts a little; they stay as they are.
+    """
+    mjx, blank = _nominal()
+    torso_mass, friction, strength, damping = body
+    torso, floor = model().body("torso").id, model().geom("floor").id
+    heavier = torso_mass / mjx.body_mass[torso]
+    changed = {
+        "body_mass": mjx.body_mass.at[torso].set(torso_mass),
+        "body_inertia": mjx.body_inertia.at[torso].multiply(heavier),
+        "geom_friction": mjx.geom_friction.at[floor, 0].set(friction),
+        "actuator_gear": mjx.actuator_gear * strength,
+        "dof_damping": mjx.dof_damping * damping,
+    }
+    return mjx.tree_replace(changed), blank
+
+
 @cache
-def _mjx() -> Any:
-    """The model and a blank state in MJX."""
+def _nominal() -> tuple[Any, Any]:
     mjx = require("mujoco.mjx", extra="mujoco")
     # Tracing must not leak into what the cache keeps.
     with jax.ensure_compile_time_eval():
