@@ -1,4 +1,5 @@
 import contextlib
+import gc
 import hashlib
 import hmac
 import json
@@ -646,6 +647,18 @@ def test_a_closed_server_ends_the_run_with_an_error():
     system.close()
     thread.join(timeout=5)
     assert failure == ["the server for remote simulators was closed"]
+
+
+def test_one_that_is_forgotten_closes_its_port():
+    system = remote()
+    address = system.address
+    peer = Peer(address)
+    until(lambda: len(system.clients) == 1)
+    del system
+    gc.collect()
+    assert peer.get() == {"type": "bye"}
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(address, timeout=5)
 
 
 def test_points_of_a_caller_that_stops_are_dropped(system):

@@ -1,3 +1,4 @@
+import gc
 import os
 import signal
 import subprocess
@@ -75,6 +76,16 @@ def test_workers_are_used_again_and_end_with_the_pool(troublesome):
     troublesome.close()
     assert not any(alive(pid) for pid in pids)
     assert outcomes(troublesome, [{"a": 0}])[0].status == Status.OK
+
+
+def test_a_pool_that_is_forgotten_ends_its_workers():
+    system = blackbox(host_systems.troublesome, workers=1)
+    (outcome,) = outcomes(system, [{"a": 9}])
+    pid = int(outcome.trace["x"][0])
+    assert alive(pid)
+    del system
+    gc.collect()
+    assert not alive(pid)
 
 
 def test_a_death_is_survived_by_a_retry(troublesome, tmp_path):

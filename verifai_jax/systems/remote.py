@@ -9,7 +9,6 @@
 `verifai_jax.remote_client` is the other side in Python, `docs/remote.md` the protocol for others.
 """
 
-import atexit
 import ipaddress
 import logging
 import queue
@@ -31,15 +30,6 @@ log = logging.getLogger("verifai_jax.remote")
 
 MOST_BYTES = 16 << 20
 BOTH = ("127.0.0.1", "::1")
-
-_opened: "weakref.WeakSet[Remote]" = weakref.WeakSet()
-
-
-@atexit.register
-def _close_all() -> None:
-    # Otherwise clients would be cut off rather than told that the run has ended.
-    for system in list(_opened):
-        system.close()
 
 
 class Remote:
@@ -121,7 +111,8 @@ class Remote:
             if self._server is None or not self._server.is_alive():
                 self._server = Server(self.rules, _listen(self.host, self.port))
                 self._server.start()
-                _opened.add(self)
+                # Clients are told that the run has ended, not cut off, whoever forgot to close it.
+                weakref.finalize(self, self._server.stop)
                 where = " and ".join(
                     f"{s.getsockname()[0]} port {s.getsockname()[1]}"
                     for s in self._server.listening

@@ -62,7 +62,9 @@ class Server(threading.Thread):
         """Send all clients away and end the thread."""
         if self.is_alive():
             self._tell(None)
-            self.join(timeout=5.0)
+            # Garbage is collected in any thread, in this one, too.
+            if threading.current_thread() is not self:
+                self.join(timeout=5.0)
 
     def _tell(self, what: Any) -> None:
         self._inbox.put(what)

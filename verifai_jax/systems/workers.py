@@ -5,7 +5,6 @@ into it, and in a session of its own: Ctrl-C reaches this process only, and a wo
 takes along what it has started.
 """
 
-import atexit
 import importlib
 import importlib.util
 import logging
@@ -78,9 +77,9 @@ class Pool:
         self.workers, self.timeout, self.retries = workers, timeout, retries
         self._setup = _setup(simulation, function)
         self._slots = threading.Semaphore(workers)
-        self._idle: list[_Worker] = []
-        self._lock = threading.Lock()
-        _pools.add(self)
+        self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
+        # When nobody can use it any more, and at the interpreter's exit.
+        weakref.finalize(self, _end, self._idle)
 
     def outcomes(
         self, features: Sequence[Any], seeds: Sequence[int]
@@ -116,12 +115,7 @@ class Pool:
 
     def close(self) -> None:
         """Let the idle workers end; those that work are ended by their batch."""
-        with self._lock:
-            idle, self._idle = self._idle, []
-        for worker in idle:
-            worker.pipe.close()
-        for worker in idle:
-            worker.end()
+        _end(self._idle)
 
     def _work(self, batch: "_Batch") -> None:
         """Simulate what is left of the batch in one worker after the other; runs in a thread."""
@@ -161,42 +155,46 @@ class Pool:
                 if batch.stopped:
                     worker.end()
                 else:
-                    with self._lock:
-                        self._idle.append(worker)
+                    self._idle.append(worker)
             self._slots.release()
 
     def _worker(self, batch: "_Batch") -> "_Worker":
         """An idle worker that lives, or a new one that is ready."""
         while True:
-            with self._lock:
-                worker = self._idle.pop() if self._idle else None
-            if worker is None:
+            try:
+                worker = self._idle.pop()
+            except IndexError:
                 break
             if worker.process.poll() is None:
                 batch.enter(worker)
                 return worker
             worker.end()
-        worker = _Worker(self._setup)
-        batch.enter(worker)
-        try:
-            if worker.ready():
-                return worker
-        except StartError:
+        end = ""
+        for _ in range(self.retries + 1):
+            worker = _Worker(self._setup)
+            batch.enter(worker)
+            try:
+                if worker.ready():
+                    return worker
+            except StartError:
+                batch.leave(worker)
+                worker.end()
+                raise
             batch.leave(worker)
-            worker.end()
-            raise
-        batch.leave(worker)
-        raise StartError(f"{worker.end()} before it was ready to simulate")
+            end = worker.end()
+            if batch.stopped:
+                break
+        raise StartError(f"{end} before it was ready to simulate")
 
 
-# Open pools, so that interpreter exit ends their workers while threads can still be joined.
-_pools: "weakref.WeakSet[Pool]" = weakref.WeakSet()
-
-
-@atexit.register
-def _close_all() -> None:
-    for pool in list(_pools):
-        pool.close()
+def _end(idle: "list[_Worker]") -> None:
+    """Let these workers end, all at a time."""
+    ending = []
+    while idle:
+        ending.append(idle.pop())
+        ending[-1].pipe.close()
+    for worker in ending:
+        worker.end()
 
 
 class _Batch:
