@@ -139,6 +139,21 @@ def test_refuses_bad_options(options, match):
         blackbox(host_systems.decay, **options)
 
 
+def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
+    (tmp_path / "licensed.py").write_text(
+        "from verifai_jax.systems import workers\n"
+        "if workers._preparing:\n    raise ImportError('no licence left')\n"
+        "def simulate(features): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    import licensed  # pyright: ignore[reportMissingImports]
+
+    system = blackbox(licensed.simulate, workers=1)
+    match = "a worker process could not import the simulator: ImportError: no licence left"
+    with pytest.raises(workers.StartError, match=match):
+        list(system.simulate_each([{}], [0]))
+
+
 def test_ways_in_which_a_worker_dies_are_named():
     assert workers._manner(3) == "ended with exit code 3"
     assert workers._manner(-11) == "was killed by SIGSEGV"
