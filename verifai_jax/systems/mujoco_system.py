@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.errors import suggests_options, unknown_name
-from verifai_jax.systems import mjx as in_jax
+from verifai_jax.systems.mjx import reverse_hint, rollout, why_not
 from verifai_jax.systems.mujoco_bindings import Bound, bindings
 from verifai_jax.systems.mujoco_loop import Loop, Signals
 from verifai_jax.systems.mujoco_model import load
@@ -53,7 +53,7 @@ class MuJoCo:
         """Why an engine cannot simulate this model; None where it can."""
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
-        return None if backend == "native" else in_jax.why_not(self.loop.bindings)
+        return None if backend == "native" else why_not(self.loop.bindings)
 
     def with_backend(self, name: str) -> "MuJoCo":
         """The same system on one engine, or on `"auto"`.
@@ -72,7 +72,7 @@ class MuJoCo:
     @cached_property
     def reverse_hint(self) -> str | None:
         """What makes reverse mode work, where it does not."""
-        return in_jax.reverse_hint(self.loop.compiled)
+        return reverse_hint(self.loop.compiled)
 
     def check(self, features: Any) -> None:
         """Refuse features that the system does not fit; nothing compiles.
@@ -111,7 +111,7 @@ class MuJoCo:
         features = bound(features, self.duration)
         if not self.black_box:
             self.loop.check(features)
-            return in_jax.rollout(self.loop, features, key)
+            return rollout(self.loop, features, key)
         key = jax.random.key(0) if key is None else key
         batch = self.simulate_batch(
             jax.tree.map(lambda leaf: np.asarray(leaf)[None], features), jnp.asarray(key)[None]
