@@ -17,6 +17,8 @@ from verifai_jax.waveform import Waveform
 
 package = pytest.importorskip("gymnax")
 
+from gymnax.wrappers.purerl import StickyActionWrapper  # noqa: E402
+
 from verifai_jax.systems.gymnax import gymnax  # noqa: E402
 
 KEY = jax.random.key(7)
@@ -279,6 +281,9 @@ def test_refuses_policies_and_environments_of_another_kind():
         jax.eval_shape(gymnax("CartPole-v1", vector, steps=2), {}, KEY)
     with pytest.raises(ValueError, match="id of an environment or a gymnax Environment; got 5"):
         gymnax(5, lean)
+    sticky = StickyActionWrapper(package.make("CartPole-v1")[0], 0.5)
+    with pytest.raises(ValueError, match="StickyActionWrapper is a wrapper, whose step resets"):
+        gymnax(sticky, lean)
 
 
 def test_a_missing_or_old_package_is_one_line(monkeypatch):

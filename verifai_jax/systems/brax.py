@@ -77,8 +77,8 @@ class Brax:
     def reverse_hint(self) -> str:
         """Why derivatives in reverse may not exist."""
         return (
-            f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges; "
-            "spring and positional take a fixed number of steps"
+            f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges, "
+            "unless the model asks for one iteration; the other backends have fixed loops"
         )
 
     def __call__(self, features: Any, key: Any = None) -> Trace:

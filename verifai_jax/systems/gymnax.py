@@ -227,11 +227,17 @@ def gymnax(
             raise unknown_name("environment of gymnax", env, package.registered_envs)
         env, own = package.make(env)
         params = own if params is None else params
-    missing = [n for n in ("reset_env", "step_env", "default_params") if not hasattr(env, n)]
-    if missing:
+    parts = ("reset_env", "step_env", "default_params")
+    if missing := [part for part in parts if not hasattr(env, part)]:
         raise ValueError(
             f"env must be the id of an environment or a gymnax Environment; got {env!r}, "
             f"which has no {missing[0]}"
+        )
+    if not hasattr(type(env), "step_env"):
+        # What it passes on is the inner environment's step, without what the wrapper adds.
+        raise ValueError(
+            f"{type(env).__name__} is a wrapper, whose step resets the environment at its end: "
+            "give the environment itself, and do in the policy what the wrapper does"
         )
     if env.supports_transition_gradients and not env.transition_gradients_enabled:
         env = env.with_transition_gradients()
