@@ -66,6 +66,7 @@ from verifai_jax.systems import ode as ode
 from verifai_jax.systems import remote as remote
 from verifai_jax.systems import scaled as scaled
 from verifai_jax.systems import sin_cos as sin_cos
+from verifai_jax.systems import stacked as stacked
 from verifai_jax.table import ErrorTable as ErrorTable
 from verifai_jax.trace import Status as Status
 from verifai_jax.trace import Trace as Trace

@@ -1,7 +1,8 @@
-"""Contract suites: run them on domains and searches of your own.
+"""Contract suites: run them on domains, searches and systems of your own.
 
     check_domain(MyDomain(...))                          # round trips, shapes, table columns
     check_search(MySearch(...), Cube((0, 0, 4)))         # init / ask / tell
+    check_system(my_simulator, space)                    # one clock, same alone and in batches
 
 Each raises `AssertionError` that says which law is broken.
 """
@@ -13,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.features import Domain
+from verifai_jax.features import Domain, FeatureSpace
+from verifai_jax.host import plain
 from verifai_jax.search import Cube, Evaluated, Search
+from verifai_jax.trace import Status, Trace
 
 
 def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
@@ -168,6 +171,124 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
         seen.append(np.concatenate(parts)[:points])
     for other in seen[1:]:
         _same(seen[0], other, "points must not depend on the batch size", exact=True)
+
+
+def check_system(
+    system: Any, space: FeatureSpace, *, samples: int = 4, seed: int = 0, tolerance: float = 1e-5
+) -> None:
+    """Check the contract of a system on random features: pure, one clock, all its ways agree.
+
+    - `tolerance`: by how much signals may differ between the ways to simulate, relative to their
+      largest value.
+
+    **Raises:** `AssertionError` naming the broken law.
+    """
+    points = jax.random.uniform(jax.random.key(seed), (samples, space.dim), jnp.float32)
+    features = jax.jit(jax.vmap(space.unflatten))(points)
+    keys = jax.random.split(jax.random.key(seed), samples)
+    each = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], features) for i in range(samples)]
+    if callable(check := getattr(system, "check", None)):
+        check(jax.eval_shape(space.unflatten, jnp.zeros(space.dim)))
+    on_host = bool(getattr(system, "black_box", False))
+    alone = [system(f, key) for f, key in zip(each, keys, strict=True)]
+    for trace in alone:
+        _check_trace(trace)
+    for trace, f, key in zip(alone, each, keys, strict=True):
+        _agree(trace, system(f, key), 0.0, "a system must give the same trace for the same key")
+    if not on_host:
+        batch: Any = jax.jit(jax.vmap(system))(features, keys)
+        _agree_all(alone, batch, tolerance, "compiled under vmap, and called alone")
+        if callable(getattr(system, "fold", None)):
+            _check_fold(system, features, keys, alone, tolerance)
+    together: Any = getattr(system, "simulate_batch", None)
+    if together is not None and on_host:
+        batch = together(jax.tree.map(np.asarray, features), keys)
+        _agree_all(alone, batch, tolerance, "in a batch, and called alone")
+    one_by_one: Any = getattr(system, "simulate_each", None)
+    if one_by_one is not None:
+        seeds = [int(seed) for seed in jax.vmap(jax.random.bits)(keys)]
+        found = list(one_by_one([jax.tree.map(plain, f) for f in each], seeds))
+        numbers = sorted(i for i, _ in found)
+        assert numbers == list(range(samples)), (
+            f"simulate_each must give each of {samples} indices once; got {numbers}"
+        )
+        for i, outcome in found:
+            message = f"simulation {i} failed only in a batch: {outcome.message}"
+            assert outcome.trace is not None, message
+            _agree(alone[i], outcome.trace, tolerance, "one by one, and called alone")
+    abstract: Any = getattr(system, "abstract", None)
+    if abstract is not None:
+        told = abstract(jax.eval_shape(space.unflatten, jnp.zeros(space.dim)))
+        shapes = {name: tuple(signal.shape) for name, signal in told.signals.items()}
+        given = {name: np.shape(signal) for name, signal in alone[0].signals.items()}
+        assert shapes == given, f"abstract must tell the signals' shapes {given}; got {shapes}"
+
+
+def _check_trace(trace: Any) -> None:
+    assert isinstance(trace, Trace), f"a system must return a Trace; got {type(trace).__name__}"
+    times = np.asarray(trace.clock())
+    assert np.all(np.diff(times) > 0), "sample times must increase"
+    valid = trace.length if trace.valid is None else int(trace.valid)
+    assert 1 <= valid <= trace.length, f"valid must be 1 to {trace.length}; got {valid}"
+    if trace.held:
+        for name, signal in trace.signals.items():
+            rest = np.asarray(signal)[valid - 1 :]
+            assert np.array_equal(rest, np.broadcast_to(rest[:1], rest.shape), equal_nan=True), (
+                f"a trace that says it is held must repeat its last valid sample; {name!r} does not"
+            )
+    if trace.status is None or int(trace.status) == Status.OK:
+        for name in trace.finite:
+            assert np.all(np.isfinite(np.asarray(trace.signals[name]))), (
+                f"signal {name!r} is vouched for as finite and is not"
+            )
+
+
+def _check_fold(system: Any, features: Any, keys: Any, alone: Any, tolerance: float) -> None:
+    names = list(alone[0].signals)
+
+    def totals(features: Any, key: Any) -> Any:
+        def add(carry: Any, sample: Any) -> Any:
+            return {name: carry[name] + jnp.sum(sample[name]) for name in names}
+
+        start = {name: jnp.zeros(()) for name in names}
+        return system.fold(features, key, start, add)
+
+    sums, status = jax.jit(jax.vmap(totals))(features, keys)
+    for i, trace in enumerate(alone):
+        if int(status[i]) != Status.OK:
+            continue
+        held = trace.hold()
+        for name in names:
+            wanted = np.asarray(held.signals[name], np.float64)
+            size = max(np.abs(wanted).sum(), 1e-6)
+            assert abs(float(sums[name][i]) - wanted.sum()) <= max(tolerance, 1e-4) * size, (
+                f"fold must take in each sample, the last again behind the end; {name!r} differs"
+            )
+
+
+def _agree_all(alone: Any, batch: Trace, tolerance: float, ways: str) -> None:
+    for i, trace in enumerate(alone):
+        row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], batch)
+        _agree(trace, row, tolerance, f"a simulation must give the same {ways}")
+
+
+def _agree(one: Trace, other: Trace, tolerance: float, law: str) -> None:
+    assert list(one.signals) == list(other.signals), (
+        f"{law}: signals {list(one.signals)} and {list(other.signals)}"
+    )
+    assert _status(one) == _status(other), f"{law}: status {_status(one)} and {_status(other)}"
+    one, other = one.hold().trim(), other.hold().trim()
+    assert one.length == other.length, f"{law}: {one.length} and {other.length} valid samples"
+    for name, signal in one.signals.items():
+        a, b = np.asarray(signal, np.float64), np.asarray(other.signals[name], np.float64)
+        size = max(np.max(np.abs(np.nan_to_num(a)), initial=0.0), 1.0)
+        assert np.allclose(a, b, rtol=0, atol=tolerance * size, equal_nan=True), (
+            f"{law}: signal {name!r} differs by {np.nanmax(np.abs(a - b)):.3g}"
+        )
+
+
+def _status(trace: Trace) -> str:
+    return Status(0 if trace.status is None else int(trace.status)).name
 
 
 def _evaluate(u: Any, gradient: bool) -> Evaluated:

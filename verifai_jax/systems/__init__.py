@@ -2,6 +2,7 @@
 
 from verifai_jax.systems.blackbox import BlackBox as BlackBox
 from verifai_jax.systems.blackbox import blackbox as blackbox
+from verifai_jax.systems.blackbox import stacked as stacked
 from verifai_jax.systems.brax import Brax as Brax
 from verifai_jax.systems.brax import brax as brax
 from verifai_jax.systems.gymnasium import gymnasium as gymnasium
