@@ -37,14 +37,14 @@ SIZE = (160, 120)
 FOCAL = 60 / np.tan(np.pi / 6)  # pixels
 
 
-def problem(**options):
+def problem(backend="native", **options):
     system = mujoco(
         BALL,
         duration=0.4,
         control_period=0.02,
         bind={"size": "geom/ball/size[0]", "wind": "body/ball/force[0]", "vx": "joint/x/qvel"},
         signals={"z": "joint/z/qpos", "x": "joint/x/qpos"},
-        backend="native",
+        backend=backend,
         **options,
     )
     domains = {"size": vj.Box(0.05, 0.4), "wind": vj.Box(-9, 9), "vx": vj.Box(0, 2)}
@@ -90,6 +90,16 @@ def test_what_is_recorded_is_what_was_replayed(seen, motion):
     assert motion.decisive == 20
     # The system's own model stays as it was.
     assert seen.problem.system.loop.compiled.geom("ball").size[0] == pytest.approx(0.1)
+
+
+@pytest.mark.slow
+def test_what_mjx_simulated_is_recorded_in_mjx():
+    row = {"size": 0.2, "wind": 3.0, "vx": 2.0}
+    for precision in ("float32", "float64"):
+        seen = replay(problem("mjx"), row, jax.random.key(0), 7, precision)
+        motion = scene.record(seen)
+        np.testing.assert_allclose(motion.qpos[:, 0], np.asarray(seen.trace["x"]), rtol=1e-6)
+        np.testing.assert_array_equal(motion.pushes[:, 1, 0], 3.0)
 
 
 def test_the_picture_shows_the_ball_where_it_was(motion, gl):
