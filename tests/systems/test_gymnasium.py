@@ -98,6 +98,65 @@ def test_configure_signals_and_continuous_actions():
     assert trace.dt == 0.05
 
 
+class Rising(gym.Env):
+    """Observes a dictionary, in one and the same array each time."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "height": gym.spaces.Box(-100, 100, (1,), np.float64),
+            "wind": gym.spaces.Box(-100, 100, (2,), np.float64),
+        }
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    speed = 1.0
+
+    def __init__(self):
+        self.seen = {"height": np.zeros(1), "wind": np.zeros(2)}
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.seen["height"][:] = 0.0
+        self.seen["wind"][:] = seed
+        return self.seen, {}
+
+    def step(self, action):
+        self.seen["height"] += self.speed * float(action[0])
+        return self.seen, self.seen["height"][0], False, False, {}
+
+
+class Resetting:
+    """A policy that counts its steps."""
+
+    count = 0
+
+    def reset(self):
+        self.count = 0
+
+    def __call__(self, observation):
+        self.count += 1
+        return 1.0 if self.count < 3 else 0.5
+
+
+def test_dictionaries_and_a_policy_that_remembers():
+    system = gymnasium(
+        Rising,
+        Resetting(),
+        steps=4,
+        features={"fast": "speed"},
+        signals={"height": "height", "wind": "wind"},
+    )
+    for _ in range(2):
+        trace = system({"fast": 2.0}, 7)
+        np.testing.assert_array_equal(trace["height"], [0.0, 2.0, 4.0, 5.0, 6.0])
+        np.testing.assert_array_equal(trace["reward"], [0.0, 2.0, 4.0, 5.0, 6.0])
+        np.testing.assert_array_equal(trace["action"], [1.0, 1.0, 0.5, 0.5, 0.5])
+        np.testing.assert_array_equal(trace["wind"], np.full((5, 2), 7.0))
+        assert (trace.dt, trace.valid) == (1.0, 5)
+    assert system({"fast": np.nan}, 7).status == Status.NONFINITE
+    with pytest.raises(ValueError, match="unknown entry of Rising's observation 'hight'"):
+        gymnasium(Rising, Resetting(), steps=4, signals={"h": "hight"})({}, 0)
+
+
 def test_a_signal_feature_is_set_before_each_step():
     seen = []
 

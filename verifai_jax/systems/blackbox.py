@@ -287,7 +287,7 @@ def blackbox(
       `function` must then be at the top level of a module. One after the other in this process
       when left out. A worker has one core for JAX, no GPU, and no standard output.
     - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
-      `timeout`; needs `workers`.
+      `timeout`; needs `workers`. What a worker's first simulation compiles or loads counts.
     - `retries`: how often a simulation whose process dies is started again, in a new one.
     - `vectorised`: `function` simulates many at a time: arrays of features are `[n, ...]`, `seeds`
       is `[n]`, and so is every array of the trace; see `stacked`.

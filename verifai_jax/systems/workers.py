@@ -74,6 +74,10 @@ class Pool:
             raise ValueError(f"timeout must be a positive number of seconds; got {timeout!r}")
         if not isinstance(retries, int) or isinstance(retries, bool) or retries < 0:
             raise ValueError(f"retries must be an integer of at least 0; got {retries!r}")
+        if os.name != "posix":
+            raise ValueError(
+                "workers need Linux or macOS; leave them out, or use a remote simulator"
+            )
         self.workers, self.timeout, self.retries = workers, timeout, retries
         self._setup = _setup(simulation, function)
         self._slots = threading.Semaphore(workers)
