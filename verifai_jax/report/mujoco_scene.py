@@ -310,7 +310,10 @@ def _gl() -> Any:
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if sys.platform == "linux" and not os.environ.get("MUJOCO_GL") and not screen:
         return importlib.import_module("mujoco.egl").GLContext
-    return importlib.import_module("mujoco.gl_context").GLContext
+    found = getattr(importlib.import_module("mujoco.gl_context"), "GLContext", None)
+    if found is None:
+        raise RuntimeError("drawing is switched off")
+    return found
 
 
 def explained(error: Exception) -> str:
