@@ -150,6 +150,10 @@ class _Connection:
         try:
             self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            # A run whose machine is gone is noticed within half a minute, where this can be set.
+            for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3)):
+                if hasattr(socket, option):
+                    self.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
             self._greet(token, name)
             self.socket.settimeout(None)
         except BaseException:

@@ -61,7 +61,7 @@ class Remote:
     @property
     def clients(self) -> list[str]:
         """Who is connected now."""
-        return [client.name for client in tuple(self._open().clients) if client.greeted]
+        return [client.name for client in tuple(self._open().clients) if client.here]
 
     @property
     def abstract(self) -> Callable[[Any], Trace] | None:
