@@ -89,7 +89,11 @@ def test_cartpole_is_that_of_our_own_equations():
         features=["masspole", "masscart", "length"],
         initial={"x0": "x", "x_dot0": "x_dot", "theta0": "theta", "theta_dot0": "theta_dot"},
     )
-    ours = cp.cartpole(cp.neural(policy), duration=2.0, terminate=True)
+
+    def push(time, state, features):
+        return jnp.where(policy.act(jnp.stack(state)) == 1, 10.0, -10.0)
+
+    ours = cp.cartpole(push, duration=2.0, terminate=True)
     rng = np.random.default_rng(0)
     batch = {
         "x0": rng.uniform(-1, 1, 16),
@@ -149,8 +153,6 @@ def test_falsified_in_batches():
     run = vj.falsify(problem, budget=64, search="halton", batch=64)
     assert 0 < len(run.table.counterexamples) < 64
     assert run.replay(run.table.counterexamples.index[0]).trace.length < 51
-    with pytest.raises(vj.RunError, match="CartPole-v1: the environment stops gradients"):
-        vj.falsify(problem, budget=64, search="gradient", batch=64)
 
 
 def test_time_limit_cuts_only_when_asked():
