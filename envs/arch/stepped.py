@@ -1,0 +1,115 @@
+"""A system given by what happens between two samples: its own solver, its own state machine.
+
+    Stepped(initial, advance, signals, dt=0.01, steps=3000, nominal={"throttle": 50.0})
+
+The benchmark models prescribe solvers, and let discrete logic run at instants of its own, which
+`verifai_jax.systems.ode` has no words for.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from verifai_jax.errors import check_names
+from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.trace import Status, Trace
+from verifai_jax.waveform import bound
+
+Features = Mapping[str, Any]
+Scalar = Float[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """A system `(features, key) -> Trace` with a sample at time 0 and after each of `steps`.
+
+    **Arguments:**
+
+    - `initial(features) -> state`: any pytree of numbers and truth values.
+    - `advance(k, state, features) -> state`: from sample `k` to the next.
+    - `signals(k, state, features) -> dict`: a number for each name, at sample `k`.
+    - `dt`: the sampling period in seconds.
+    - `nominal`: the features that the model has, with their values where they are not given.
+
+    The status of the trace is `NONFINITE` if the last state is NaN or infinite; a model must not
+    recover from such a state.
+    """
+
+    initial: Callable[[Features], Any]
+    advance: Callable[[Int[Array, ""], Any, Features], Any]
+    signals: Callable[[Int[Array, ""], Any, Features], dict[str, Any]]
+    dt: float
+    steps: int
+    nominal: Features = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.steps * self.dt
+
+    def check(self, features: Features) -> None:
+        """Refuse features that the model does not have; it would ignore them."""
+        check_names("feature", features, self.nominal)
+
+    def __call__(self, features: Features, key: Any = None) -> Trace:
+        """Simulate once; nothing is random."""
+        last, _, samples = self._run(features, None, lambda _, seen: (None, seen))
+        return Trace(samples, dt=self.dt, status=_status(last))
+
+    def fold(
+        self, features: Features, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept."""
+        last, carry, _ = self._run(features, carry, lambda c, seen: (update(c, seen), None))
+        return carry, _status(last)
+
+    def _run(self, features: Features, kept: Any, keep: Any) -> tuple[Any, Any, Any]:
+        self.check(features)
+        features = bound({**self.nominal, **features}, self.duration)
+
+        def sample(carry: Any, k: Int[Array, ""]) -> Any:
+            state, kept = carry
+            kept, output = keep(kept, self.signals(k, state, features))
+            following = self.advance(k, state, features)
+            # One iteration more than there are steps samples the last state and stays there: it
+            # costs less than appending one sample to all others.
+            state = jax.tree.map(lambda a, b: jnp.where(k < self.steps, a, b), following, state)
+            return (state, kept), output
+
+        start = (self.initial(features), kept)
+        (last, kept), outputs = checkpointed_scan(sample, start, self.steps + 1)
+        return last, kept, outputs
+
+
+def value(feature: Any, time: Scalar | float) -> Any:
+    """A feature at a time: a function of time, or a number that holds always."""
+    return feature(time) if callable(feature) else jnp.asarray(feature, real())
+
+
+def real() -> Any:
+    """The floating type of this process: double where JAX's x64 is on."""
+    return jnp.result_type(float)
+
+
+def whole(seconds: float, dt: float, name: str) -> int:
+    """How many periods of `dt` make `seconds`.
+
+    **Raises:** `ValueError`, naming the argument, unless it is a whole number of at least 1.
+    """
+    steps = round(seconds / dt) if math.isfinite(seconds) else 0
+    if steps < 1 or abs(steps * dt - seconds) > 1e-6 * dt:
+        raise ValueError(f"{name} must be a positive multiple of {dt:g} s; got {seconds!r}")
+    return steps
+
+
+def _status(last: Any) -> Int[Array, ""]:
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(last):
+        if jnp.issubdtype(leaf.dtype, jnp.inexact):
+            finite &= jnp.all(jnp.isfinite(leaf))
+    return jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
