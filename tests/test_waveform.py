@@ -87,3 +87,14 @@ def test_a_duration_is_needed_and_can_be_given():
 def test_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("hold", ["linear", "constant"])
+@pytest.mark.parametrize("knots", [np.array([1.0, -2.0, 4.0]), np.arange(6.0).reshape(3, 2)])
+def test_on_the_host_it_is_the_same_function_in_numpy(hold, knots):
+    knots = knots.astype(np.float32)
+    host, traced = Waveform(knots, hold, 2.0), Waveform(jnp.asarray(knots), hold, 2.0)
+    for time in (-1.0, 0, 0.3, 2 / 3, 1.0, np.float64(1.7), 2.0, 5.0):
+        value = host(time)
+        assert isinstance(value, np.ndarray | np.float32)
+        np.testing.assert_allclose(value, traced(time), rtol=1e-6)

@@ -58,18 +58,21 @@ class Waveform:
                 "a Signal without a duration cannot be evaluated: give Signal(..., duration=4.0), "
                 "or call features[...].over(4.0)(time)"
             )
-        knots = jnp.asarray(self.knots)
+        # A simulator on the host asks at every step: JAX op by op would take a millisecond each.
+        on_host = isinstance(self.knots, np.ndarray) and isinstance(time, float | int | np.number)
+        xp: Any = np if on_host else jnp
+        knots = xp.asarray(self.knots)
         count = knots.shape[0]
-        place = jnp.asarray(time).astype(knots.dtype) / self.duration
+        place = xp.asarray(time).astype(knots.dtype) / self.duration
         if count == 1:
             return knots[0]
         if self.hold == "constant":
             # An instant at which a piece begins belongs to it, whatever its rounding.
-            piece = jnp.floor(place * count + 1e-5).astype(jnp.int32)
-            return knots[jnp.clip(piece, 0, count - 1)]
-        place = jnp.clip(place, 0.0, 1.0) * (count - 1)
-        left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
-        share = place - left
+            piece = xp.floor(place * count + 1e-5).astype(np.int32)
+            return knots[xp.clip(piece, 0, count - 1)]
+        place = xp.clip(place, 0.0, 1.0) * (count - 1)
+        left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
+        share = (place - left).astype(knots.dtype)
         return knots[left] * (1 - share) + knots[left + 1] * share
 
     def refined(self, factor: int) -> "Waveform":
