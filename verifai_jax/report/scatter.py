@@ -81,7 +81,7 @@ def plot_features(
     rate = run.failure_rate
     figure.suptitle(
         f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples"
-        + (f"\nfailure rate {rate}" if rate is not None else f"\n{run.search}"[:100]),
+        + (f"\nfailure rate {rate}" if rate is not None else f"\nsearch {run.search.split('(')[0]}"),
         fontsize=10,
     )
     return show_or_save(figure, path)
