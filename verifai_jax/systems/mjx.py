@@ -22,6 +22,7 @@ from verifai_jax.trace import Status, Trace
 # What MJX decides once from the model's values, and features may change: it has to see that there
 # is something there.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
+LEAST = 1e-9  # MJX takes a row of friction without friction for an equality.
 
 
 class Physics(NamedTuple):
@@ -169,6 +170,8 @@ def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
     changes = {}
     for name, value in leaves.items():
         old = _leaf(model, name)
+        if name in _SWITCHES:
+            value = jnp.maximum(value, LEAST)
         changes[name] = value.reshape(old.shape).astype(old.dtype)
     model = model.tree_replace(changes)
     if bindings.moves_constants:
@@ -186,9 +189,9 @@ def _put(bindings: Bindings) -> tuple[Any, Any]:
             array, where = binding.place.array, binding.place.index
             if array in _SWITCHES:
                 flat = getattr(compiled, array).reshape(-1)
-                flat[where] = np.maximum(flat[where], 1e-9)
+                flat[where] = np.maximum(flat[where], LEAST)
             if array in ("opt.density", "opt.viscosity", "opt.wind"):
-                compiled.opt.density = max(compiled.opt.density, 1e-9)
+                compiled.opt.density = max(compiled.opt.density, LEAST)
         # Constants of every program that is traced, so never traced themselves.
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(compiled, impl="jax")
