@@ -79,9 +79,9 @@ def plot_features(
         axes.set_visible(False)
     failing, safe = len(run.table.counterexamples), len(run.table.safe)
     rate = run.failure_rate
+    told = f"search {run.search.split('(')[0]}" if rate is None else f"failure rate {rate}"
     figure.suptitle(
-        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples"
-        + (f"\nfailure rate {rate}" if rate is not None else f"\nsearch {run.search.split('(')[0]}"),
+        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples\n{told}",
         fontsize=10,
     )
     return show_or_save(figure, path)
