@@ -10,6 +10,7 @@ from verifai_jax.systems.episode import (
     Moment,
     at_time,
     deciding,
+    folded,
     inputs_used,
     keys_of,
     period,
@@ -60,6 +61,19 @@ def test_what_is_over_is_frozen_and_has_a_finite_gradient():
     np.testing.assert_allclose(trace["level"][end:], levels[-1], atol=1e-5)
     np.testing.assert_allclose(trace["time"], np.minimum(np.arange(31), end - 1) * 0.1, rtol=1e-5)
     assert np.isfinite(float(slope))
+
+
+def test_a_fold_takes_in_the_samples_of_the_trace():
+    def add(carry, sample):
+        return carry[0] + sample["level"], jnp.maximum(carry[1], sample["time"])
+
+    for level, steps in ((1.0, 30), (9.0, 30)):
+        episode = tank(jnp.float32(level), steps=steps)
+        trace = rollout(episode, KEY)
+        (total, latest), status = folded(episode, KEY, (0.0, 0.0), add)
+        assert float(total) == pytest.approx(float(trace["level"].sum()), rel=1e-5)
+        assert float(latest) == float(trace["time"][-1])
+        assert int(status) == int(trace.status) == Status.OK
 
 
 def test_a_state_that_is_not_a_number_is_a_status():

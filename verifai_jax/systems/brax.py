@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from jaxtyping import Array, Int
+
 from verifai_jax.errors import (
     MissingExtra,
     require,
@@ -38,6 +40,7 @@ from verifai_jax.systems.episode import (
     check_features,
     check_signals_option,
     deciding,
+    folded,
     period,
     read,
     rollout,
@@ -83,6 +86,20 @@ class Brax:
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one episode, not reset at its end."""
+        return rollout(self._episode(features), key)
+
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the last step.
+        Returns the carry and the status.
+        """
+        return folded(self._episode(features), key, carry, update)
+
+    def _episode(self, features: Any) -> Episode:
+        """The environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
         fixed = None if varies(features) else self._configured(features, 0.0)
@@ -114,9 +131,8 @@ class Brax:
             action, memory = decide(observation, memory, key)
             return vector_action(action, size, self.name), memory
 
-        return rollout(
-            Episode(self.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt),
-            key,
+        return Episode(
+            self.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
         )
 
     def _configured(self, features: Any, time: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.errors import check_names, unknown_name
 from verifai_jax.systems.horizon import checkpointed_scan
@@ -83,38 +83,53 @@ def rollout(episode: Episode, key: Any) -> Trace:
 
     **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
     """
+    last, age, _, samples = _run(episode, key, None, lambda _, seen: (None, seen))
+    return Trace(samples, dt=episode.dt, valid=age + 1, status=_status(last), held=True)
+
+
+def folded(
+    episode: Episode, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+) -> tuple[Any, Int[Array, ""]]:
+    """`carry = update(carry, sample)` over the samples of `rollout`, of which none is kept.
+
+    Behind the end the last valid sample comes again. Returns the carry and the status.
+    """
+    last, _, carry, _ = _run(episode, key, carry, lambda c, seen: (update(c, seen), None))
+    return carry, _status(last)
+
+
+def _run(episode: Episode, key: Any, kept: Any, keep: Any) -> tuple[Moment, Any, Any, Any]:
+    """The last moment, how many steps were lived, and what `keep` made of the samples."""
     keys = keys_of(key)
     first, memory = _settled(episode, episode.start(keys.start), keys)
 
     def sample(carry: Any, k: Any) -> Any:
-        moment, memory, age = carry
+        (moment, memory, age), kept = carry
         frozen = (k >= episode.steps) | moment.over
         # Time, and with it randomness, stops with the state: what is seen behind the end repeats.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
         action, after = episode.decide(moment.observation, memory, decide_key)
-        seen = episode.see(time, moment, action)
+        kept, output = keep(kept, episode.see(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.after(time, state, action, step_key), moment)
-        return _where(frozen, carry, (following, after, age + 1)), seen
+        return (_where(frozen, carry[0], (following, after, age + 1)), kept), output
 
     # One iteration more than there are steps samples the end and moves nothing.
-    (last, _, age), samples = checkpointed_scan(
-        sample, (first, memory, jnp.int32(0)), episode.steps + 1
+    ((last, _, age), kept), outputs = checkpointed_scan(
+        sample, ((first, memory, jnp.int32(0)), kept), episode.steps + 1
     )
+    return last, age, kept, outputs
+
+
+def _status(last: Moment) -> Int[Array, ""]:
     sound = jnp.array(True)
     for leaf in _floats(last):
         sound &= ~jnp.any(jnp.isnan(leaf))
     for leaf in _floats((last.observation, last.reward)):
         sound &= jnp.all(jnp.isfinite(leaf))
-    return Trace(
-        samples,
-        dt=episode.dt,
-        valid=age + 1,
-        status=jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
-        held=True,
-    )
+    return jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
 
 
 def _settled(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from verifai_jax.errors import (
     MissingExtra,
@@ -31,6 +31,7 @@ from verifai_jax.systems.episode import (
     check_features,
     check_signals_option,
     deciding,
+    folded,
     inputs_used,
     period,
     read,
@@ -77,6 +78,20 @@ class Gymnax:
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one episode, not reset at its end."""
+        return rollout(self._episode(features), key)
+
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the last step.
+        Returns the carry and the status.
+        """
+        return folded(self._episode(features), key, carry, update)
+
+    def _episode(self, features: Any) -> Episode:
+        """The environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
         fixed = None if varies(features) else self._configured(features, 0.0)
@@ -111,18 +126,8 @@ class Gymnax:
             action, memory = decide(observation, memory, key)
             return _fitted(action, self.env.action_space(self.params), self.env.name), memory
 
-        return rollout(
-            Episode(
-                self.env.name,
-                start,
-                step,
-                fitting,
-                self.policy_memory,
-                see,
-                self.steps,
-                self.dt,
-            ),
-            key,
+        return Episode(
+            self.env.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
         )
 
     def _configured(self, features: Any, time: Any) -> Any:
