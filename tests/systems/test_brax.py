@@ -12,6 +12,7 @@ from verifai_jax.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import Discrete, Policy
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.systems.episode import keys_of
+from verifai_jax.testing import check_system
 from verifai_jax.trace import Status
 from verifai_jax.waveform import Waveform
 
@@ -195,6 +196,12 @@ def test_falsified_in_batches(changed):
     )
     run = vj.falsify(problem, "halton", 64, batch=64, progress=False)
     assert 0 < len(run.table.counterexamples) < 64
+
+
+@pytest.mark.slow
+def test_keeps_the_contract_of_systems():
+    system = brax(Slide(), jitter, steps=30, features={"mass": "mass[0]", "drag": "drag"})
+    check_system(system, vj.FeatureSpace({"mass": vj.Box(1.0, 4.0), "drag": vj.Box(0.0, 1.0)}))
 
 
 def test_signal_feature_changes_the_system_as_time_goes_by():

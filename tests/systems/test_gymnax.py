@@ -12,6 +12,7 @@ from verifai_jax.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.systems.episode import keys_of
+from verifai_jax.testing import check_system
 from verifai_jax.trace import Status
 from verifai_jax.waveform import Waveform
 
@@ -153,6 +154,16 @@ def test_falsified_in_batches():
     run = vj.falsify(problem, budget=64, search="halton", batch=64)
     assert 0 < len(run.table.counterexamples) < 64
     assert run.replay(run.table.counterexamples.index[0]).trace.length < 51
+
+
+@pytest.mark.slow
+def test_keeps_the_contract_of_systems():
+    system = gymnax(
+        "CartPole-v1", coin, steps=50, features=["masspole"], initial={"spin": "theta_dot"}
+    )
+    check_system(
+        system, vj.FeatureSpace({"spin": vj.Box(-2.0, 2.0), "masspole": vj.Box(0.05, 0.5)})
+    )
 
 
 def test_time_limit_cuts_only_when_asked():
