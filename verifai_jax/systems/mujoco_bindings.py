@@ -130,9 +130,8 @@ class Bindings:
         shapes["qfrc_applied"] = (compiled.nv,)
         bound = {binding.place.array for binding in self.applied}
         values = {name: jnp.zeros(shapes[name], _float()) for name in APPLIED if name in bound}
-        now = {
-            name: value(time) if is_waveform(value) else value for name, value in features.items()
-        }
+        given = {binding.feature: features[binding.feature] for binding in self.applied}
+        now = {name: value(time) if is_waveform(value) else value for name, value in given.items()}
         return _set(values, self.applied, now, self._base)
 
     def check(self, features: Mapping[str, Any]) -> None:

@@ -24,13 +24,8 @@ from verifai_jax.errors import require, unknown_name
 # Where the numbers of one element lie in an array: at its id, its degrees of freedom, its part of
 # qpos, or in some columns of its row.
 _BODY = {name: f"body_{name}" for name in ("mass", "inertia", "pos", "quat", "ipos", "iquat")}
-_GEOM = {
-    name: f"geom_{name}"
-    for name in (
-        *("size", "pos", "quat", "friction", "margin", "gap"),
-        *("solref", "solimp", "solmix"),
-    )
-}
+_GEOM_FIELDS = ("size", "pos", "quat", "friction", "margin", "gap", "solref", "solimp", "solmix")
+_GEOM = {name: f"geom_{name}" for name in _GEOM_FIELDS}
 _JOINT_DOF = {name: f"dof_{name}" for name in ("damping", "armature", "frictionloss")}
 _JOINT = {name: f"jnt_{name}" for name in ("stiffness", "range", "pos", "axis", "solref", "solimp")}
 _SITE = {"pos": "site_pos", "quat": "site_quat"}
