@@ -69,10 +69,16 @@ gusts = vj.Problem(
 
 settle = vj.Problem(
     "settle",
-    vj.FeatureSpace({"x0": vj.Box(-1.0, 1.0), "theta0": vj.Box(-0.15, 0.15)}),
-    mujoco_cartpole.cartpole(cartpole.linear(), features=["x0", "theta0"]),
-    "eventually[0, 3] always[0, 1] (abs(theta) <= 0.03 & abs(x) <= 0.5)",
-    nominal={"x0": 0.0, "theta0": 0.0},
-    description="the linear controller brings the cart back to the middle and holds it there",
+    vj.FeatureSpace(
+        {
+            "x0": vj.Box(-1.5, 1.5),
+            "theta0": vj.Box(-0.15, 0.15),
+            "masscart": vj.LogUniform(0.5, 4.0),
+        }
+    ),
+    mujoco_cartpole.cartpole(cartpole.linear(), features=["x0", "theta0", "masscart"]),
+    "eventually[0, 3] always[0, 1] (abs(theta) <= 0.04 & abs(x) <= 0.4)",
+    nominal={"x0": 0.0, "theta0": 0.0, "masscart": 1.0},
+    description="the linear controller brings any cart back to the middle and holds it there",
     draw=draw,
 )
