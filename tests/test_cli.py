@@ -166,18 +166,33 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
 
 
 def test_precision_of_a_run(call, tmp_path):
-    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", "32", "--precision", "float64",
-         "--out", str(tmp_path / "run"), "--no-pictures")  # fmt: skip
+    where = ("--out", tmp_path / "run", "--no-pictures")
+    call("falsify", "specs/ramp.py:ramp", "--budget", 32, "--precision", "float64", *where)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["precision"], record["backend"]) == ("float64", None)
     output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=1)
     assert "has no backends to choose from; got backend 'native'" in output
 
 
+def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_path):
+    (tmp_path / "specs" / "noisy.py").write_text(
+        PROBLEM.replace('f["a"] +', 'jax.random.normal(key) + f["a"] +').replace(
+            "import jax.numpy", "import jax\nimport jax.numpy"
+        )
+    )
+    call("falsify", "specs/noisy.py:ramp", "--search", "uniform", "--budget", 64, "--no-pictures")
+    output = call("replay", "runs/ramp-1", 7, "--no-pictures")
+    stored = load(tmp_path / "runs" / "ramp-1").table.all["rho"][7]
+    assert "row 7, float32" in output
+    assert f"robustness {stored:.6g} in float32, {stored:.6g} in the table" in output
+    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 8, "--no-pictures")
+    assert "float64" in call("replay", "runs/ramp-2", 0, "--no-pictures")
+
+
 def test_doctor_knows_what_does_not_go_together():
     assert bad_pairs({"brax": "0.14.2", "mujoco": "3.4.0", "jax": "0.10.2"}) == []
     (told,) = bad_pairs({"brax": "0.14.2", "mujoco": "4.0.0", "gymnax": None, "jax": "0.10.2"})
-    assert told.startswith("brax 0.14.2 with mujoco 4.0.0: its spring")
+    assert told.startswith("brax 0.14.2 with mujoco 4.0.0: its swimmer")
     (told,) = bad_pairs({"gymnax": "0.0.9", "jax": "0.10.2"})
     assert "pip install 'gymnax>=1.0.1'" in told
 

@@ -160,7 +160,9 @@ def list_problems(place: str) -> None:
 @click.argument("row", type=int, required=False)
 @click.option("--problem", "target", help="FILE.py:NAME of the problem [the one recorded].")
 @click.option(
-    "--precision", type=click.Choice(["float32", "float64"]), default="float64", show_default=True
+    "--precision",
+    type=click.Choice(["float32", "float64"]),
+    help="[default: float64, and that of the run for a system that draws random numbers]",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of pictures [the run's].")
 @click.option("--pictures/--no-pictures", default=True)
@@ -168,7 +170,7 @@ def replay(
     folder: Path,
     row: int | None,
     target: str | None,
-    precision: str,
+    precision: str | None,
     out: Path | None,
     pictures: bool,
 ) -> None:
@@ -179,6 +181,9 @@ def replay(
 
     run = load(folder, load_target(target or _recorded_target(folder)))
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
+    if precision is None:
+        assert run.problem is not None
+        precision = run.precision if run.problem.draws() else "float64"
     seen = run.replay(number, precision)
     stored = run.table.all.iloc[number]
     click.echo(f"{run.name}, row {number}, {precision}")

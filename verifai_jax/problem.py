@@ -95,6 +95,20 @@ class Problem:
         """Whether the system runs on the host, out of JAX's sight."""
         return bool(getattr(self.system, "black_box", False))
 
+    def draws(self) -> bool:
+        """Whether the system uses its random key; abstract evaluation, nothing compiles.
+
+        JAX draws other numbers in float64 than in float32, so a replay of such a system is only
+        the same simulation in the precision of its run. A black box gets an integer seed.
+        """
+        if self.black_box:
+            return False
+        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        program = jax.make_jaxpr(lambda key, features: self.system(features, key))(key, features)
+        drawn = program.jaxpr.invars[0]
+        return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
+
     def on_backend(self, backend: str) -> "Problem":
         """The same problem on one backend of its system, made once: it keeps what it compiles.
 
