@@ -60,7 +60,9 @@ ALLOWED = {
         "table",
         "trace",
     },
+    "options": {"errors", "problem", "proposals", "rates", "run", "search", "table"},
     "falsify": {
+        "options",
         "backends",
         "engine",
         "errors",
@@ -77,7 +79,7 @@ ALLOWED = {
         "devices",
         "engine",
         "errors",
-        "falsify",
+        "options",
         "problem",
         "proposals",
         "run",

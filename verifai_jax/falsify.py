@@ -6,8 +6,7 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,12 +17,24 @@ from verifai_jax import search as searches
 from verifai_jax.backends import Choice, resolved
 from verifai_jax.engine import in_precision
 from verifai_jax.errors import check_names, suggests_options
+from verifai_jax.options import (
+    check_gradient,
+    check_options,
+    check_rule,
+    check_same_space,
+    check_search,
+    described,
+    earlier_rows,
+    new_folder,
+    usual_batch,
+    writing,
+)
 from verifai_jax.problem import Problem
 from verifai_jax.progress import Progress
-from verifai_jax.proposals import cube_of, units
+from verifai_jax.proposals import units
 from verifai_jax.rates import StoppingRule
 from verifai_jax.rounds import Rounds
-from verifai_jax.run import RECORD, Run, load, write_record
+from verifai_jax.run import Run, load, write_record
 from verifai_jax.search import Search
 from verifai_jax.table import ErrorTable
 
@@ -91,8 +102,8 @@ def falsify(
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     search = check_search(problem, search)
-    _check_rule(search, stop_when)
-    earlier = _earlier(warm_start, problem)
+    check_rule(search, stop_when)
+    earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     choice = resolved(
@@ -100,9 +111,9 @@ def falsify(
         wanted=backend,
     )  # fmt: skip
     problem = choice.problem
-    _check_gradient(problem, search)
+    check_gradient(problem, search)
     problem.check()
-    place = _new_folder(folder)
+    place = new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
     rounds = Rounds(problem, search, batch, seed, table, precision, place)
 
@@ -192,8 +203,8 @@ def resume(
             )
         search = searches.from_json(run.search_data)
     search = check_search(problem, search)
-    _check_same_space(run, problem)
-    _check_rule(search, stop_when)
+    check_same_space(run, problem)
+    check_rule(search, stop_when)
     budget = run.budget if budget is None else budget
     check_options(budget, run.batch, run.seed, max_seconds, stop_after)
     snapshot = run.snapshot or {}
@@ -212,9 +223,9 @@ def resume(
         )
     choice = resolved(problem, wanted=run.backend)
     problem = choice.problem
-    _check_gradient(problem, search)
+    check_gradient(problem, search)
     problem.check()
-    with _writing(run.folder):
+    with writing(run.folder):
         table = run.table.resumed(rows, run.folder)
     rounds = Rounds(problem, search, run.batch, run.seed, table, run.precision, run.folder)
 
@@ -286,7 +297,7 @@ def _play(
             problem=problem,
             budget=int(ends.budget),
             search_data=searches.to_json(search),
-            space_data=_described(problem),
+            space_data=described(problem),
             acceptance=rounds.acceptance,
             snapshot=rounds.snapshot,
             precision=rounds.precision,
@@ -295,7 +306,7 @@ def _play(
         )
 
     if place is not None:
-        with _writing(place):
+        with writing(place):
             write_record(run("running"), place)
     stopped, cause = None, None
     try:
@@ -341,129 +352,3 @@ def _broke_down(name: str, simulations: int, place: Path | None, cause: Exceptio
             "elsewhere"
         )
     return f"{told}They are in the .run of this error and in {place}, which can be resumed"
-
-
-@contextmanager
-def _writing(place: Path | None) -> Iterator[None]:
-    """Turn what a file system refuses into one line that says what to do."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(
-            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
-            "can be, or none to keep the run in memory"
-        ) from error
-
-
-def usual_batch(search: Search, budget: int) -> int:
-    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few."""
-    if not search.learns:
-        return search.most_at_once
-    return min(search.most_at_once, 1 << max(3, (int(budget) // 20).bit_length() - 1))
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
-def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
-    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
-        if name == "stop_after" and value is None:
-            continue
-        if not _is_integer(value) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1; got {value!r}")
-    if not _is_integer(seed) or not 0 <= seed < 2**63:
-        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
-    if max_seconds is not None and not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive; got {max_seconds!r}")
-
-
-def check_search(problem: Any, search: Any) -> Search:
-    if not isinstance(problem, Problem):
-        raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
-    if isinstance(search, str):
-        search = searches.named(search)
-    if not isinstance(search, Search):
-        raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
-    if not getattr(problem.system, "backends", ()):
-        _check_gradient(problem, search)
-    problem.space.check_where()
-    search.check(cube_of(problem.space))
-    return search
-
-
-def _why_not_traced(system: Any) -> str:
-    """What a system with several backends says of those that JAX could trace."""
-    if "mjx" in getattr(system, "backends", ("mjx",)) or not hasattr(system, "why_not"):
-        return ""
-    return f". It does not run on mjx: {system.why_not('mjx')}"
-
-
-def _check_gradient(problem: Problem, search: Search) -> None:
-    if problem.black_box and search.wants_gradient:
-        why = _why_not_traced(problem.system)
-        raise ValueError(
-            f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
-            f"search {search!r} needs one; use one that does not, such as 'cross_entropy'{why}"
-        )
-
-
-def _check_rule(search: Search, rule: StoppingRule | None) -> None:
-    if rule is None:
-        return
-    if not hasattr(rule, "done"):
-        raise TypeError(f"stop_when must be a rule such as Within(0.005); got {rule!r}")
-    if not search.samples_prior:
-        raise ValueError(
-            f"stop_when needs independent samples of the space, which search {search!r} does not "
-            "give; use search='uniform'"
-        )
-
-
-def _described(problem: Problem) -> dict[str, Any] | None:
-    try:
-        return problem.space.to_json()
-    except ValueError:
-        return None  # It has domains that only the user knows.
-
-
-def _check_same_space(run: Run, problem: Problem) -> None:
-    data = _described(problem)
-    if run.space_data is None or data is None or run.space_data == data:
-        return
-    was, now = dict(run.space_data["features"]), dict(data["features"])
-    for name in now:
-        if was.get(name) != now[name]:
-            raise ValueError(
-                f"the run of {run.name!r} was over another space: its feature {name!r} was "
-                f"{was.get(name)}, that of the given problem is {now[name]} (a run with --only is "
-                "resumed with the same --only)"
-            )
-    # The name of a constraint may change with the line it is written in.
-    if list(was) != list(now) or bool(run.space_data["where"]) != bool(data["where"]):
-        raise ValueError(f"the run of {run.name!r} was over a space of another order or constraint")
-
-
-def _earlier(warm_start: Any, problem: Problem) -> Any:
-    """The rows of an earlier table, as a DataFrame with the columns that are needed."""
-    if warm_start is None:
-        return None
-    table = warm_start.table if isinstance(warm_start, Run) else warm_start
-    frame = table.all if isinstance(table, ErrorTable) else table
-    if not hasattr(frame, "columns"):
-        raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
-    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, frame.columns))
-    return frame
-
-
-def _new_folder(folder: str | Path | None) -> Path | None:
-    if folder is None:
-        return None
-    place = Path(folder)
-    # A process that dies before its first record leaves a part of one.
-    leftover = {f"{RECORD}.part"}
-    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
-        raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
-    with _writing(place):
-        place.mkdir(parents=True, exist_ok=True)
-    return place

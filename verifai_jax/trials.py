@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.engine import CHUNK, Engine, in_precision, simulation_key
 from verifai_jax.errors import suggests_options
-from verifai_jax.falsify import check_options, check_search, usual_batch
+from verifai_jax.options import check_options, check_search, usual_batch
 from verifai_jax.problem import Problem
 from verifai_jax.proposals import cube_of
 from verifai_jax.run import run_keys
