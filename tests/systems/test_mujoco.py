@@ -331,6 +331,10 @@ def test_bindings_to_nothing_are_refused(bind, message):
         ({"bind": {"a": "body/pole/mass", "b": "body/pole/mass"}}, r"'a' and 'b' are both bound"),
         ({"model": "no/such.xml"}, r"there is no MJCF file 'no/such.xml'"),
         ({"model": "<mujoco><bla/></mujoco>"}, r"MJCF text is no MuJoCo model: XML Error"),
+        ({"controller": 3.0}, r"controller must be a function; got 3.0"),
+        ({"bind": ["body/pole/mass"]}, r"bind must be a dictionary of paths by feature; got \['b"),
+        ({"signals": ["joint/hinge/qpos"]}, r"signals must be a dictionary or a function; got"),
+        ({"solver_iterations": 0}, r"solver_iterations must be an integer of at least 1; got 0"),
         ({"model": 3}, r"an MjSpec or an MjModel; got int"),
     ],
 )

@@ -174,6 +174,16 @@ def mujoco(
         raise unknown_name("backend", backend, (*BACKENDS, "auto"))
     if controller is None and controller_memory is not None:
         raise ValueError("controller_memory needs a controller; got none")
+    for name, part in (("controller", controller), ("initial", initial), ("terminate", terminate)):
+        if part is not None and not callable(part):
+            raise ValueError(f"{name} must be a function; got {part!r}")
+    for name, count in (("solver_iterations", solver_iterations), ("ls_iterations", ls_iterations)):
+        if count is not None and (not isinstance(count, int) or count < 1):
+            raise ValueError(f"{name} must be an integer of at least 1; got {count!r}")
+    if not (bind is None or isinstance(bind, Mapping)):
+        raise ValueError(f"bind must be a dictionary of paths by feature; got {bind!r}")
+    if not (signals is None or callable(signals) or isinstance(signals, Mapping)):
+        raise ValueError(f"signals must be a dictionary or a function; got {signals!r}")
     contacts = ()
     if isinstance(signals, Mapping):
         if not signals:
