@@ -387,3 +387,32 @@ def test_features_and_functions_that_do_not_fit_are_refused(options, features, m
     system = loop(**{"bind": {"m": "body/pole/mass"}, **options})
     with pytest.raises(ValueError, match=message):
         system.check(features)
+
+
+def test_contacts_need_a_model_that_can_be_given_a_sensor():
+    compiled = mujoco.MjModel.from_xml_path(CART)
+    with pytest.raises(ValueError, match="needs a sensor that a compiled MjModel cannot be given"):
+        loop(model=compiled, signals={"hit": "contact/pole/cart"})
+    with pytest.raises(UnknownNameError, match=r"unknown geom in 'contact/pole/cat': geom 'cat'"):
+        loop(signals={"hit": "contact/pole/cat"})
+
+
+def test_a_row_in_which_mujoco_raises_is_an_error_and_the_others_go_on(monkeypatch):
+    from mujoco.batch import Batch, SimulationError
+
+    system = loop(backend="native", terminate=None, duration=0.2)
+    alone = system.simulate_batch(rows(), KEYS)
+    step = Batch.step
+
+    def refuse(self, ids=None, **options):
+        going = np.ones(self.nsim, bool) if ids is None else np.array(ids)
+        if not going[1]:
+            return step(self, ids, **options)
+        going[1] = False
+        step(self, going, **options)
+        raise SimulationError(np.array([1]), "stack overflow")
+
+    monkeypatch.setattr(Batch, "step", refuse)
+    trace = system.simulate_batch(rows(), KEYS)
+    np.testing.assert_array_equal(trace.status, [Status.OK, Status.ERROR, Status.OK, Status.OK])
+    np.testing.assert_array_equal(trace.signals["x"][[0, 2, 3]], alone.signals["x"][[0, 2, 3]])
