@@ -4,7 +4,8 @@
     problem = resolved(problem, wanted="native")
 
 A gradient needs a backend that JAX can trace. Without one the faster backend is taken, as measured
-on this machine with this problem; what was chosen, and why, is told in the run.
+on this machine with this problem, unless the run is over before a compiler would be; what was
+chosen, and why, is told in the run.
 """
 
 import time
@@ -18,8 +19,10 @@ from verifai_jax.host import HostEngine
 from verifai_jax.problem import Problem
 from verifai_jax.run import run_keys
 
-WORTH_MEASURING = 5.0
-"""Seconds that a run must take natively before a slow compiler is asked for a quicker program."""
+WORTH_MEASURING = 30.0
+"""Seconds that a run must take natively before a slow compiler is asked for a quicker program,"""
+WORTH_TRYING = 5.0
+"""or so many where the system says that the compiled program is likely the quicker one."""
 
 
 class Choice(NamedTuple):
@@ -81,7 +84,8 @@ def _fastest(
         known[kinds[0]] = _measured(HostEngine(host, precision), host, batch)
     speed = known[kinds[0]]
     if kinds[1] not in known:
-        if budget / speed < WORTH_MEASURING:
+        likely = getattr(problem.system, "likely", None) == traced
+        if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
             seconds = f"{budget / speed:.1f} s for all simulations"
             return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
         try:
