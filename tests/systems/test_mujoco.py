@@ -416,3 +416,19 @@ def test_a_row_in_which_mujoco_raises_is_an_error_and_the_others_go_on(monkeypat
     trace = system.simulate_batch(rows(), KEYS)
     np.testing.assert_array_equal(trace.status, [Status.OK, Status.ERROR, Status.OK, Status.OK])
     np.testing.assert_array_equal(trace.signals["x"][[0, 2, 3]], alone.signals["x"][[0, 2, 3]])
+
+
+def test_one_system_in_both_precisions():
+    system = loop(backend="native", terminate=None, duration=0.2)
+    single = system.simulate_batch(rows(), KEYS).signals["x"]
+    with jax.enable_x64():
+        wide = jax.tree.map(lambda leaf: leaf.astype(np.float64), rows())
+        double = system.simulate_batch(wide, KEYS).signals["x"]
+    assert (single.dtype, double.dtype) == (np.float32, np.float64)
+    np.testing.assert_allclose(single, double, atol=1e-5)
+    one = jax.tree.map(lambda leaf: leaf[0], rows())
+    in_jax = system.with_backend("mjx")
+    assert jax.eval_shape(in_jax, one, KEYS[0]).signals["x"].dtype == jnp.float32
+    with jax.enable_x64():
+        one = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), wide)
+        assert jax.eval_shape(in_jax, one, KEYS[0]).signals["x"].dtype == jnp.float64

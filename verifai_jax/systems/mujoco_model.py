@@ -92,6 +92,10 @@ class Place:
     path: str
     sign: float = 1.0
 
+    def __post_init__(self) -> None:
+        # JAX keeps what it traced of an index; one of 64 bits would not be the same in float32.
+        object.__setattr__(self, "index", self.index.astype(np.int32))
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
