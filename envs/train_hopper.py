@@ -3,7 +3,8 @@
     python -m envs.train_hopper
     python -m envs.train_hopper --seed 3 --steps 2000000 --out my_policy.npz
 
-Nothing is written, and the exit status is 1, if the policy did not learn to run.
+It takes seven minutes on one core. Nothing is written, and the exit status is 1, if the policy did
+not learn to run.
 """
 
 import argparse
