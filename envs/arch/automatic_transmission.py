@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from envs.arch.stepped import Features, Scalar, Stepped, real, value, whole
+from envs.arch.tables import bilinear, hinges, interpolated
 
 DT = 0.01
 STEPS_PER_TICK = 4
@@ -107,62 +108,10 @@ class State(NamedTuple):
     ticks: Int[Array, ""]
 
 
-class Hinges(NamedTuple):
-    """A piecewise linear function `base + slope (x - x0) + sum bend[i] max(x - at[i], 0)`.
-
-    Lanes of a batch evaluate it without looking anything up in memory. It goes on along its first
-    and last piece. Values may be vectors.
-    """
-
-    x0: float
-    base: np.ndarray
-    slope: np.ndarray
-    at: np.ndarray
-    bend: np.ndarray
-
-
-def hinges(x: Sequence[float], y: Any) -> Hinges:
-    """The interpolation of `y[i]` at `x[i]`, as hinges."""
-    xs, ys = np.asarray(x, float), np.asarray(y, float)
-    slopes = np.diff(ys, axis=0) / np.diff(xs).reshape(-1, *(1,) * (ys.ndim - 1))
-    return Hinges(xs[0], ys[0], slopes[0], xs[1:-1], np.diff(slopes, axis=0))
-
-
-_K = hinges(SPEED_RATIO, K_FACTOR)
-_TORQUE_RATIO = hinges(SPEED_RATIO, TORQUE_RATIO)
+_CONVERTER = hinges(SPEED_RATIO, np.stack([K_FACTOR, TORQUE_RATIO], axis=1))
+_ENGINE = bilinear(ENGINE_THROTTLE, ENGINE_RPM, ENGINE_TORQUE)
 _UP = hinges(UP_THROTTLE, UP_SPEED)
 _DOWN = hinges(DOWN_THROTTLE, DOWN_SPEED)
-
-
-def _engine_map() -> tuple[Hinges, np.ndarray]:
-    """Torque as hinges of rpm whose coefficients are hinges of throttle: bilinear."""
-    rows = [hinges(ENGINE_RPM, row) for row in ENGINE_TORQUE]
-    coefficients = np.array([[row.base, row.slope, *row.bend] for row in rows])
-    return hinges(ENGINE_THROTTLE, coefficients), rows[0].at
-
-
-_ENGINE, _ENGINE_AT = _engine_map()
-
-
-def _interpolated(table: Hinges, x: Scalar) -> list[Any]:
-    """The values, one for each column of the table, at `x`."""
-    bends = [jnp.maximum(x - at, 0) for at in table.at]
-    return [
-        table.base[c]
-        + table.slope[c] * (x - table.x0)
-        + sum(float(b[c]) * over for b, over in zip(table.bend, bends, strict=True) if b[c])
-        for c in range(len(table.base))
-    ]
-
-
-def _converter(ratio: Scalar) -> tuple[Scalar, Scalar]:
-    """Capacity factor and torque ratio of the torque converter at a speed ratio."""
-    k: Any = _K.base + _K.slope * ratio
-    torque: Any = _TORQUE_RATIO.base + _TORQUE_RATIO.slope * ratio
-    for at, bend, torque_bend in zip(_K.at, _K.bend, _TORQUE_RATIO.bend, strict=True):
-        over = jnp.maximum(ratio - at, 0)
-        k, torque = k + bend * over, torque + torque_bend * over
-    return k, torque
 
 
 def _of_gear(choices: Sequence[Any], gear: Scalar) -> Any:
@@ -180,8 +129,8 @@ def speed(state: State) -> Scalar:
 def shifted(state: State, throttle: Scalar) -> State:
     """The shift chart at one of its ticks."""
     v, gear = speed(state), state.gear
-    up = _of_gear(_interpolated(_UP, throttle), gear)
-    down = _of_gear(_interpolated(_DOWN, throttle), gear)
+    up = _of_gear(interpolated(_UP, throttle), gear)
+    down = _of_gear(interpolated(_DOWN, throttle), gear)
     ticks = state.ticks + 1
     rising, falling = state.phase == UPSHIFTING, state.phase == DOWNSHIFTING
     waited = ticks >= WAIT_TICKS
@@ -201,16 +150,13 @@ def driven(state: State, throttle: Scalar, brake: Scalar) -> State:
     """One step of the engine and the wheels, in a gear that stays."""
     dtype = real()
     ratio = _of_gear(GEAR_RATIO, state.gear).astype(dtype)
-    level, tilt, *bends = _interpolated(_ENGINE, throttle)
+    engine_torque = _ENGINE.along(throttle)
     low, high = RPM_LIMITS
 
     def slope(engine: Scalar, wheel: Scalar) -> tuple[Scalar, Scalar]:
-        torque = level + tilt * (engine - ENGINE_RPM[0])
-        for at, bend in zip(_ENGINE_AT, bends, strict=True):
-            torque = torque + bend * jnp.maximum(engine - at, 0)
-        k, torque_ratio = _converter(FINAL_DRIVE * ratio * wheel / engine)
+        k, torque_ratio = interpolated(_CONVERTER, FINAL_DRIVE * ratio * wheel / engine)
         impeller = (engine / k) ** 2
-        engine_slope = (torque - impeller) / ENGINE_INERTIA
+        engine_slope = (engine_torque(engine) - impeller) / ENGINE_INERTIA
         # The integrator is limited: no slope leads out of its limits.
         out = ((engine >= high) & (engine_slope > 0)) | ((engine <= low) & (engine_slope < 0))
         v = wheel * MPH_PER_WHEEL_RPM
