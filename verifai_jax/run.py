@@ -37,7 +37,8 @@ FORMAT = 1
 class Replay:
     """One simulation, looked at again.
 
-    `rho` holds the robustness of each formula by name; NaN where `status` is not OK.
+    `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
+    random key of the simulation.
     """
 
     problem: Problem
@@ -46,6 +47,7 @@ class Replay:
     trace: Trace
     rho: dict[str, float]
     status: Status
+    key: Key[Array, ""] | None = None
 
     @property
     def violated(self) -> bool:
@@ -263,6 +265,7 @@ def replay(
             trace=trace.trim(),
             rho={name: float(value) for name, value in zip(problem.formulas, rho, strict=True)},
             status=Status(int(status)),
+            key=key,
         )
 
 
