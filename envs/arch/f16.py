@@ -7,11 +7,11 @@ Features: the attitude at first, `phi`, `theta`, `psi` (rad), the `altitude` (ft
 (ft/s), the angle of attack `alpha` (rad) and the engine's `power` (0 to 100). Signals, 30 a second:
 `altitude`, the attitude, `vt`, `alpha`, and `mode` (0 stands by, 1 rolls, 2 pulls).
 
-Source: AeroBench v2 in Python, with its ground collision avoidance. It is not the MATLAB version of
-2018, of which earlier results speak. AeroBench integrates with an adaptive method; here it is the
-classical Runge-Kutta method with 1/30 s, the period of the automatic pilot, 0.01 ft off in the least
-altitude. That altitude jumps where the pilot's decision falls into another period, so that the worst
-attitude from 2338 ft is not in the corner of the box.
+Source: AeroBench v2 in Python, with its ground collision avoidance. It is not the MATLAB version
+of 2018, of which earlier results speak. AeroBench integrates with an adaptive method; here it is
+the classical Runge-Kutta method with 1/30 s, the period of the automatic pilot, 0.01 ft off in the
+least altitude. That altitude jumps where a decision of the pilot falls into another period, so that
+the worst attitude from 2338 ft is not in the corner of the box.
 """
 
 import math
