@@ -138,7 +138,8 @@ class Problem:
         """Trace the system and its monitor abstractly: no simulation, nothing compiles.
 
         A system may have its own say: `check(features)`, with features as `jax.ShapeDtypeStruct`s,
-        and, for one that JAX does not trace, `abstract(features)`, the form of its traces.
+        and `abstract(features)`, the form of its traces, for one that JAX does not trace or not
+        quickly.
 
         **Raises:** what the system's own check does; `ProblemError` for a system that raises or
         returns no `Trace`; what the monitor says for a formula over a signal that the system does
@@ -152,7 +153,7 @@ class Problem:
         if self.black_box and abstract is None:
             return
         try:
-            if self.black_box:
+            if abstract is not None:
                 trace = abstract(features)
             else:
                 trace = jax.eval_shape(self.system, features, key)

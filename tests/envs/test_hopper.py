@@ -167,3 +167,22 @@ def test_a_policy_that_did_not_learn_is_not_written(earned, status, tmp_path, ca
             "steps": 8192,
             "mean_return": earned,
         }
+
+
+def test_a_row_is_the_same_simulation_in_any_batch():
+    """Falls differ visibly by the last digit of a network's output."""
+    problem = specs.upright.on_backend("native")
+    u = np.random.default_rng(0).random((130, problem.space.dim), np.float32)
+    features = jax.tree.map(np.asarray, jax.jit(jax.vmap(problem.space.unflatten))(u))
+    keys = jax.random.split(KEY, 130)
+    whole = problem.system.simulate_batch(features, keys)
+    for count in (1, 5):
+        few = jax.tree.map(lambda leaf, count=count: leaf[:count], features)
+        trace = problem.system.simulate_batch(few, keys[:count])
+        np.testing.assert_array_equal(trace["pitch"], whole["pitch"][:count])
+
+
+def test_replays_are_exact():
+    run = vj.falsify(specs.upright, "uniform", 70, batch=64, backend="native")
+    for row in (int(run.best.name), 69):
+        assert run.replay(row).rho["spec"] == pytest.approx(run.table.all["rho"][row], abs=1e-6)
