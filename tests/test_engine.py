@@ -155,7 +155,7 @@ class Iterated:
         shift = jnp.stack([features[name] for name in sorted(features)]).mean()
 
         def more(carry):
-            x, step = carry
+            x, _ = carry
             return jnp.cos(x + shift), jnp.abs(jnp.cos(x + shift) - x)
 
         x, _ = jax.lax.while_loop(lambda c: c[1] > 1e-6, more, (jnp.zeros(()), jnp.ones(())))

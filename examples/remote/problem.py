@@ -2,8 +2,8 @@
 
     verifai-jax falsify examples/remote/problem.py:swing --search uniform --budget 1000
 
-waits at port 4567 for as many of `pendulum.py`, or the compiled `pendulum.c` beside it, as there are
-cores.
+waits at port 4567 for as many of `pendulum.py`, or the compiled `pendulum.c` beside it, as there
+are cores.
 """
 
 import verifai_jax as vj
