@@ -151,7 +151,10 @@ def list_problems(place: str) -> None:
             click.echo(f"{file}:{name}  {problem.description}")
             for formula in problem.formulas.values():
                 click.echo(f"    {formula}")
-            click.echo(f"    over {', '.join(problem.space.columns)}")
+            click.echo(f"    over {', '.join(problem.space.domains)}")
+    for folder in sorted(path.iterdir()) if path.is_dir() else []:
+        if any(folder.glob("[!_]*.py")):
+            click.echo(f"more in {folder}/: verifai-jax list {folder}")
     click.echo(f"searches: {', '.join(names())}")
 
 
