@@ -189,6 +189,17 @@ def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_p
     assert "float64" in call("replay", "runs/ramp-2", 0, "--no-pictures")
 
 
+def test_a_missing_extra_is_one_line(call, tmp_path):
+    (tmp_path / "specs" / "robot.py").write_text(
+        "from verifai_jax.errors import require\nrequire('no_such_engine', extra='engine')\n"
+    )
+    told = "no_such_engine is not installed: pip install 'verifai_jax[engine]'"
+    assert call("falsify", "specs/robot.py:walk", code=1) == f"Error: {told}\n"
+    output = call("list")
+    assert f"specs/robot.py: {told}\n" in output
+    assert "specs/ramp.py:ramp" in output
+
+
 def test_doctor_knows_what_does_not_go_together():
     assert bad_pairs({"brax": "0.14.2", "mujoco": "3.4.0", "jax": "0.10.2"}) == []
     (told,) = bad_pairs({"brax": "0.14.2", "mujoco": "4.0.0", "gymnax": None, "jax": "0.10.2"})

@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from verifai_jax import __version__
+from verifai_jax.errors import MissingExtra
 
 
 class _Group(click.Group):
@@ -20,7 +21,7 @@ class _Group(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
-        except (ValueError, TypeError, IndexError, FileNotFoundError, OSError) as error:
+        except (ValueError, TypeError, IndexError, OSError, MissingExtra) as error:
             if ctx.params.get("traceback"):
                 raise
             raise click.ClickException(str(error)) from error
@@ -147,7 +148,12 @@ def list_problems(place: str) -> None:
     if not files:
         raise TargetError(f"{place}/ has no Python file with problems")
     for file in files:
-        for name, problem in problems_in(str(file)).items():
+        try:
+            found = problems_in(str(file))
+        except MissingExtra as error:
+            click.echo(f"{file}: {error}")
+            continue
+        for name, problem in found.items():
             click.echo(f"{file}:{name}  {problem.description}")
             for formula in problem.formulas.values():
                 click.echo(f"    {formula}")
