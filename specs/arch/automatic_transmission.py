@@ -7,9 +7,9 @@ Instance 2 (`at1`, ...): inputs constant for 5 s, over the 30 s that the model's
 (35 s for AT5, which looks 32.7 s ahead). Instance 1 (`at1_instance1`, ...): lines between 7 control
 points of the throttle and 3 of the brake over 50 s, as most tools have it.
 
-`gear == i` has robustness 1/2 - |gear - i|, the margin to the interval [i - 1/2, i + 1/2] as which
-tools that need a half-plane write it: 1/2 in the gear, -1/2 beside it. The plain `==` could not be
-told from a violation in the gear, where its robustness is 0. The interval [0.001, 0.1] of AT5
+`gear == i` is written `abs(gear - i) <= 0.5`, which has the same truth: 1/2 in the gear, -1/2 or
+less in another. Tools write `gear == i` (FalStar) or `gear >= i & gear <= i` (FReaK), whose
+robustness in the gear is 0, and with it that of AT5, broken or not. The interval [0.001, 0.1] of AT5
 begins with the first sample after the instant, 0.01 s later.
 """
 
