@@ -18,6 +18,7 @@ the competition's results have; up to 3.6 in robustness.
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -99,11 +100,12 @@ def _threshold(mode: Any, gap: Scalar) -> tuple[Scalar, Any, Any]:
     return threshold, ended, following.astype(jnp.int32)
 
 
-def _followed(leader: Path, gap: Scalar, speed: Scalar, mode: Any) -> tuple[Path, Any]:
+def _followed(leader: Path, car: Any, dt: float) -> tuple[Path, Any]:
     """The path of a car behind `leader` over one step, and its mode at the end."""
+    gap, speed, mode = car
     own = _motion(mode, jnp.zeros_like(gap), speed)
 
-    bend, end = leader.change, jnp.asarray(DT, gap.dtype)
+    bend, end = leader.change, jnp.asarray(dt, gap.dtype)
     gap_bend = gap + own.at(bend)[0] - leader.after.place
     gap_end = gap + own.at(end)[0] - leader.after.at(end - bend)[0]
     # The first of three instants at which the mode is over: the transition lies just before it.
@@ -144,48 +146,47 @@ def initial(features: Features) -> State:
     )
 
 
-def _first(k: Int[Array, ""], state: State, features: Features) -> Path:
-    middle = (k.astype(real()) + 0.5) * DT
+def _first(middle: Scalar, state: State, features: Features, dt: float) -> Path:
     throttle, brake = value(features["throttle"], middle), value(features["brake"], middle)
     zero, one = jnp.zeros_like(state.y1), jnp.ones_like(state.y1)
     motion = Motion(zero, state.v1, -throttle, jnp.asarray(brake, zero.dtype), one)
-    end = jnp.asarray(DT, zero.dtype)
+    end = jnp.asarray(dt, zero.dtype)
     place, speed = motion.at(end)
     return Path(motion, end, motion._replace(place=place, speed=speed))
 
 
-def advance(k: Int[Array, ""], state: State, features: Features) -> State:
-    """One step with transitions within it."""
-
-    def follow(carry: Any, car: Any) -> Any:
-        leader, moved = carry
-        gap, speed, mode = car
-        path, mode = _followed(leader, gap, speed, mode)
-        place, speed = path.after.at(DT - path.change)
-        return (path, place), (gap + (place - moved), speed, mode)
-
-    return _advanced(state, _first(k, state, features), follow)
-
-
-def advance_unlocated(k: Int[Array, ""], state: State, features: Features) -> State:
-    """One step at whose end the modes change."""
-
-    def follow(carry: Any, car: Any) -> Any:
-        first, moved = carry
-        gap, speed, mode = car
-        place, speed = _motion(mode, jnp.zeros_like(gap), speed).at(DT)
-        gap = gap + (place - moved)
-        _, ended, following = _threshold(mode, gap)
-        return (first, place), (gap, speed, jnp.where(ended, following, mode))
-
-    return _advanced(state, _first(k, state, features), follow)
+def advance(
+    k: Int[Array, ""], state: State, features: Features, substeps: int = 1, located: bool = True
+) -> State:
+    """A hundredth of a second, with transitions within its steps or at their ends."""
+    step, dt = _located if located else _unlocated, DT / substeps
+    for j in range(substeps):
+        middle = k.astype(real()) * DT + (j + 0.5) * dt
+        first = _first(middle, state, features, dt)
+        # Each car follows the path of the one before; the first has only the input.
+        _, cars = jax.lax.scan(
+            partial(step, dt=dt),
+            (first, first.after.place),
+            (state.gaps, state.speeds, state.modes),
+        )
+        state = State(state.y1 + first.after.place, first.after.speed, *cars)
+    return state
 
 
-def _advanced(state: State, first: Path, follow: Any) -> State:
-    """The state after `follow` has moved the cars 2 to 5, each behind the one before."""
-    carry = (first, first.after.place)
-    _, cars = jax.lax.scan(follow, carry, (state.gaps, state.speeds, state.modes))
-    return State(state.y1 + first.after.place, first.after.speed, *cars)
+def _located(carry: Any, car: Any, dt: float) -> Any:
+    leader, moved = carry
+    path, mode = _followed(leader, car, dt)
+    place, speed = path.after.at(dt - path.change)
+    return (path, place), (car[0] + (place - moved), speed, mode)
+
+
+def _unlocated(carry: Any, car: Any, dt: float) -> Any:
+    first, moved = carry
+    gap, speed, mode = car
+    place, speed = _motion(mode, jnp.zeros_like(gap), speed).at(dt)
+    gap = gap + (place - moved)
+    _, ended, following = _threshold(mode, gap)
+    return (first, place), (gap, speed, jnp.where(ended, following, mode))
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
@@ -196,11 +197,19 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     return {f"y{i}": place for i, place in enumerate(places, 1)}
 
 
-def chasing_cars(duration: float = 100.0, *, located: bool = True) -> Stepped:
+def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: int = 1) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
     - `located`: find transitions within the step; otherwise they wait for its end.
+    - `substeps`: steps in 0.01 s.
     """
-    step = advance if located else advance_unlocated
-    return Stepped(initial, step, signals, DT, whole(duration, DT, "duration"), NOMINAL)
+    return Stepped(
+        initial,
+        partial(advance, substeps=substeps, located=located),
+        signals,
+        DT,
+        whole(duration, DT, "duration"),
+        NOMINAL,
+        lambda factor: chasing_cars(duration, located=located, substeps=substeps * factor),
+    )

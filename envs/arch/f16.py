@@ -15,6 +15,7 @@ the worst attitude from 2338 ft is not in the corner of the box.
 """
 
 import math
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -91,9 +92,16 @@ def initial(features: Features) -> State:
     return decided(State(plane._replace(**given), jnp.int32(ROLL), jnp.int32(0)))
 
 
-def advance(k: Int[Array, ""], state: State, features: Features) -> State:
+def advance(k: Int[Array, ""], state: State, features: Features, substeps: int = 1) -> State:
     """A thirtieth of a second, at whose end the automatic pilot thinks again."""
-    start = state.plane
+    plane = state.plane
+    for _ in range(substeps):
+        plane = _flown(plane, state.mode, DT / substeps)
+    return decided(State(plane, state.mode, state.since + 1))
+
+
+def _flown(start: Plane, mode: Int[Array, ""], dt: float) -> Plane:
+    """One step of the classical Runge-Kutta method."""
 
     # A scan over the four stages of the classical method: XLA takes minutes for the derivative of
     # stages that are written out.
@@ -101,13 +109,13 @@ def advance(k: Int[Array, ""], state: State, features: Features) -> State:
         rate, total = carry
         place, share = weights
         rate = _moved(start, rate, place)
-        rate = slope(rate, reference(rate, state.mode))
+        rate = slope(rate, reference(rate, mode))
         return (rate, _moved(total, rate, share)), None
 
-    weights = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], real()) * DT
+    weights = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], real()) * dt
     at_rest = jax.tree.map(jnp.zeros_like, start)
     (_, plane), _ = jax.lax.scan(stage, (at_rest, start), (weights[:, 0], weights[:, 1]))
-    return decided(State(plane, state.mode, state.since + 1))
+    return plane
 
 
 def _moved(plane: Plane, rate: Plane, seconds: Scalar) -> Plane:
@@ -121,9 +129,18 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     return {**flight, "mode": state.mode.astype(real())}
 
 
-def f16(duration: float = 15.0) -> Stepped:
+def f16(duration: float = 15.0, *, substeps: int = 1) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 1/30.
+    - `substeps`: integration steps in 1/30 s, the period of the automatic pilot.
     """
-    return Stepped(initial, advance, signals, DT, whole(duration, DT, "duration"), NOMINAL)
+    return Stepped(
+        initial,
+        partial(advance, substeps=substeps),
+        signals,
+        DT,
+        whole(duration, DT, "duration"),
+        NOMINAL,
+        lambda factor: f16(duration, substeps=substeps * factor),
+    )

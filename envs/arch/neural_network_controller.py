@@ -10,6 +10,7 @@ controller that runs every 0.01 s. The model's solver is ode45; here the plant i
 classical Runge-Kutta method with 0.001 s. No trajectory of the original was available to compare.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +22,6 @@ from envs.arch.stepped import Features, Scalar, Stepped, real, value, whole
 from verifai_jax.systems.integrators import rk4
 
 DT = 0.01
-SUBSTEPS = 10
 NOMINAL = {"Ref": 2.0}
 
 CURRENT_LIMITS = (-1.0, 4.0)
@@ -166,15 +166,15 @@ def _decided(k: Int[Array, ""], state: State, features: Features) -> Scalar:
     return controlled(state, value(features["Ref"], k.astype(real()) * DT))
 
 
-def advance(k: Int[Array, ""], state: State, features: Features) -> State:
+def advance(k: Int[Array, ""], state: State, features: Features, substeps: int = 10) -> State:
     """One control period."""
     current = _decided(k, state, features)
 
     def substep(plant: Any, _: None) -> Any:
-        return rk4(lambda _, s: slope(s, current), 0.0, plant, DT / SUBSTEPS), None
+        return rk4(lambda _, s: slope(s, current), 0.0, plant, DT / substeps), None
 
     plant = (state.position, state.velocity)
-    (position, velocity), _ = jax.lax.scan(substep, plant, None, length=SUBSTEPS)
+    (position, velocity), _ = jax.lax.scan(substep, plant, None, length=substeps)
     return State(
         position,
         velocity,
@@ -192,9 +192,18 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     }
 
 
-def neural_network_controller(duration: float = 40.0) -> Stepped:
+def neural_network_controller(duration: float = 40.0, *, substeps: int = 10) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
+    - `substeps`: integration steps in a control period.
     """
-    return Stepped(initial, advance, signals, DT, whole(duration, DT, "duration"), NOMINAL)
+    return Stepped(
+        initial,
+        partial(advance, substeps=substeps),
+        signals,
+        DT,
+        whole(duration, DT, "duration"),
+        NOMINAL,
+        lambda factor: neural_network_controller(duration, substeps=substeps * factor),
+    )

@@ -35,6 +35,8 @@ class Stepped:
     - `signals(k, state, features) -> dict`: a number for each name, at sample `k`.
     - `dt`: the sampling period in seconds.
     - `nominal`: the features that the model has, with their values where they are not given.
+    - `finer(factor) -> Stepped`: the same model with so many times as many integration steps; None
+      where there is nothing to integrate.
 
     The status of the trace is `NONFINITE` if the last state is NaN or infinite; a model must not
     recover from such a state.
@@ -46,11 +48,21 @@ class Stepped:
     dt: float
     steps: int
     nominal: Features = field(default_factory=dict)
+    finer: Callable[[int], "Stepped"] | None = None
 
     @property
     def duration(self) -> float:
         """Simulated seconds."""
         return self.steps * self.dt
+
+    def refined(self, factor: int) -> "Stepped":
+        """The same model, sampled and decided as before, with a `factor` times smaller step.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
+        """
+        if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
+            raise ValueError(f"factor must be a positive integer; got {factor!r}")
+        return self if self.finer is None else self.finer(factor)
 
     def check(self, features: Features) -> None:
         """Refuse features that the model does not have; it would ignore them."""

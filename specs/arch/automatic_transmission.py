@@ -9,8 +9,8 @@ points of the throttle and 3 of the brake over 50 s, as most tools have it.
 
 `gear == i` is written `abs(gear - i) <= 0.5`, which has the same truth: 1/2 in the gear, -1/2 or
 less in another. Tools write `gear == i` (FalStar) or `gear >= i & gear <= i` (FReaK), whose
-robustness in the gear is 0, and with it that of AT5, broken or not. The interval [0.001, 0.1] of AT5
-begins with the first sample after the instant, 0.01 s later.
+robustness in the gear is 0, and with it that of AT5, broken or not. The interval [0.001, 0.1] of
+AT5 begins with the first sample after the instant, 0.01 s later.
 """
 
 import verifai_jax as vj

@@ -121,6 +121,17 @@ def test_transitions_at_the_end_of_steps_come_late(located):
     assert np.max(np.abs(located(throttle, brake)[-1] - late["y5"])) > 0.01
 
 
+def test_located_transitions_do_not_depend_on_the_step(located):
+    finer = cc.chasing_cars(25.0).refined(2)
+    inputs = ([1.0, 0.2, 0.9, 0.6, 0.0], [0.0, 0.7, 0.1, 0.3, 0.9])
+    names = ("throttle", "brake")
+    features = {n: Waveform(jnp.array(k), "constant") for n, k in zip(names, inputs, strict=True)}
+    places = jax.jit(finer.__call__)(features)
+    np.testing.assert_allclose(located(*inputs)[4], places["y5"], rtol=0, atol=1e-8)
+    with pytest.raises(ValueError, match="factor must be a positive integer; got 0"):
+        finer.refined(0)
+
+
 def test_single_precision_keeps_the_gaps():
     system, inputs = cc.chasing_cars(25.0), {"throttle": 1.0, "brake": 0.1}
     double = jax.jit(system.__call__)(inputs)
