@@ -2,7 +2,7 @@
 
     verifai-jax falsify specs/arch/f16.py:f16a --search gradient
 
-`f16a` begins at 2338 ft, as the competition has it since 2022: about one of 4000 attitudes hits the
+`f16a` begins at 2338 ft, as the competition has it since 2022: about 2 of 10 000 attitudes hit the
 ground, by less than a foot, all of them with the steepest dive. `f16a_high` begins at 4040 ft, as
 before, where only the MATLAB version of 2018 fails: a negative control.
 """
