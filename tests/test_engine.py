@@ -143,7 +143,9 @@ def test_forward_and_reverse_agree(d):
         gradient, auxiliary = jax.jit(lambda u, f=derivative: f(objective, u))(u)
         np.testing.assert_allclose(gradient, wanted, atol=1e-6)
         np.testing.assert_allclose(auxiliary["sum"], u.sum(), rtol=1e-6)
-    assert Derivative(d).reverse == (d > 4)
+    assert Derivative(d).reverse
+    assert Derivative(d, forward_up_to=11).reverse == (d > 11)
+    assert not Derivative(1).reverse
 
 
 class Iterated:

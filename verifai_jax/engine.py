@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.carried import carried_monitor
 from verifai_jax.devices import enable_compile_cache
-from verifai_jax.gradients import Derivative, reverse_refused
+from verifai_jax.gradients import FORWARD_UP_TO, Derivative, reverse_refused
 from verifai_jax.mtl import robustness, satisfied, smooth
 from verifai_jax.packing import Packing
 from verifai_jax.problem import Problem
@@ -128,7 +128,8 @@ class Engine:
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
-        self._derivative = Derivative(problem.space.dim)
+        limit = getattr(problem.system, "forward_up_to", FORWARD_UP_TO)
+        self._derivative = Derivative(problem.space.dim, limit)
         self._packing: dict[str, Packing] = {}
         self._executables: dict[str, Any] = {}
 

@@ -16,23 +16,27 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-FORWARD_LIMIT = 4
-"""Coordinates up to which forward sweeps are no slower than one reverse."""
+FORWARD_UP_TO = 1
+"""Coordinates up to which forward sweeps are no slower than one reverse, in a small model."""
 SWEEPS = 8
 """Forward sweeps at a time: more fill the cache, fewer repeat the simulation more often."""
 
 
 @dataclass(frozen=True)
 class Derivative:
-    """The gradient of an objective over `dim` coordinates; `reverse` says by which mode."""
+    """The gradient of an objective over `dim` coordinates; `reverse` says by which mode.
+
+    - `forward_up_to`: coordinates up to which forward sweeps are the quicker way.
+    """
 
     dim: int
+    forward_up_to: int = FORWARD_UP_TO
     mode: str | None = None
 
     @property
     def reverse(self) -> bool:
         """Whether one reverse sweep is taken."""
-        return self.mode == "reverse" or (self.mode is None and self.dim > FORWARD_LIMIT)
+        return self.mode == "reverse" or (self.mode is None and self.dim > self.forward_up_to)
 
     def by(self, mode: str) -> "Derivative":
         """The same by `"forward"` sweeps or by one `"reverse"` sweep, whatever the dimension."""

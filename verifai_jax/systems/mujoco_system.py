@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,9 @@ class MuJoCo:
     - `backend`: `"native"`, `"mjx"`, or `"auto"` until a run chooses.
     """
 
+    # Measured on the cart-pole in MJX: four forward sweeps take 0.8 of one reverse sweep's time,
+    # and half of its time to compile.
+    forward_up_to: ClassVar[int] = 4
     loop: Loop
     backend: str = "auto"
 
