@@ -39,6 +39,9 @@ class MuJoCo:
     # Measured on the cart-pole in MJX: four forward sweeps take 0.8 of one reverse sweep's time,
     # and half of its time to compile.
     forward_up_to: ClassVar[int] = 4
+    # Lanes wait for the one whose contacts take most iterations: a ball at 144 000 steps/s with 128
+    # together, 47 000 with 512.
+    lanes: ClassVar[int] = 128
     loop: Loop
     backend: str = "auto"
 
