@@ -62,11 +62,7 @@ class MuJoCo:
         Without anything for a constraint solver to do, MJX measured three times native's speed
         (a cart-pole); with a contact a seventh of it (a ball).
         """
-        model = self.loop.compiled
-        touching = bool(model.npair) or _may_touch(model)
-        limited = bool(np.any(model.jnt_limited)) or bool(np.any(model.tendon_limited))
-        constrained = bool(model.neq) or bool(np.any(model.dof_frictionloss > 0))
-        return "native" if touching or limited or constrained else "mjx"
+        return "native" if in_jax.constrained(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
         """Why an engine cannot simulate this model; None where it can."""
@@ -238,14 +234,6 @@ def mjx(model: Any, **options: Any) -> MuJoCo:
 def native(model: Any, **options: Any) -> MuJoCo:
     """A MuJoCo model stepped in C on all cores; the arguments are those of `mujoco`."""
     return mujoco(model, backend="native", **options)
-
-
-def _may_touch(model: Any) -> bool:
-    """Whether any two geoms may ever be in contact."""
-    kinds, with_ = model.geom_contype, model.geom_conaffinity
-    meets = (kinds[:, None] & with_[None, :]) | (with_[:, None] & kinds[None, :])
-    bodies = model.geom_bodyid
-    return bool(np.any(meets[bodies[:, None] != bodies[None, :]]))
 
 
 def _whole(seconds: float, part: float, name: str, of: str) -> int:
