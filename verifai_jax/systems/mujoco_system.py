@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.errors import suggests_options, unknown_name
-from verifai_jax.systems.mjx import reverse_hint, rollout, why_not
+from verifai_jax.systems.mjx import constrained, reverse_hint, rollout, why_not
 from verifai_jax.systems.mujoco_bindings import Bound, bindings
 from verifai_jax.systems.mujoco_loop import Loop, Signals
 from verifai_jax.systems.mujoco_model import load
@@ -62,7 +62,7 @@ class MuJoCo:
         Without anything for a constraint solver to do, MJX measured three times native's speed
         (a cart-pole); with a contact a seventh of it (a ball).
         """
-        return "native" if in_jax.constrained(self.loop.compiled) else "mjx"
+        return "native" if constrained(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
         """Why an engine cannot simulate this model; None where it can."""
