@@ -28,6 +28,7 @@ class TwoEngines:
     slow: float = 0.0
     backends: tuple[str, ...] = ("native", "mjx")
     broken: str = ""
+    likely: str = "native"
 
     @property
     def black_box(self):
@@ -92,6 +93,16 @@ def test_the_faster_one_is_taken_as_measured(monkeypatch, slow, faster):
     assert "simulations/s on native" in choice.why
     # Measured once: runs of one process agree.
     assert resolved(two, batch=8, budget=8)[:2] == choice[:2]
+
+
+@pytest.mark.parametrize(
+    ("likely", "budget", "tried"),
+    [("native", 400, False), ("mjx", 400, True), ("mjx", 100, False), ("native", 2000, True)],
+)
+def test_a_compiler_is_asked_where_it_may_pay(monkeypatch, likely, budget, tried):
+    monkeypatch.setattr(backends, "_measured", lambda engine, on, batch: 40 if on.black_box else 90)
+    choice = resolved(problem(likely=likely), batch=8, budget=budget)
+    assert choice.backend == ("mjx" if tried else "native")
 
 
 def test_a_model_that_mjx_cannot_do_is_simulated_natively(monkeypatch):
