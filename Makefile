@@ -58,12 +58,15 @@ notebooks: .venv/installed
 	.venv-bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]'
 	@touch $@
 
-bench: .venv-bench/installed
+bench: .venv-bench/installed .venv/installed
 	.venv-bench/bin/python benchmarks/throughput.py
 	.venv-bench/bin/python benchmarks/search_quality.py landscapes
 	.venv-bench/bin/python benchmarks/search_quality.py cartpole
 	.venv-bench/bin/python benchmarks/search_cost.py
 	.venv-bench/bin/python benchmarks/monitor.py
+	$(BIN)/python benchmarks/engine.py
+	$(BIN)/python benchmarks/contact_gradients.py
+	$(BIN)/python benchmarks/remote.py
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole

@@ -87,8 +87,9 @@ def brax_pendulum():
         backend="generalized",
         steps=100,
         signals={"angle": 1},
+        features={"pole": "link.inertia.mass[pole]"},
     )
-    return vj.Problem("brax", {"unused": vj.Constant(0.0)}, system, "always angle <= 0.2")
+    return vj.Problem("brax", {"pole": vj.Box(3.0, 6.0)}, system, "always angle <= 0.2")
 
 
 def engine_of(problem, batch):
@@ -133,8 +134,7 @@ def speed():
                 figures.append(f"{measured_speed(problem, batch):>12,.0f}")
             except Exception as error:
                 figures.append(f"{type(error).__name__:>12}")
-            print(f"\r{name:<40}{' '.join(figures)}", end="", flush=True)
-        print()
+        print(f"{name:<40}{' '.join(figures)}", flush=True)
 
 
 def overhead():
@@ -163,18 +163,39 @@ def overhead():
         print(f"{problem.name:<12}{ratio:6.3f}   {1e3 * ours:8.2f} {1e3 * theirs:8.2f}", flush=True)
 
 
+ONE_THROUGHPUT = """
+import os
+os.sched_setaffinity(0, {cores})
+from benchmarks import engine as bench
+print(bench.measured_speed(bench.{problem}(), 4096, least=2.0))
+"""
+
+
 def cores():
-    print(f"throughput on {len(jax.devices())} devices / on one, batch 4096")
-    for problem in (linear_cartpole(), network_cartpole()):
-        u = points(problem, 4096)
-        one, every = (Engine(problem, 4096, devices=d) for d in (jax.devices()[:1], None))
-        one.compile(), every.compile()
-        ratio, *_ = paired(
-            lambda e=one, u=u: e.evaluate(u, KEY, 0),
-            lambda e=every, u=u: e.evaluate(u, KEY, 0),
-            21,
-        )
-        print(f"{problem.name:<12}{ratio:6.2f}", flush=True)
+    """Processes of their own: one bound to one core, one with all, in turn."""
+    every = os.sched_getaffinity(0)
+    print(f"throughput on {len(every)} cores / on one, batch 4096")
+    for problem in ("linear_cartpole", "network_cartpole"):
+        ratios = []
+        for _ in range(5):
+            all_cores, one = (
+                float(told(ONE_THROUGHPUT.format(cores=cores, problem=problem))[0])
+                for cores in (every, {min(every)})
+            )
+            ratios.append(all_cores / one)
+        print(f"{problem:<18}{statistics.median(ratios):6.2f}", flush=True)
+
+
+def told(code, **environment):
+    """The words that a Python program prints, in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": ".", **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.split()
 
 
 def gradients():
@@ -232,17 +253,8 @@ def compile_times():
     for name, (expression, gradient) in cases.items():
         with tempfile.TemporaryDirectory() as cache:
             code = ONE_COMPILE.format(name=expression, gradient=gradient)
-            told = [
-                subprocess.run(
-                    [sys.executable, "-c", code],
-                    env={**os.environ, "VERIFAI_JAX_CACHE": cache, "PYTHONPATH": "."},
-                    capture_output=True,
-                    text=True,
-                    check=True,
-                ).stdout.split()
-                for _ in range(2)
-            ]
-        print(f"{name:<36}cold {told[0][1]:>6}   warm {told[1][1]:>6}", flush=True)
+            cold, warm = (told(code, VERIFAI_JAX_CACHE=cache)[1] for _ in range(2))
+        print(f"{name:<36}cold {cold:>6}   warm {warm:>6}", flush=True)
 
 
 def native():
