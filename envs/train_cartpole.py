@@ -6,13 +6,11 @@
 Nothing is written, and the exit status is 1, if the policy did not learn to balance.
 """
 
-import argparse
 import sys
-import time
-from pathlib import Path
 
 from envs.cartpole import POLICY_FILE, CartPoleTask
-from verifai_jax.rl import PPO, evaluate, save_policy, train
+from envs.training import Training
+from verifai_jax.rl import PPO
 
 HYPER_PARAMETERS = PPO(
     learning_rate=5e-4,
@@ -23,41 +21,16 @@ HYPER_PARAMETERS = PPO(
 )
 SOLVED = 475.0  # CartPole-v1's reward threshold
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Train, measure, and write the weights; returns the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=500_000, help="environment steps")
-    parser.add_argument("--out", type=Path, default=POLICY_FILE)
-    chosen = parser.parse_args(arguments)
-
-    started = time.perf_counter()
-    trained = train(CartPoleTask(), HYPER_PARAMETERS, seed=chosen.seed, steps=chosen.steps)
-    seconds = time.perf_counter() - started
-    returns = evaluate(CartPoleTask(), trained.policy, seed=chosen.seed + 1, episodes=1000)
-    mean_return = float(returns.mean())
-    print(
-        f"{trained.steps[-1]} steps in {seconds:.1f} s, compile included; "
-        f"mean return {mean_return:.1f} of 500, worst {returns.min():.0f} of 1000 episodes"
-    )
-    if mean_return < SOLVED:
-        print(f"not solved: the mean return must reach {SOLVED:g}; nothing written")
-        return 1
-    save_policy(
-        trained.policy,
-        chosen.out,
-        task="CartPole-v1",
-        algorithm="PPO",
-        seed=chosen.seed,
-        steps=int(trained.steps[-1]),
-        mean_return=mean_return,
-    )
-    print(f"wrote {chosen.out}")
-    return 0
+TRAINING = Training(
+    CartPoleTask(),
+    HYPER_PARAMETERS,
+    name="CartPole-v1",
+    file=POLICY_FILE,
+    steps=500_000,
+    solved=SOLVED,
+    most=500,
+)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(TRAINING.main(__doc__))

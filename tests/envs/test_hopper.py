@@ -10,7 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from envs import hopper as h
-from envs import train_hopper
+from envs import train_hopper, training
 from specs import hopper as specs
 from verifai_jax.errors import UnknownNameError
 from verifai_jax.rl import Discrete, Trained, evaluate, load_policy, policy_notes
@@ -154,9 +154,9 @@ def test_the_engines_agree_until_contacts_make_them_part(native):
 def test_a_policy_that_did_not_learn_is_not_written(earned, status, tmp_path, capsys, monkeypatch):
     policy, out = load_policy(h.POLICY_FILE), tmp_path / "policy.npz"
     trained = Trained(policy, np.array([8192]), np.array([np.nan]))
-    monkeypatch.setattr(train_hopper, "train", lambda *task, **options: trained)
-    monkeypatch.setattr(train_hopper, "evaluate", lambda *task, **options: np.full(256, earned))
-    assert train_hopper.main(["--seed", "5", "--out", str(out)]) == status
+    monkeypatch.setattr(training, "train", lambda *task, **options: trained)
+    monkeypatch.setattr(training, "evaluate", lambda *task, **options: np.full(256, earned))
+    assert train_hopper.TRAINING.main(None, ["--seed", "5", "--out", str(out)]) == status
     assert ("nothing written" in capsys.readouterr().out) == (status == 1)
     assert out.exists() == (status == 0)
     if status == 0:
