@@ -161,22 +161,21 @@ def test_killed_at_random_moments_and_resumed_the_table_is_the_same(kind, kills,
     script.write_text(KILLED)
     root = str(Path(__file__).parent.parent)
     environment = {**os.environ, "PYTHONPATH": root, "VERIFAI_JAX_CACHE": str(tmp_path / "cache")}
-    budget = {"traced": 480_000, "blackbox": 24_000}[kind]
-    command = [sys.executable, str(script), kind, str(folder), str(budget)]
-    moments, done = random.Random(0), 0
-    whole = vj.falsify(slow_problem("traced"), "cross_entropy", budget, batch=16).table.all
+    # More than any machine can do meanwhile: every one of the processes is killed.
+    command = [sys.executable, str(script), kind, str(folder), str(100_000_000)]
+    moments = random.Random(0)
     for _ in range(kills):
         child = subprocess.Popen(command, env=environment, cwd=root)
         # Some die while they import, most in the middle of their rounds.
-        try:
+        with pytest.raises(subprocess.TimeoutExpired):
             child.wait(timeout=moments.uniform(1.0, 6.0))
-        except subprocess.TimeoutExpired:
-            os.kill(child.pid, signal.SIGKILL)
-            done += 1
+        os.kill(child.pid, signal.SIGKILL)
         child.wait()
-    assert done == kills
-    subprocess.run(command, env=environment, cwd=root, check=True, timeout=300)
-    table = vj.load(folder, slow_problem(kind)).table.all
+    cut_off = len(vj.load(folder).table)
+    assert cut_off > 1000
+    budget = 16 * (cut_off // 16 + 50)
+    table = vj.resume(folder, slow_problem(kind), budget=budget).table.all
+    whole = vj.falsify(slow_problem("traced"), "cross_entropy", budget, batch=16).table.all
     assert list(table.index) == list(range(budget))
     np.testing.assert_allclose(table["rho"], whole["rho"], atol=0 if kind == "traced" else 1e-6)
     assert table["a"].equals(whole["a"])
