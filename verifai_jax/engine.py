@@ -123,7 +123,8 @@ class Engine:
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
         per_device = -(-batch // len(self.devices))
-        self.chunks = -(-per_device // getattr(problem.system, "lanes", CHUNK))
+        self.together = getattr(problem.system, "lanes", CHUNK)
+        self.chunks = -(-per_device // self.together)
         self.lanes = -(-per_device // self.chunks)
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.engine import Evaluation, in_precision, judge, simulation_key, verdict
 from verifai_jax.journal import Journal, Judged
 from verifai_jax.problem import Problem
+from verifai_jax.systems.blackbox import plain_leaves
 from verifai_jax.systems.simulations import Batched, Each, Outcome
 from verifai_jax.trace import Status, Trace
 
@@ -90,7 +91,7 @@ class HostEngine:
         for i, judged in known.items():
             rows.put(i, judged)
         todo = [i for i in range(len(u)) if i not in known]
-        each = [jax.tree.map(lambda leaf, i=i: plain(leaf[i]), features) for i in todo]
+        each = [plain_leaves(jax.tree.map(lambda leaf, i=i: leaf[i], features)) for i in todo]
         waiting: dict[Any, list[tuple[int, Trace]]] = {}
 
         def settle(form: Any) -> None:
@@ -206,11 +207,6 @@ def _power_of_two(leaf: Any) -> np.ndarray:
     leaf = np.asarray(leaf)
     missing = (1 << (len(leaf) - 1).bit_length()) - len(leaf)
     return np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]) if missing else leaf
-
-
-def plain(leaf: Any) -> Any:
-    """A number as Python's own, an array as NumPy's."""
-    return np.asarray(leaf).item() if np.ndim(leaf) == 0 else np.asarray(leaf)
 
 
 def pad_trace(trace: Trace) -> Trace:

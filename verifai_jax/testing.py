@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.features import Domain, FeatureSpace
-from verifai_jax.host import plain
 from verifai_jax.search import Cube, Evaluated, Search
+from verifai_jax.systems.blackbox import plain_leaves
 from verifai_jax.trace import Status, Trace
 
 
@@ -207,7 +207,7 @@ def check_system(
     one_by_one: Any = getattr(system, "simulate_each", None)
     if one_by_one is not None:
         seeds = [int(seed) for seed in jax.vmap(jax.random.bits)(keys)]
-        found = list(one_by_one([jax.tree.map(plain, f) for f in each], seeds))
+        found = list(one_by_one([plain_leaves(f) for f in each], seeds))
         numbers = sorted(i for i, _ in found)
         assert numbers == list(range(samples)), (
             f"simulate_each must give each of {samples} indices once; got {numbers}"

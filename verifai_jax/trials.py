@@ -20,7 +20,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Float, Int
 
 from verifai_jax.devices import enable_compile_cache
-from verifai_jax.engine import CHUNK, Engine, in_precision, simulation_key
+from verifai_jax.engine import Engine, in_precision, simulation_key
 from verifai_jax.errors import suggests_options
 from verifai_jax.options import check_options, check_search, usual_batch
 from verifai_jax.problem import Problem
@@ -184,9 +184,9 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
 
     def on_device(state: Any, keys: Any, first: Any) -> Any:
         # Blocks of seeds whose simulations fit the cache together.
-        together = max(1, CHUNK // batch)
+        blocks = max(1, engine.together // batch)
         return jax.lax.map(
-            lambda seed: one_seed(seed[0], seed[1], first), (state, keys), batch_size=together
+            lambda seed: one_seed(seed[0], seed[1], first), (state, keys), batch_size=blocks
         )
 
     split, whole = PartitionSpec("seed"), PartitionSpec()
