@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.mtl import online
 from verifai_jax.problem import Problem
@@ -35,11 +35,10 @@ def carried_monitor(problem: Problem) -> Judge | None:
             return None
     except ValueError:
         return None  # It looks ahead without end; or its clock is wrong, which `judge` says better.
-    names = list(dict.fromkeys(n for f in problem.formulas.values() for n in f.signals()))
 
     def update(carry: Any, sample: Any) -> Any:
         states, finite = carry
-        for name in names:
+        for name in problem.monitored:
             signal = jnp.asarray(sample[name])
             if jnp.issubdtype(signal.dtype, jnp.inexact):
                 finite &= jnp.all(jnp.isfinite(signal))
@@ -50,7 +49,14 @@ def carried_monitor(problem: Problem) -> Judge | None:
         start = (tuple(monitor.init() for monitor in monitors), jnp.array(True))
         (states, finite), status = system.fold(features, key, start, update)
         rho = jnp.stack([m.finish(state) for m, state in zip(monitors, states, strict=True)])
-        status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
-        return jnp.where(status == Status.OK, rho, jnp.nan), status
+        return with_status(rho, status, finite)
 
     return judge
+
+
+def with_status(
+    rho: Float[Array, " formulas"], status: Int[Array, ""], finite: Bool[Array, ""]
+) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
+    """The status, given whether all signals are finite; robustness is NaN unless it is OK."""
+    status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
+    return jnp.where(status == Status.OK, rho, jnp.nan), status

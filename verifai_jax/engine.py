@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.carried import carried_monitor
+from verifai_jax.carried import carried_monitor, with_status
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.gradients import FORWARD_UP_TO, Derivative, reverse_refused
 from verifai_jax.mtl import robustness, satisfied, smooth
@@ -77,13 +77,12 @@ def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], In
         [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
     )
     finite = jnp.array(True)
-    for name in dict.fromkeys(n for f in problem.formulas.values() for n in f.signals()):
+    for name in problem.monitored:
         signal = jnp.asarray(trace.signals[name])
         if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
             finite &= jnp.all(jnp.isfinite(signal))
     status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
-    status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
-    return jnp.where(status == Status.OK, rho, jnp.nan), status
+    return with_status(rho, status, finite)
 
 
 def verdict(problem: Problem, trace: Trace) -> Bool[Array, " formulas"]:

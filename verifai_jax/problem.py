@@ -91,6 +91,11 @@ class Problem:
             self.space.check(self.nominal)
 
     @property
+    def monitored(self) -> tuple[str, ...]:
+        """Names of the signals that the formulas speak of."""
+        return tuple(dict.fromkeys(n for f in self.formulas.values() for n in f.signals()))
+
+    @property
     def black_box(self) -> bool:
         """Whether the system runs on the host, out of JAX's sight."""
         return bool(getattr(self.system, "black_box", False))
