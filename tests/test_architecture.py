@@ -47,8 +47,10 @@ ALLOWED = {
         "trace",
     },
     "proposals": {"features", "search"},
+    "evaluator": {"engine", "host", "problem", "run", "trace"},
     "rounds": {
         "engine",
+        "evaluator",
         "host",
         "journal",
         "problem",

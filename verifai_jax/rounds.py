@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.engine import Engine, Evaluation, engine_for
+from verifai_jax.engine import Evaluation, engine_for
+from verifai_jax.evaluator import violated
 from verifai_jax.host import HostEngine
 from verifai_jax.journal import Journal
 from verifai_jax.problem import Problem
@@ -166,19 +167,10 @@ class Rounds:
         }
 
     def _violated(self, evaluation: Evaluation, points: Any, first: int) -> np.ndarray:
-        violated = np.any(evaluation.rho < 0, axis=1)
-        proper = evaluation.status == Status.OK
-        undecided = proper & ~violated & np.any(evaluation.rho == 0, axis=1)
-        if undecided.any():
-            # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
-            holds = evaluation.holds
-            if holds is None:
-                assert isinstance(self.engine, Engine)
-                compiled = self.engine.compile_seconds
-                holds = self.engine.verdicts(points, self.simulation_key, first)
-                self.compile_seconds += self.engine.compile_seconds - compiled
-            violated |= undecided & ~np.all(holds, axis=1)
-        return violated
+        compiled = getattr(self.engine, "compile_seconds", 0.0)
+        found = violated(self.engine, evaluation, points, self.simulation_key, first)
+        self.compile_seconds += getattr(self.engine, "compile_seconds", 0.0) - compiled
+        return found
 
     def _columns(self, evaluation: Evaluation, rho: Any, violated: Any) -> dict[str, Any]:
         columns: dict[str, Any] = {**self.problem.space.rows(evaluation.features), "rho": rho}
