@@ -103,10 +103,13 @@ def dynamics(time: Scalar, state: State, force: Scalar, features: Features) -> S
 
 
 def pushed(time: Scalar, push_time: Scalar | float) -> Scalar:
-    """The part of the step that begins at `time` during which the push acts, in `[0, 1]`.
+    """The part of the 0.02 s around `time` during which the push acts, in `[0, 1]`.
 
-    Continuous in `push_time`, so that a gradient search can shift the push.
+    Continuous in `push_time`, so that a gradient search can shift the push; the same push at any
+    step of the integration.
     """
+    # A thousandth more than the quotient, which may be rounded down.
+    time = jnp.floor(time / DT + 1e-3) * DT
     begin = jnp.maximum(time, push_time)
     end = jnp.minimum(time + DT, push_time + PUSH_SECONDS)
     return jnp.maximum(end - begin, 0.0) / DT

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from envs.arch.stepped import Features, Scalar, Stepped, real, value, whole
+from envs.arch.stepped import Features, Scalar, Stepped, real, repeated, value, whole
 from envs.arch.tables import bilinear, hinges, interpolated
 
 DT = 0.01
@@ -147,7 +147,7 @@ def shifted(state: State, throttle: Scalar) -> State:
     return state._replace(gear=gear, phase=phase.astype(jnp.int32), ticks=ticks)
 
 
-def driven(state: State, throttle: Scalar, brake: Scalar, dt: float = DT) -> State:
+def driven(state: State, throttle: Scalar, brake: Scalar, dt: Any = DT) -> State:
     """One step of the engine and the wheels, in a gear that stays."""
     dtype = real()
     ratio = _of_gear(GEAR_RATIO, state.gear).astype(dtype)
@@ -192,12 +192,11 @@ def initial(features: Features) -> State:
     )
 
 
-def advance(k: Int[Array, ""], state: State, features: Features, substeps: int = 1) -> State:
+def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 1) -> State:
     """From sample `k` to the next, whose gear is the one after the chart has run there."""
     time = k.astype(real()) * DT
     throttle, brake = value(features["throttle"], time), value(features["brake"], time)
-    for _ in range(substeps):
-        state = driven(state, throttle, brake, DT / substeps)
+    state = repeated(lambda _, s: driven(s, throttle, brake, DT / substeps), state, substeps)
     then = (k + 1).astype(real()) * DT
     ticked = shifted(state, value(features["throttle"], then))
     tick = (k + 1) % STEPS_PER_TICK == 0
@@ -209,7 +208,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     return {"speed": speed(state), "rpm": state.engine, "gear": state.gear}
 
 
-def automatic_transmission(duration: float = 30.0, *, substeps: int = 1) -> Stepped:
+def automatic_transmission(duration: float = 30.0, *, substeps: Any = 1) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 0.01. The competition has 50 s; its requirements
@@ -224,4 +223,5 @@ def automatic_transmission(duration: float = 30.0, *, substeps: int = 1) -> Step
         whole(duration, DT, "duration"),
         NOMINAL,
         lambda factor: automatic_transmission(duration, substeps=substeps * factor),
+        traced_factor=True,
     )

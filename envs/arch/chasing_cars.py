@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from envs.arch.stepped import Features, Scalar, Stepped, real, value, whole
+from envs.arch.stepped import Features, Scalar, Stepped, real, repeated, value, whole
 
 DT = 0.01
 CHASING, KEEPING, BRAKING = 0, 1, 2
@@ -100,7 +100,7 @@ def _threshold(mode: Any, gap: Scalar) -> tuple[Scalar, Any, Any]:
     return threshold, ended, following.astype(jnp.int32)
 
 
-def _followed(leader: Path, car: Any, dt: float) -> tuple[Path, Any]:
+def _followed(leader: Path, car: Any, dt: Any) -> tuple[Path, Any]:
     """The path of a car behind `leader` over one step, and its mode at the end."""
     gap, speed, mode = car
     own = _motion(mode, jnp.zeros_like(gap), speed)
@@ -146,7 +146,7 @@ def initial(features: Features) -> State:
     )
 
 
-def _first(middle: Scalar, state: State, features: Features, dt: float) -> Path:
+def _first(middle: Scalar, state: State, features: Features, dt: Any) -> Path:
     throttle, brake = value(features["throttle"], middle), value(features["brake"], middle)
     zero, one = jnp.zeros_like(state.y1), jnp.ones_like(state.y1)
     motion = Motion(zero, state.v1, -throttle, jnp.asarray(brake, zero.dtype), one)
@@ -156,11 +156,12 @@ def _first(middle: Scalar, state: State, features: Features, dt: float) -> Path:
 
 
 def advance(
-    k: Int[Array, ""], state: State, features: Features, substeps: int = 1, located: bool = True
+    k: Int[Array, ""], state: State, features: Features, substeps: Any = 1, located: bool = True
 ) -> State:
     """A hundredth of a second, with transitions within its steps or at their ends."""
     step, dt = _located if located else _unlocated, DT / substeps
-    for j in range(substeps):
+
+    def substep(j: Any, state: State) -> State:
         middle = k.astype(real()) * DT + (j + 0.5) * dt
         first = _first(middle, state, features, dt)
         # Each car follows the path of the one before; the first has only the input.
@@ -169,18 +170,19 @@ def advance(
             (first, first.after.place),
             (state.gaps, state.speeds, state.modes),
         )
-        state = State(state.y1 + first.after.place, first.after.speed, *cars)
-    return state
+        return State(state.y1 + first.after.place, first.after.speed, *cars)
+
+    return repeated(substep, state, substeps)
 
 
-def _located(carry: Any, car: Any, dt: float) -> Any:
+def _located(carry: Any, car: Any, dt: Any) -> Any:
     leader, moved = carry
     path, mode = _followed(leader, car, dt)
     place, speed = path.after.at(dt - path.change)
     return (path, place), (car[0] + (place - moved), speed, mode)
 
 
-def _unlocated(carry: Any, car: Any, dt: float) -> Any:
+def _unlocated(carry: Any, car: Any, dt: Any) -> Any:
     first, moved = carry
     gap, speed, mode = car
     place, speed = _motion(mode, jnp.zeros_like(gap), speed).at(dt)
@@ -197,7 +199,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     return {f"y{i}": place for i, place in enumerate(places, 1)}
 
 
-def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: int = 1) -> Stepped:
+def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: Any = 1) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
@@ -212,4 +214,5 @@ def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: int
         whole(duration, DT, "duration"),
         NOMINAL,
         lambda factor: chasing_cars(duration, located=located, substeps=substeps * factor),
+        traced_factor=True,
     )

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from envs.arch.f16_dynamics import Plane, Reference, Scalar, slope
-from envs.arch.stepped import Features, Stepped, real, whole
+from envs.arch.stepped import Features, Stepped, real, repeated, whole
 
 DT = 1 / 30
 STANDBY, ROLL, PULL = 0, 1, 2
@@ -92,15 +92,13 @@ def initial(features: Features) -> State:
     return decided(State(plane._replace(**given), jnp.int32(ROLL), jnp.int32(0)))
 
 
-def advance(k: Int[Array, ""], state: State, features: Features, substeps: int = 1) -> State:
+def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 1) -> State:
     """A thirtieth of a second, at whose end the automatic pilot thinks again."""
-    plane = state.plane
-    for _ in range(substeps):
-        plane = _flown(plane, state.mode, DT / substeps)
+    plane = repeated(lambda _, p: _flown(p, state.mode, DT / substeps), state.plane, substeps)
     return decided(State(plane, state.mode, state.since + 1))
 
 
-def _flown(start: Plane, mode: Int[Array, ""], dt: float) -> Plane:
+def _flown(start: Plane, mode: Int[Array, ""], dt: Any) -> Plane:
     """One step of the classical Runge-Kutta method."""
 
     # A scan over the four stages of the classical method: XLA takes minutes for the derivative of
@@ -129,7 +127,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     return {**flight, "mode": state.mode.astype(real())}
 
 
-def f16(duration: float = 15.0, *, substeps: int = 1) -> Stepped:
+def f16(duration: float = 15.0, *, substeps: Any = 1) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 1/30.
@@ -143,4 +141,5 @@ def f16(duration: float = 15.0, *, substeps: int = 1) -> Stepped:
         whole(duration, DT, "duration"),
         NOMINAL,
         lambda factor: f16(duration, substeps=substeps * factor),
+        traced_factor=True,
     )

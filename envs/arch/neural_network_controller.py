@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from envs.arch.stepped import Features, Scalar, Stepped, real, value, whole
+from envs.arch.stepped import Features, Scalar, Stepped, real, repeated, value, whole
 from verifai_jax.systems.integrators import rk4
 
 DT = 0.01
@@ -166,15 +166,14 @@ def _decided(k: Int[Array, ""], state: State, features: Features) -> Scalar:
     return controlled(state, value(features["Ref"], k.astype(real()) * DT))
 
 
-def advance(k: Int[Array, ""], state: State, features: Features, substeps: int = 10) -> State:
+def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 10) -> State:
     """One control period."""
     current = _decided(k, state, features)
 
-    def substep(plant: Any, _: None) -> Any:
-        return rk4(lambda _, s: slope(s, current), 0.0, plant, DT / substeps), None
+    def substep(_: Any, plant: Any) -> Any:
+        return rk4(lambda _, s: slope(s, current), 0.0, plant, DT / substeps)
 
-    plant = (state.position, state.velocity)
-    (position, velocity), _ = jax.lax.scan(substep, plant, None, length=substeps)
+    position, velocity = repeated(substep, (state.position, state.velocity), substeps)
     return State(
         position,
         velocity,
@@ -192,7 +191,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
     }
 
 
-def neural_network_controller(duration: float = 40.0, *, substeps: int = 10) -> Stepped:
+def neural_network_controller(duration: float = 40.0, *, substeps: Any = 10) -> Stepped:
     """The model as a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
@@ -206,4 +205,5 @@ def neural_network_controller(duration: float = 40.0, *, substeps: int = 10) -> 
         whole(duration, DT, "duration"),
         NOMINAL,
         lambda factor: neural_network_controller(duration, substeps=substeps * factor),
+        traced_factor=True,
     )

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from verifai_jax.errors import check_names
 from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.systems.integrators import check_factor
 from verifai_jax.trace import Status, Trace
 from verifai_jax.waveform import bound
 
@@ -37,6 +38,8 @@ class Stepped:
     - `nominal`: the features that the model has, with their values where they are not given.
     - `finer(factor) -> Stepped`: the same model with so many times as many integration steps; None
       where there is nothing to integrate.
+    - `traced_factor`: whether `finer` takes a factor that JAX traces, so that one program replays
+      at every step; see `repeated`.
 
     The status of the trace is `NONFINITE` if the last state is NaN or infinite; a model must not
     recover from such a state.
@@ -49,6 +52,7 @@ class Stepped:
     steps: int
     nominal: Features = field(default_factory=dict)
     finer: Callable[[int], "Stepped"] | None = None
+    traced_factor: bool = False
 
     @property
     def duration(self) -> float:
@@ -60,8 +64,8 @@ class Stepped:
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
-        if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
-            raise ValueError(f"factor must be a positive integer; got {factor!r}")
+        if not (self.traced_factor and isinstance(factor, jax.core.Tracer)):
+            check_factor(factor)
         return self if self.finer is None else self.finer(factor)
 
     def check(self, features: Features) -> None:
@@ -110,6 +114,13 @@ def value(feature: Any, time: Scalar | float) -> Any:
 def real() -> Any:
     """The floating type of this process: double where JAX's x64 is on."""
     return jnp.result_type(float)
+
+
+def repeated(step: Callable[[Any, Any], Any], state: Any, count: Any) -> Any:
+    """`state = step(j, state)` for `j` below `count`, which JAX may trace: forward mode only then."""
+    if isinstance(count, int) and count == 1:
+        return step(0, state)
+    return jax.lax.fori_loop(0, count, step, state)
 
 
 def whole(seconds: float, dt: float, name: str) -> int:

@@ -67,5 +67,14 @@ def integrator(method: str) -> Integrator:
     return METHODS[method]
 
 
+def check_factor(factor: Any) -> None:
+    """Refuse what cannot divide a step.
+
+    **Raises:** `ValueError` for a factor that is not a positive integer.
+    """
+    if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
+        raise ValueError(f"factor must be a positive integer; got {factor!r}")
+
+
 def _advance(state: Any, dt: float, slope: Any) -> Any:
     return jax.tree.map(lambda s, d: s + dt * d, state, slope)

@@ -10,8 +10,8 @@ forward and reverse.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.errors import suggests_options
 from verifai_jax.systems.horizon import checkpointed_scan
-from verifai_jax.systems.integrators import integrator
+from verifai_jax.systems.integrators import check_factor, integrator
 from verifai_jax.systems.structure import (
     check_like,
     check_signals,
@@ -35,8 +35,12 @@ Time = Float[Array, ""]
 
 @dataclass(frozen=True, eq=False)
 class Ode:
-    """A closed loop `(features, key) -> Trace`; made by `ode`, which says what its parts are."""
+    """A closed loop `(features, key) -> Trace`; made by `ode`, which says what its parts are.
 
+    - `substeps`: integration steps between two samples; more than one in a `refined` loop.
+    """
+
+    traced_factor: ClassVar[bool] = True
     dynamics: Callable[..., Any]
     initial: Callable[..., Any]
     controller: Callable[..., Any] | None
@@ -48,11 +52,23 @@ class Ode:
     signals: Callable[..., Mapping[str, Any]] | None
     terminate: Callable[..., Any] | None
     unroll: int
+    substeps: Any = 1
 
     @property
     def duration(self) -> float:
         """Simulated seconds."""
         return self.steps * self.dt
+
+    def refined(self, factor: int) -> "Ode":
+        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+
+        The factor may be traced by JAX; the loop then has no derivative in reverse mode.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
+        """
+        if not isinstance(factor, jax.core.Tracer):
+            check_factor(factor)
+        return replace(self, substeps=self.substeps * factor)
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
@@ -184,10 +200,21 @@ class _Rollout:
         return self.loop.signals(time, state, control, self.features)
 
     def step(self, time: Time, state: Any, control: Any) -> Any:
+        """From one sample to the next."""
+        count = self.loop.substeps
+        advance = integrator(self.loop.method)
+
         def slope(time: Time, state: Any) -> Any:
             return self.loop.dynamics(time, state, control, self.features)
 
-        return integrator(self.loop.method)(slope, time, state, self.loop.dt)
+        if isinstance(count, int) and count == 1:
+            return advance(slope, time, state, self.loop.dt)
+        dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
+
+        def substep(j: Any, state: Any) -> Any:
+            return advance(slope, time + j.astype(dt.dtype) * dt, state, dt)
+
+        return jax.lax.fori_loop(0, count, substep, state)
 
     def check(self, state: Any, memory: Any) -> tuple[str, ...]:
         """Refuse functions that do not fit together; abstract evaluation, nothing compiles.
