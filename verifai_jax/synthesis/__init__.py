@@ -1,0 +1,5 @@
+"""Parameters for which a formula holds: found (`synthesize`), or mended (`repair`)."""
+
+from verifai_jax.synthesis.heldout import HeldOut as HeldOut
+from verifai_jax.synthesis.synthesize import Synthesis as Synthesis
+from verifai_jax.synthesis.synthesize import synthesize as synthesize

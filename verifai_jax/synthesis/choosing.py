@@ -1,0 +1,237 @@
+"""Parameters for a fixed set of environments: explored, climbed along gradients, or narrowed.
+
+The value of parameters is their least robustness over the set. All that is judged goes to the
+`Archive`. A `merit` says which of two choices is better: the value alone for a synthesis, first the
+value and then the distance from the nominal parameters for a repair.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.proposals import Proposals
+from verifai_jax.search import Search
+from verifai_jax.synthesis.limits import Limits
+from verifai_jax.synthesis.parametric import Pairs, Parametric
+
+ACTIVE = 16
+"""Environments, the least robust ones, that decide a step; all of them judge its result."""
+LEAST_RADIUS = 1e-5
+
+Merit = Callable[[np.ndarray, float], tuple[float, ...]]
+Propose = Callable[[np.ndarray, np.ndarray, np.ndarray, float], list[np.ndarray]]
+
+
+class Choice(NamedTuple):
+    """Parameters, and their least robustness over so many environments."""
+
+    theta: Float[np.ndarray, " p"]
+    value: float
+    environments: int
+
+
+class Archive:
+    """All parameters that were judged, newest last."""
+
+    def __init__(self) -> None:
+        self.choices: list[Choice] = []
+
+    def add(self, thetas: Any, values: Any, environments: int) -> None:
+        """Keep these."""
+        for theta, value in zip(np.asarray(thetas), values, strict=True):
+            self.choices.append(Choice(theta, float(value), environments))
+
+    def best(self, count: int, merit: Merit, apart: float = 0.0) -> list[Choice]:
+        """The best, no two nearer than `apart` in each coordinate."""
+        taken: list[Choice] = []
+        for choice in sorted(self.choices, key=lambda c: merit(c.theta, c.value), reverse=True):
+            if all(np.abs(choice.theta - other.theta).max() > apart for other in taken):
+                taken.append(choice)
+            if len(taken) == count:
+                break
+        return taken
+
+
+def by_value(theta: np.ndarray, value: float) -> tuple[float, ...]:
+    """The merit of a synthesis."""
+    return (value,)
+
+
+def least(pairs: Pairs) -> Float[np.ndarray, " k"]:
+    """The value of each choice of parameters: negative where one fails somewhere.
+
+    Minus infinity where a simulation has no verdict in an environment in which others have one, or
+    where none of the environments can happen.
+    """
+    known = np.any(pairs.proper, axis=0)
+    rho = np.where(pairs.proper, pairs.rho, -np.inf)[:, known]
+    # At exactly zero the Boolean semantics have decided.
+    rho = np.where(pairs.failing[:, known] & (rho >= 0), -np.finfo(np.float32).tiny, rho)
+    value = np.min(rho, axis=1, initial=np.inf)
+    return np.where(np.isposinf(value), -np.inf, value)
+
+
+def scale_of(rho: Any) -> float:
+    """The size of ordinary robustnesses, positive."""
+    sizes = np.abs(np.asarray(rho, float))
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    return float(np.median(sizes)) if len(sizes) else 1.0
+
+
+def judged(
+    loop: Parametric, thetas: Any, environments: Any, archive: Archive | None = None
+) -> Float[np.ndarray, " k"]:
+    """The values of these parameters over the set."""
+    values = least(loop.judge(thetas, environments))
+    if archive is not None:
+        archive.add(thetas, values, len(environments))
+    return values
+
+
+def explore(
+    loop: Parametric,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    search: Search,
+    batch: int,
+    seed: Any,
+    cost: Callable[[np.ndarray, float], float],
+    done: Callable[[Archive], bool] = lambda archive: False,
+) -> None:
+    """Drive a search over the whole space of the parameters; they must be features.
+
+    - `cost`: what the search is to make small, positive, from parameters and their value.
+    """
+    assert loop.space is not None
+    proposals = Proposals(search, loop.space, batch, jax.random.key(seed))
+    size = max(1, len(environments))
+    reference = None
+    while limits.left >= size and not proposals.exhausted:
+        thetas = np.asarray(proposals.next(min(batch, limits.left // size)), np.float64)
+        if not len(thetas):
+            proposals.tell_refused()
+            continue
+        values = judged(loop, thetas, environments, archive)
+        if done(archive):
+            break
+        known = np.isfinite(values)
+        costs = np.array([cost(*pair) for pair in zip(thetas, values, strict=True)])
+        if reference is None and known.any():
+            reference = costs[known].min(), max(float(np.std(costs[known])), 1e-9)
+        low, spread = reference or (0.0, 1.0)
+        # A search takes all failures for equally good and progress for a share: so never below 0.
+        told = np.exp(np.clip((costs - low) / spread, -60.0, 60.0))
+        proposals.tell(np.where(known, told, np.nan).astype(np.float32), known, None)
+
+
+def climb(
+    loop: Parametric,
+    thetas: Any,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    propose: Propose,
+    merit: Merit,
+    scale: float,
+    radius: float,
+    steps: int = 40,
+) -> list[Choice]:
+    """Follow the gradients of the least robust environments from each start, all in step.
+
+    - `propose(theta, rho, slopes, radius)`: candidates for a step, the boldest first.
+
+    A step is taken where simulations show that it is better; the radius follows its success.
+    """
+    thetas = np.array(thetas, np.float64)
+    rho = loop.judge(thetas, environments)
+    now = [Choice(t, v, len(environments)) for t, v in zip(thetas, least(rho), strict=True)]
+    rhos = [np.where(ok, r, np.inf) for r, ok in zip(rho.rho, rho.proper, strict=True)]
+    archive.add(thetas, [choice.value for choice in now], len(environments))
+    radii = np.full(len(now), radius)
+    for _ in range(steps):
+        alive = [
+            i for i, r in enumerate(radii) if r >= LEAST_RADIUS * radius and now[i].value > -np.inf
+        ]
+        if not alive:
+            break
+        for i in alive:
+            few = np.asarray(environments)[np.argsort(rhos[i], kind="stable")[:ACTIVE]]
+            if limits.left < 8 * len(few) + len(environments):
+                return now
+            # Cooler as steps get shorter: the kinks of the robustness matter then.
+            warmth = scale * max(0.001, 0.02 * min(1.0, radii[i] / radius))
+            seen = loop.judge(now[i].theta[None], few, warmth)
+            assert seen.by_parameters is not None
+            values = np.where(seen.proper[0], seen.rho[0], np.inf)
+            candidates = propose(now[i].theta, values, seen.by_parameters[0], radii[i])
+            candidates = [c for c in candidates if np.any(c != now[i].theta)]
+            if not candidates:
+                radii[i] = 0.0
+                continue
+            tried = judged(loop, candidates, few)
+            order = sorted(
+                range(len(candidates)), key=lambda j: merit(candidates[j], tried[j]), reverse=True
+            )
+            winner = candidates[order[0]]
+            whole = loop.judge(winner[None], environments)
+            value = float(least(whole)[0])
+            archive.add([winner], [value], len(environments))
+            before, after = merit(now[i].theta, now[i].value), merit(winner, value)
+            if after > before:
+                now[i] = Choice(winner, value, len(environments))
+                rhos[i] = np.where(whole.proper[0], whole.rho[0], np.inf)
+                gain = max(abs(a - b) for a, b in zip(after, before, strict=True))
+                radii[i] *= 2.0 if order[0] == 0 else 0.7
+                if gain < 1e-5 * scale:
+                    radii[i] /= 20
+            else:
+                radii[i] /= 10
+            radii[i] = min(radii[i], 4 * radius)
+    return now
+
+
+def narrow(
+    loop: Parametric,
+    thetas: Any,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    merit: Merit,
+    batch: int,
+    rng: np.random.Generator,
+    rounds: int = 8,
+) -> None:
+    """Cross-entropy around good parameters, without gradients: sample, keep an elite, narrow.
+
+    De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
+    3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.
+    """
+    assert loop.space is not None
+    size = max(1, len(environments))
+    if limits.left < len(thetas) * size:
+        return
+    points = np.array(thetas, np.float64)
+    values = judged(loop, points, environments, archive)
+    most = max(4, batch // 5)
+    std = np.full(loop.dim, 0.1)
+    for _ in range(rounds):
+        if limits.left < batch * size:
+            return
+        order = sorted(range(len(points)), key=lambda j: merit(points[j], values[j]), reverse=True)
+        points, values = points[order[:most]], values[order[:most]]
+        if len(points) == most:
+            std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
+        parents = points[rng.integers(0, len(points), batch)]
+        drawn = parents + std * rng.normal(size=parents.shape)
+        anew = rng.random(parents.shape) < 0.1
+        other = np.where(anew, rng.random(parents.shape), parents)
+        drawn = np.clip(np.where(loop.free, drawn, other), 0.0, 1.0)
+        found = judged(loop, drawn, environments, archive)
+        points, values = np.concatenate([points, drawn]), np.concatenate([values, found])

@@ -1,0 +1,382 @@
+"""A system with parameters, simulated in environments: every pair of the two in one program.
+
+    loop = FeatureParameters(problem, ["k_x", "k_theta"])          # parameters are features
+    loop = ArrayParameters(problem, weights, system_of)            # parameters are arrays
+    loop.judge(thetas, environments)                               # [k, p] x [n, d] -> [k, n]
+    loop.judge(thetas, environments, temperature=0.1)              # and d rho / d theta [k, n, p]
+
+Parameters are inputs of the compiled program, never constants in it, so that nothing compiles again
+from one candidate to the next. A pair that the constraint of the space refuses cannot happen: it
+is not simulated, and its robustness is infinite.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.engine import in_precision, judge, simulation_key, verdict
+from verifai_jax.errors import check_names
+from verifai_jax.evaluator import Evaluator
+from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import robustness, smooth
+from verifai_jax.problem import Problem
+from verifai_jax.run import run_keys
+from verifai_jax.trace import Status
+
+
+class Pairs(NamedTuple):
+    """What came of `k` parameters in `n` environments each.
+
+    - `rho`: least robustness of the formulas; NaN without a verdict, infinite where the constraint
+      refuses the pair.
+    - `failing`: breaks a formula.
+    - `proper`: has a verdict, or cannot happen.
+    - `by_parameters`, `by_environment`: gradients of the smooth robustness by the coordinates, zero
+      where they are not finite; None unless asked for.
+    """
+
+    rho: Float[np.ndarray, "k n"]
+    failing: Bool[np.ndarray, "k n"]
+    proper: Bool[np.ndarray, "k n"]
+    by_parameters: Float[np.ndarray, "k n p"] | None = None
+    by_environment: Float[np.ndarray, "k n d"] | None = None
+
+    def violates(self, margin: float) -> Bool[np.ndarray, "k n"]:
+        """Which pairs break a formula, or keep it with less than this margin."""
+        return self.proper & (self.failing | (self.rho < margin))
+
+
+class Parametric(Protocol):
+    """What synthesis and repair need to know of a system with parameters."""
+
+    problem: Problem
+    dim: int
+    """Number `p` of coordinates of the parameters."""
+    bounded: bool
+    """Whether the parameters live in the unit cube."""
+    space: FeatureSpace | None
+    """Of the parameters, where they are features."""
+    environment: FeatureSpace | None
+    """What varies beside the parameters; None where nothing does."""
+    free: Bool[np.ndarray, " p"]
+    """Which coordinates are continuous."""
+    differentiable: bool
+    simulations: int
+    without_verdict: int
+
+    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs: ...
+
+    def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]: ...
+
+    def values(self, theta: Float[np.ndarray, " p"]) -> Any:
+        """The parameters as a person gives them."""
+        ...
+
+    def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
+        """The problem with the parameters held at these values."""
+        ...
+
+
+class FeatureParameters:
+    """Some features of a problem as parameters, the others as the environment.
+
+    **Arguments:**
+
+    - `problem`: on the backend that it is to run on.
+    - `names`: of the features that are parameters; all that vary when left out.
+    - `batch`: simulations at once.
+    - `gradient`: whether gradients may be asked for.
+
+    **Raises:** `ValueError` for unknown features, none, or one that does not vary.
+    """
+
+    bounded = True
+
+    def __init__(
+        self,
+        problem: Problem,
+        names: Sequence[str] | None = None,
+        *,
+        batch: int = 256,
+        gradient: bool = True,
+        precision: str = "float32",
+        seed: int = 0,
+    ) -> None:
+        domains = problem.space.domains
+        varied = [name for name, domain in domains.items() if domain.size]
+        if isinstance(names, str):
+            names = [name.strip() for name in names.split(",")]
+        names = varied if names is None else list(dict.fromkeys(names))
+        if not names:
+            raise ValueError(
+                f"name at least one parameter, of {', '.join(varied)}"
+                if varied
+                else f"no feature of problem {problem.name!r} varies"
+            )
+        check_names("parameter", names, domains)
+        for name in names:
+            if name not in varied:
+                raise ValueError(f"{name} does not vary, so it is no parameter to choose")
+        self.problem = problem
+        self.names = tuple(name for name in domains if name in names)
+        sizes = [(name, domain.size) for name, domain in domains.items()]
+        owner = np.array([name in names for name, size in sizes for _ in range(size)], bool)
+        self.mine, self.theirs = np.flatnonzero(owner), np.flatnonzero(~owner)
+        self.dim = len(self.mine)
+        # Where there is no environment the constraint speaks of the parameters alone.
+        alone = len(self.names) == len(varied)
+        of_their_own = FeatureSpace({name: domains[name] for name in self.names})
+        self.space = problem.space if alone else of_their_own
+        others = {name: d for name, d in domains.items() if name in varied and name not in names}
+        self.environment = FeatureSpace(others) if others else None
+        self.free = np.array(self.space.levels) == 0
+        self.differentiable = gradient and not problem.black_box and bool(self.free.any())
+        self._values = Evaluator(problem, batch, precision=precision, seed=seed)
+        self._slopes = None
+        if self.differentiable:
+            # Other random numbers than those of the verdicts.
+            other = (seed + 1) % 2**63
+            self._slopes = Evaluator(problem, batch, gradient=True, precision=precision, seed=other)
+        self.without_verdict = 0
+
+    @property
+    def simulations(self) -> int:
+        """Simulations so far; one with its gradient counts once."""
+        return self._values.simulations + (self._slopes.simulations if self._slopes else 0)
+
+    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
+        """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
+        k, n, d = len(thetas), len(environments), self.problem.space.dim
+        rows = self._rows(thetas, environments)
+        happens = accepted(self.problem.space, rows)
+        evaluate = self._values if temperature is None else self._slopes
+        assert evaluate is not None
+        found = evaluate(rows[happens], 1.0 if temperature is None else temperature)
+        self.without_verdict += int(np.sum(~found.proper))
+        rho = np.full(k * n, np.inf)
+        rho[happens] = np.where(found.proper, found.rho, np.nan)
+        failing, proper = np.zeros(k * n, bool), np.ones(k * n, bool)
+        failing[happens], proper[happens] = found.failing, found.proper
+        slopes: Any = (None, None)
+        if temperature is not None and found.gradient is not None:
+            whole = np.zeros((k * n, d))
+            whole[happens] = _finite(found.gradient, found.proper)
+            whole = whole.reshape(k, n, d)
+            slopes = whole[..., self.mine], whole[..., self.theirs]
+        return Pairs(*(x.reshape(k, n) for x in (rho, failing, proper)), *slopes)
+
+    def values(self, theta: Float[np.ndarray, " p"]) -> dict[str, Any]:
+        """Parameter name -> value, as a person writes it."""
+        table = self.space.rows(_one(self.space, theta))
+        columns = {column: entries[0] for column, entries in table.items()}
+        return {name: _plain(self.space[name], name, columns) for name in self.names}
+
+    def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
+        """The problem with these features fixed."""
+        return held(self.problem, self.values(theta))
+
+    def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
+        """Which environments the constraint accepts with these parameters."""
+        return accepted(self.problem.space, self._rows(np.asarray(theta)[None], environments))
+
+    def _rows(self, thetas: Any, environments: Any) -> Float[np.ndarray, "kn d"]:
+        u = np.empty((len(thetas), len(environments), self.problem.space.dim), np.float32)
+        u[..., self.mine] = np.asarray(thetas, np.float32)[:, None, :]
+        u[..., self.theirs] = np.asarray(environments, np.float32)[None, :, :]
+        return u.reshape(-1, u.shape[-1])
+
+
+class ArrayParameters:
+    """Arrays as parameters, such as the weights of a network; all features are the environment.
+
+    **Arguments:**
+
+    - `problem`: its space, formulas and `end` are used; the system is what `system_of` makes.
+    - `parameters`: a pytree of arrays of real numbers.
+    - `system_of(parameters) -> system`: pure, and traced by JAX.
+    - `batch`: simulations at once.
+
+    **Raises:** `TypeError` for leaves that are no real numbers; `ValueError` for a system that JAX
+    cannot trace in the parameters.
+    """
+
+    bounded = False
+    differentiable = True
+    space = None
+
+    def __init__(
+        self,
+        problem: Problem,
+        parameters: Any,
+        system_of: Callable[[Any], Any],
+        *,
+        batch: int = 256,
+        precision: str = "float32",
+        seed: int = 0,
+    ) -> None:
+        from jax.flatten_util import ravel_pytree
+
+        for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
+            if not np.issubdtype(np.result_type(leaf), np.floating):
+                place = jax.tree_util.keystr(path)
+                raise TypeError(
+                    f"parameters must be arrays of real numbers; {place or 'they'} is "
+                    f"{np.result_type(leaf)}"
+                )
+        flat, self._restore = ravel_pytree(parameters)
+        if not flat.size:
+            raise ValueError("parameters hold no number to change")
+        self.problem, self.environment = problem, problem.space
+        self.start, self.dim = np.asarray(flat, np.float64), int(flat.size)
+        self.free = np.ones(self.dim, bool)
+        self.system_of, self.batch, self.precision = system_of, batch, precision
+        self.simulations = self.without_verdict = 0
+        self._key = run_keys(seed)[1]
+        self._check()
+
+    def _check(self) -> None:
+        features = jax.eval_shape(self.problem.space.unflatten, jnp.zeros(self.problem.space.dim))
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        if getattr(self.system_of(self._restore(jnp.asarray(self.start, jnp.float32))),
+                   "black_box", False):  # fmt: skip
+            raise ValueError(
+                "arrays of parameters are repaired by gradients, which a black box has not; make "
+                "the parameters features of the space, and name them"
+            )
+        theta = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
+        try:
+            jax.eval_shape(
+                lambda t, f, k: judge(self.problem, self.system_of(self._restore(t))(f, k)),
+                theta, features, key,
+            )  # fmt: skip
+        except Exception as error:
+            raise ValueError(
+                "system_of(parameters) must make a system that JAX can trace in the parameters "
+                f"(no float(), no NumPy on them); it raised {type(error).__name__}: {error}"
+            ) from error
+
+    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
+        """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
+        with in_precision(self.precision):
+            parts = [
+                self._one(np.asarray(theta, np.float32), environments, temperature)
+                for theta in thetas
+            ]
+        columns: Any = zip(*parts, strict=True)
+        return Pairs(*(None if column[0] is None else np.stack(column) for column in columns))
+
+    def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
+        """Which environments the constraint accepts."""
+        return accepted(self.problem.space, np.asarray(environments, np.float32))
+
+    def _one(self, theta: np.ndarray, environments: Any, temperature: float | None) -> Pairs:
+        rows = np.asarray(environments, np.float32)
+        space, happens = self.problem.space, self.happens(theta, rows)
+        rho, failing = np.full(len(rows), np.inf), np.zeros(len(rows), bool)
+        proper = np.ones(len(rows), bool)
+        slopes: Any = (None, None)
+        if temperature is not None:
+            slopes = np.zeros((len(rows), self.dim)), np.zeros((len(rows), space.dim))
+        places = np.flatnonzero(happens)
+        # One slope of each row is kept, which is as long as the parameters.
+        lanes = self.batch if temperature is None else min(self.batch, 64)
+        program = self._values if temperature is None else self._slopes
+        for start in range(0, len(places), lanes):
+            these = places[start : start + lanes]
+            u = rows[np.pad(these, (0, lanes - len(these)), mode="edge")]
+            first = np.int32(self.simulations)
+            found, gradient = program(theta, u, self._key, first, np.float32(temperature or 1.0))
+            least, status, breaks = (np.asarray(x)[: len(these)] for x in found)
+            ended = status == Status.OK
+            rho[these] = np.where(ended, least, np.nan)
+            failing[these], proper[these] = breaks & ended, ended
+            for whole, part in zip(slopes, gradient, strict=False):
+                whole[these] = _finite(np.asarray(part)[: len(these)], ended)
+            self.simulations += len(these)
+            self.without_verdict += int(np.sum(~ended))
+        return Pairs(rho, failing, proper, *slopes)
+
+    def values(self, theta: Float[np.ndarray, " p"]) -> Any:
+        """The pytree."""
+        return self._restore(jnp.asarray(theta, jnp.float32))
+
+    def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
+        """The problem with the system of these parameters."""
+        return replace(self.problem, system=self.system_of(self.values(theta)))
+
+    @cached_property
+    def _values(self) -> Any:
+        return self._program(lambda theta, u, key, temperature: (self._row(theta, u, key)[1], ()))
+
+    @cached_property
+    def _slopes(self) -> Any:
+        def row(theta: Any, u: Any, key: Any, temperature: Any) -> Any:
+            def objective(theta: Any, u: Any) -> Any:
+                trace, told = self._row(theta, u, key)
+                semantics = smooth(temperature.astype(u.dtype))
+                smoothed = [
+                    robustness(formula, trace, semantics, end=self.problem.end)
+                    for formula in self.problem.formulas.values()
+                ]
+                return jnp.min(jnp.stack(smoothed)), told
+
+            gradient, told = jax.grad(objective, argnums=(0, 1), has_aux=True)(theta, u)
+            return told, gradient
+
+        return self._program(row)
+
+    def _row(self, theta: Any, u: Any, key: Any) -> Any:
+        system = self.system_of(self._restore(theta))
+        trace = system(self.problem.space.unflatten(u), key).hold()
+        rho, status = judge(self.problem, trace)
+        # At exactly zero the comparator decides.
+        holds = verdict(self.problem, trace)
+        return trace, (jnp.min(rho), status, jnp.any((rho < 0) | ((rho == 0) & ~holds)))
+
+    def _program(self, row: Callable[..., Any]) -> Any:
+        def program(theta: Any, u: Any, key: Any, first: Any, temperature: Any) -> Any:
+            numbers = first + jnp.arange(len(u), dtype=jnp.int32)
+            keys = jax.vmap(lambda number: simulation_key(key, number))(numbers)
+            cast = theta.astype(self.precision), u.astype(self.precision)
+            return jax.vmap(row, in_axes=(None, 0, 0, None))(*cast, keys, temperature)
+
+        return jax.jit(program)
+
+
+def held(problem: Problem, values: dict[str, Any]) -> Problem:
+    """The problem with these features fixed, and nominal there if it has nominal features."""
+    nominal = None if problem.nominal is None else {**problem.nominal, **values}
+    return replace(problem, space=problem.space.fixed(**values), nominal=nominal)
+
+
+def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+    """Which points the constraint of the space accepts."""
+    if space.where is None or not len(rows):
+        return np.ones(len(rows), bool)
+    # A power of two, so that few shapes compile.
+    missing = (1 << max(0, len(rows) - 1).bit_length()) - len(rows)
+    padded = np.pad(rows, ((0, missing), (0, 0)), mode="edge")
+    return np.asarray(space.accepts_points(padded))[: len(rows)]
+
+
+def _one(space: FeatureSpace, theta: Any) -> Any:
+    features = space.unflatten(jnp.asarray(theta, jnp.float32))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
+
+
+def _plain(domain: Any, name: str, columns: dict[str, Any]) -> Any:
+    """One feature of a table's row as a person writes it."""
+    if name in columns:
+        return columns[name].item() if hasattr(columns[name], "item") else columns[name]
+    return jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), domain.from_columns(columns, name))
+
+
+def _finite(gradient: Any, proper: Any) -> Float[np.ndarray, "n d"]:
+    usable = proper & np.all(np.isfinite(gradient), axis=1)
+    return np.where(usable[:, None], gradient, 0.0)

@@ -1,0 +1,451 @@
+"""Features for which the formula holds, and holds robustly: model-parameter synthesis.
+
+    synthesize(problem, ["gain", "damping"])             # for all values of the other features
+    synthesize(problem)                                   # all features are parameters
+
+Without an environment the robustness is maximised: by a search over the whole space, then along
+gradients. With one it is the least robustness over a set of environments that grows
+(counterexample-guided inductive synthesis: Solar-Lezama, Program synthesis by sketching, 2008,
+chapter 5; for robust optimisation Blankenship and Falk, Infinitely constrained optimization
+problems, 1976, algorithm 2.1): choose parameters for the set, attack them, add the environments in
+which they do worse than in any of the set, choose again. The result is checked in fresh samples.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax import search as searches
+from verifai_jax.backends import resolved
+from verifai_jax.engine import in_precision
+from verifai_jax.errors import suggests_options
+from verifai_jax.options import check_options, check_search
+from verifai_jax.problem import Problem
+from verifai_jax.search import CrossEntropy, Search
+from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.choosing import (
+    Archive,
+    Choice,
+    by_value,
+    climb,
+    explore,
+    judged,
+    narrow,
+    scale_of,
+)
+from verifai_jax.synthesis.heldout import HeldOut, drawn, held_out, rows_of
+from verifai_jax.synthesis.limits import Limits
+from verifai_jax.synthesis.parametric import FeatureParameters
+from verifai_jax.synthesis.steps import uphill
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CANDIDATES = 32
+"""Choices of parameters at a time, and at most in the table at the end."""
+STARTS = 4
+"""Choices from which gradients are followed."""
+ADDED = 6
+"""Environments that a round adds to the set at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """What `synthesize` returns.
+
+    **Fields:** `parameters`: the best found, by name; `robustness`: the least that was seen with
+    them, over all `environments` of the set and all attacks (minus infinity without a verdict);
+    `margin` that was wanted; `candidates`: a table of the best parameters with their `rho` over
+    that many `environments`, all over the same set; `environments`: a table of the set, with the
+    `rho` of the best parameters; `held_out`: how they did in fresh samples, None without a check;
+    `attacks`: environments that were tried against the best parameters; `converged`: whether the
+    last attack found no environment worse than those of the set; `simulations`, `without_verdict`
+    and `seconds`; `stopped`: `"converged"`, `"budget"`, `"max_seconds"` or `"interrupted"`;
+    `problem`: the one given; `seed`.
+    """
+
+    problem: Problem = field(repr=False)
+    parameters: dict[str, Any]
+    robustness: float
+    margin: float
+    candidates: "pd.DataFrame" = field(repr=False)
+    environments: "pd.DataFrame" = field(repr=False)
+    held_out: HeldOut | None
+    attacks: int
+    converged: bool
+    simulations: int
+    without_verdict: int
+    seconds: float
+    stopped: str
+    seed: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the formula kept its margin in every simulation with the best parameters."""
+        kept = self.robustness >= self.margin
+        return kept and (self.held_out is None or self.held_out.passed)
+
+    @cached_property
+    def chosen(self) -> Problem:
+        """The problem with the parameters held at their values: ready to `falsify`."""
+        from verifai_jax.synthesis.parametric import held
+
+        return held(self.problem, self.parameters)
+
+    @property
+    def robust(self) -> "pd.DataFrame":
+        """The candidates that keep the margin over the whole set."""
+        return self.candidates[self.candidates["rho"] >= self.margin]
+
+    def __str__(self) -> str:
+        shown = ", ".join(f"{name} = {_short(value)}" for name, value in self.parameters.items())
+        wanted = f" by the margin of {self.margin:g}" if self.margin else ""
+        lines = [f"synthesis for {self.problem.name}: {shown}"]
+        around = self.environments.shape[1] > 1
+        if self.robustness == -np.inf:
+            lines.append("  no simulation with any parameters had a verdict")
+        elif self.holds:
+            where = f", the least over {self.attacks} simulated environments" if around else ""
+            lines.append(f"  holds{wanted} with robustness {self.robustness:.4g}{where}")
+        elif self.robustness >= self.margin:
+            lines.append(f"  no failure was found before the check: {self.robustness:.4g} at least")
+        else:
+            missing = self.margin - self.robustness
+            lines.append(
+                f"  NONE FOUND that holds{wanted}: the best so far has robustness "
+                f"{self.robustness:.4g}, {missing:.4g} too little"
+            )
+        if self.held_out is not None:
+            lines.append(f"  check: {self.held_out.told('environments' if around else 'repeats')}")
+        elif around:
+            lines.append("  not checked in held-out environments")
+        found, of = len(self.robust), len(self.candidates)
+        over = f" over {len(self.environments)} environments" if around else ""
+        lines.append(f"  {found} of the best {of} candidates keep the margin{over} (.candidates)")
+        lines.append(f"  {self._told()}")
+        return "\n".join(lines)
+
+    def _told(self) -> str:
+        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        if self.without_verdict:
+            text += f"; {self.without_verdict} gave no verdict"
+        if self.environments.shape[1] > 1:
+            text += "; an attack that finds nothing proves nothing, the check above is the evidence"
+        return text
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+@suggests_options
+def synthesize(
+    problem: Problem,
+    parameters: Sequence[str] | str | None = None,
+    budget: int = 10_000,
+    *,
+    search: str | Search = "cross_entropy",
+    margin: float = 0.0,
+    environments: int = 16,
+    held_out: int = 2000,
+    gradient: bool | None = None,
+    batch: int = 256,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+) -> Synthesis:
+    """Find features for which the formula holds robustly, whatever the other features are.
+
+    **Arguments:**
+
+    - `parameters`: names of the features to choose; all when left out. The others are the
+      environment, which varies.
+    - `budget`: simulations at most, the check not counted.
+    - `search`: attacks the parameters, over the environment.
+    - `margin`: robustness that is wanted.
+    - `environments`: in the set at first.
+    - `held_out`: fresh environments in which the result is checked; 0 for no check.
+    - `gradient`: whether to follow gradients; by default where the system has them without
+      changing the backend.
+    - `batch`: simulations at once.
+    - the others as in `falsify`.
+
+    Ctrl-C ends it and returns what is finished, without the check.
+
+    **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
+    """
+    started = time.perf_counter()
+    check_options(budget, batch, seed, max_seconds, None)
+    check_numbers(margin, environments=environments, held_out=held_out)
+    loop = feature_loop(problem, parameters, gradient, batch, budget, precision, backend, seed)
+    search = attacker(problem, search, loop)
+    until = None if max_seconds is None else started + max_seconds
+    limits = Limits(lambda: loop.simulations, budget, until)
+    work = _Search(loop, search, limits, margin, environments, seed)
+    try:
+        work.go()
+        stopped = work.stopped
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    best, robustness = work.best()
+    checked = None
+    if stopped != "interrupted" and held_out and (loop.environment is not None or problem.draws()):
+        checked = _held_out_or_none(loop, best.theta, held_out, margin, seed)
+    if checked is not None and checked.least is not None:
+        robustness = min(robustness, checked.least)
+    return Synthesis(
+        problem=problem,
+        parameters=loop.values(best.theta),
+        robustness=robustness,
+        margin=margin,
+        candidates=work.table(),
+        environments=work.environment_table(best),
+        held_out=checked,
+        attacks=work.attacks.get(best.theta.tobytes(), 0) + len(work.environments),
+        converged=work.stopped == "converged",
+        simulations=loop.simulations,
+        without_verdict=loop.without_verdict,
+        seconds=time.perf_counter() - started,
+        stopped=stopped,
+        seed=seed,
+    )
+
+
+def _held_out_or_none(loop: Any, theta: Any, count: int, margin: float, seed: int) -> Any:
+    try:
+        return held_out(loop, theta, count, margin, (seed, 1))
+    except KeyboardInterrupt:
+        return None
+
+
+class _Search:
+    """The work of a synthesis, of which all that is finished can be had at any time."""
+
+    def __init__(
+        self,
+        loop: FeatureParameters,
+        search: Search,
+        limits: Limits,
+        margin: float,
+        environments: int,
+        seed: int,
+    ) -> None:
+        self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
+        self.margin = margin
+        self.archive = Archive()
+        self.rng = np.random.default_rng((seed, 2))
+        self.scale = 1.0
+        self.stopped = "budget"
+        self.attacked: list[Choice] = []
+        self.attacks: dict[bytes, int] = {}
+        self._finalists: list[Choice] = []
+        self.environments: Any = np.zeros((1, 0), np.float32)
+        if loop.environment is not None:
+            self.environments = drawn(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
+            if not len(self.environments):
+                # The constraint wants other parameters: it is asked with each of them.
+                rng = np.random.default_rng((seed, 3))
+                self.environments = rng.random((environments, loop.environment.dim), np.float32)
+
+    def go(self) -> None:
+        total = self.limits.left
+        first = self.limits.slice(
+            int(0.5 * total if self.loop.environment is None else 0.3 * total)
+        )
+        explore(
+            self.loop, self.environments, self.archive, first,
+            search=CrossEntropy(least_std=0.003), batch=CANDIDATES, seed=self.seed,
+            cost=lambda theta, value: -value,
+        )  # fmt: skip
+        if not self.archive.choices:
+            # Not even one choice fits into the share: at least one is judged.
+            judged(self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive)
+        self.scale = scale_of([choice.value for choice in self.archive.choices])
+        if self.loop.environment is None:
+            self.improve(self.limits, 2 * STARTS)
+            self.stopped = "converged" if not self.limits.over else self.ended()
+            return
+        number = 0
+        while not self.limits.over:
+            number += 1
+            # A quarter of what is left: later sets deserve as much as the first.
+            self.improve(self.limits.slice(self.limits.left // 4), STARTS if number == 1 else 1)
+            choice = self.archive_best()
+            if not np.isfinite(choice.value):
+                break
+            level = choice.value - 1e-3 * self.scale
+            share = max(self.limits.left // 4, min(self.limits.left, 256))
+            found = attack(
+                self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
+                batch=min(128, max(8, share // 10)), seed=self.seed + 7919 * number,
+                scale=self.scale,
+            )  # fmt: skip
+            worst = min(choice.value, found.worst)
+            name = choice.theta.tobytes()
+            self.attacks[name] = self.attacks.get(name, 0) + len(found.rho)
+            self.attacked.append(choice._replace(value=worst))
+            if not found.violating.any():
+                self.stopped = "converged"
+                break
+            self.extend(found.chosen(ADDED))
+        if self.stopped != "converged":
+            self.stopped = self.ended()
+
+    def ended(self) -> str:
+        return "budget" if self.loop.simulations >= self.limits.most else "max_seconds"
+
+    def improve(self, limits: Limits, starts: int) -> None:
+        best = self.archive.best(starts, by_value, apart=1e-3)
+        if self.loop.differentiable:
+            climb(
+                self.loop, [c.theta for c in best], self.environments, self.archive, limits,
+                propose=self.propose, merit=by_value, scale=self.scale, radius=0.1,
+            )  # fmt: skip
+        if not self.loop.free.all() or not self.loop.differentiable:
+            best = self.archive.best(8, by_value)
+            narrow(
+                self.loop, [c.theta for c in best], self.environments, self.archive, limits,
+                merit=by_value, batch=CANDIDATES, rng=self.rng, rounds=1000
+                if self.loop.environment is None else 12,
+            )  # fmt: skip
+
+    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
+        def step(radius: float) -> Any:
+            moved = theta + uphill(theta, rho, slopes, radius, free=self.loop.free, bounded=True)
+            return np.clip(moved, 0.0, 1.0)
+
+        return [step(radius), step(radius / 3), step(radius / 10)]
+
+    def extend(self, points: Any) -> None:
+        """Add environments to the set; what was judged over the old one starts anew."""
+        self.environments = np.concatenate([self.environments, points]).astype(np.float32)
+        best = self.archive.best(12, by_value, apart=1e-3)
+        affordable = min(len(best), self.limits.left // len(self.environments))
+        kept, self.archive = best[:affordable], Archive()
+        if kept:
+            judged(self.loop, [c.theta for c in kept], self.environments, self.archive)
+            return
+        # Old values bound the new ones from above; the attacked ones are known best.
+        self.archive.choices = best
+
+    def archive_best(self) -> Choice:
+        return self.archive.best(1, by_value)[0]
+
+    def best(self) -> tuple[Choice, float]:
+        """The choice that has stood up best to all that was tried against it, and how well."""
+        if not self.archive.choices and not self.attacked:
+            return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0), -np.inf
+        if self.loop.environment is None or not self.attacked:
+            choice = self.archive_best()
+            return choice, choice.value
+        known: dict[bytes, Choice] = {}
+        for choice in self.attacked:
+            name = choice.theta.tobytes()
+            if name not in known or choice.value < known[name].value:
+                known[name] = choice
+        choices = list(known.values())
+        values = judged(self.loop, [c.theta for c in choices], self.environments)
+        least = [min(c.value, v) for c, v in zip(choices, values, strict=True)]
+        place = int(np.argmax(least))
+        return choices[place], float(least[place])
+
+    def table(self) -> "pd.DataFrame":
+        """The best candidates, all over the whole set."""
+        pool = Archive()
+        pool.choices = [*self.archive.choices, *self.attacked]
+        apart = 1e-3 if self.loop.environment is not None else 0.0
+        most = CANDIDATES if self.loop.environment is not None else len(pool.choices)
+        best = pool.best(most, by_value, apart)
+        if not best:
+            return rows_of(self.loop.space, np.zeros((0, self.loop.dim))).assign(rho=[])
+        thetas = np.stack([c.theta for c in best])
+        if self.loop.environment is None:
+            values = np.array([c.value for c in best])
+            keep = (values >= self.margin) | (np.arange(len(values)) < CANDIDATES)
+            thetas, values = thetas[keep], values[keep]
+        else:
+            values = judged(self.loop, thetas, self.environments)
+        frame = rows_of(self.loop.space, thetas).assign(
+            rho=values, environments=len(self.environments)
+        )
+        return frame.sort_values("rho", ascending=False, kind="stable", ignore_index=True)
+
+    def environment_table(self, best: Choice) -> "pd.DataFrame":
+        pairs = self.loop.judge(best.theta[None], self.environments)
+        return rows_of(self.loop.environment, self.environments).assign(rho=pairs.rho[0])
+
+
+def check_numbers(margin: Any, **counts: Any) -> None:
+    """Refuse numbers out of range.
+
+    **Raises:** `ValueError`.
+    """
+    if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
+        raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
+    for name, count in counts.items():
+        least = 0 if name == "held_out" else 1
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        if not whole or count < least:
+            raise ValueError(f"{name} must be an integer of at least {least}; got {count!r}")
+
+
+def feature_loop(
+    problem: Any,
+    parameters: Any,
+    gradient: bool | None,
+    batch: int,
+    budget: int,
+    precision: str,
+    backend: str | None,
+    seed: int,
+) -> FeatureParameters:
+    """The problem, checked and on its backend, with these features as parameters.
+
+    **Raises:** `ValueError` for what does not fit, before anything compiles.
+    """
+    if not isinstance(problem, Problem):
+        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
+    in_precision(precision)
+    if gradient and problem.black_box:
+        raise ValueError(
+            f"the system of problem {problem.name!r} is a black box, which has no gradient; leave "
+            "gradient out, and parameters are chosen by cross-entropy"
+        )
+    several = bool(getattr(problem.system, "backends", ()))
+    # With every name known, before a backend is measured.
+    FeatureParameters(problem, parameters, batch=batch, gradient=False)
+    problem.space.check_where()
+    choice = resolved(
+        problem, gradient=bool(gradient), batch=batch, budget=budget, precision=precision,
+        wanted=backend,
+    )  # fmt: skip
+    choice.problem.check()
+    wanted = not several if gradient is None else gradient
+    return FeatureParameters(
+        choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
+    )
+
+
+def attacker(problem: Problem, search: Any, loop: Any) -> Search:
+    """The search over the environment, if it can work there.
+
+    **Raises:** `ValueError` for one that needs gradients where there are none.
+    """
+    if isinstance(search, str):
+        search = searches.named(search)
+    if loop.environment is None:
+        return search
+    from verifai_jax.proposals import cube_of
+
+    checked = check_search(problem, search) if loop.problem.black_box else search
+    if not isinstance(checked, Search):
+        raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
+    checked.check(cube_of(loop.environment))
+    if checked.wants_gradient and not loop.differentiable:
+        raise ValueError(f"search {checked!r} needs gradients, which are not to be had here")
+    return checked
