@@ -1,0 +1,109 @@
+"""How far a point is from the nominal one: how many features depart from it, and how much.
+
+    nominal = Nominal.of(problem)
+    nominal.count(points), nominal.distance(points)     # [n] each
+
+A departure is measured in unit coordinates, in which 1 is the whole range of the prior. Every
+coordinate counts for itself, a control point of a signal too.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.errors import check_names
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem import Problem
+from verifai_jax.proposals import cube_of
+from verifai_jax.search import Cube
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """The features of an ordinary day, as the point `u` `[d]` of the unit cube."""
+
+    space: FeatureSpace
+    u: Float[np.ndarray, " d"]
+
+    @classmethod
+    def of(cls, problem: Problem, nominal: Mapping[str, Any] | None = None) -> "Nominal":
+        """That of a problem, with the given features instead where there are some.
+
+        **Raises:** `ValueError` where neither names all features, or one is outside the space.
+        """
+        space = problem.space
+        check_names("feature", nominal or {}, space.domains)
+        whole = {**(problem.nominal or {}), **(nominal or {})}
+        varied = [name for name, domain in space.root.fields if domain.size]
+        missing = [name for name in varied if name not in whole]
+        if missing:
+            raise ValueError(
+                f"problem {problem.name!r} does not say what is nominal for {', '.join(missing)}; "
+                f"give it: nominal={{{missing[0]!r}: ..., ...}}, or Problem(..., nominal=...)"
+            )
+        # What a view of the space holds fixed is not said again.
+        features = space.coerce({name: whole[name] for name in varied})
+        return cls(space, np.asarray(jax.jit(space.flatten)(features), np.float32))
+
+    @cached_property
+    def cube(self) -> Cube:
+        """The unit cube of the space."""
+        return cube_of(self.space)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """What the coordinates are called."""
+        return self.space.coordinates
+
+    @cached_property
+    def groups(self) -> tuple[tuple[str, Int[np.ndarray, " k"]], ...]:
+        """The features, each with the places of its coordinates."""
+        found, first = [], 0
+        for name, domain in self.space.root.fields:
+            if domain.size:
+                found.append((name, np.arange(first, first + domain.size)))
+            first += domain.size
+        return tuple(found)
+
+    def settle(self, points: Any) -> Float[np.ndarray, "n d"]:
+        """These points inside the cube, in the middles of cells, nominal where they mean it."""
+        u = np.clip(np.asarray(points, np.float64), 0.0, 1.0).astype(np.float32)
+        discrete = self.cube.discrete
+        if len(discrete):
+            cells = np.asarray(self.cube.cells(u))
+            same = cells == np.asarray(self.cube.cells(self.u))
+            middles = np.asarray(self.cube.centres(cells))
+            u[:, discrete] = np.where(same, self.u[discrete], middles)
+        return u
+
+    def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
+        """Which coordinates of settled points are not nominal."""
+        return points != self.u
+
+    def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """How much each coordinate departs, 0 to 1.
+
+        Integers and lengths by difference of places, choices 0 or 1.
+        """
+        gap = np.abs(np.asarray(points, np.float64) - self.u)
+        discrete = self.cube.discrete
+        if len(discrete):
+            places = np.asarray(self.cube.cells(np.asarray(points, np.float32)), np.float64)
+            apart = np.abs(places - np.asarray(self.cube.cells(self.u)))
+            steps = np.array([max(self.cube.levels[i] - 1, 1) for i in discrete])
+            ordered = np.array([self.cube.ordered[i] for i in discrete])
+            gap[:, discrete] = np.where(ordered, apart / steps, apart > 0)
+        return gap
+
+    def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
+        """How many coordinates depart."""
+        return self.departs(points).sum(axis=1)
+
+    def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Euclidean length of the departure."""
+        return np.sqrt((self.gaps(points) ** 2).sum(axis=1))
