@@ -1,0 +1,158 @@
+"""Intervals and bounds: of prior samples, of weighted samples, and of splitting.
+
+    upper_bound(0, 2000)                            # 0.0015: what no failure in 2000 says
+    simulations_until(1e-4, failures=0, simulations=2000)
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Weighted(NamedTuple):
+    """The mean of weighted samples, its relative error and what is known of their tail.
+
+    - `cv`: relative standard error of the mean.
+    - `skewness`: of the samples; `effective`: as many samples of equal weight.
+    - `largest`: share of the largest sample in the sum.
+    - `tail`: index of the generalised Pareto distribution of the largest ones (k-hat); the variance
+      is infinite from 0.5 on, and the mean beyond 0.7 not to be relied on.
+    """
+
+    mean: float
+    cv: float
+    skewness: float
+    effective: float
+    largest: float
+    tail: float
+
+
+def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
+    """One-sided Clopper-Pearson bound: the largest rate that so few failures do not exclude.
+
+    Source: Clopper and Pearson, Biometrika 26 (1934). Without a failure about `3 / simulations`.
+    """
+    from scipy.special import betaincinv
+
+    if simulations < 1 or failures >= simulations:
+        return 1.0
+    return float(betaincinv(failures + 1, simulations - failures, confidence))
+
+
+def normal_quantile(confidence: float) -> float:
+    """How many standard deviations a two-sided interval of this confidence has."""
+    from scipy.special import ndtri
+
+    return float(ndtri((1 + confidence) / 2))
+
+
+def weighted(x: Float[np.ndarray, " n"]) -> Weighted:
+    """What independent samples `x >= 0`, weights of failures and zero elsewhere, say of their mean."""
+    n, total = len(x), float(x.sum())
+    if n < 2 or total <= 0:
+        return Weighted(0.0, math.inf, 0.0, 0.0, 1.0, math.inf)
+    mean, std = total / n, float(x.std(ddof=1))
+    skewness = float(np.mean((x - mean) ** 3)) / std**3 if std > 0 else 0.0
+    effective = total**2 / float(np.sum(x * x))
+    return Weighted(
+        mean,
+        std / math.sqrt(n) / mean,
+        skewness,
+        effective,
+        float(x.max()) / total,
+        tail_index(x[x > 0]),
+    )
+
+
+def skewed_interval(x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
+    """An interval of the mean of skewed samples: Student's, with the skewness transformed away.
+
+    Source: Hall, On the removal of skewness by transformation, Journal of the Royal Statistical
+    Society B 54 (1992), equation 2.3 (the cubic one, which is monotone).
+    """
+    found, n = weighted(x), len(x)
+    if not math.isfinite(found.cv):
+        return 0.0, math.inf
+    # Few effective samples: as wide as Student's interval of so many.
+    quantile = student(confidence, max(found.effective - 1, 2.0))
+    g = found.skewness / math.sqrt(n)
+
+    def transformed(t: float) -> float:
+        if abs(g) < 1e-6:
+            return t
+        inner = 1 + g * (t - g / 6)
+        return 3 / g * (math.copysign(abs(inner) ** (1 / 3), inner) - 1)
+
+    low = found.mean * (1 - found.cv * transformed(quantile))
+    high = found.mean * (1 - found.cv * transformed(-quantile))
+    # Below zero nothing is possible; there the logarithm is symmetric.
+    return max(low, found.mean * math.exp(-quantile * found.cv * 1.5), 0.0), high
+
+
+def log_interval(mean: float, cv: float, confidence: float, freedom: float) -> tuple[float, float]:
+    """An interval symmetric in the logarithm: of a product of fractions."""
+    factor = math.exp(student(confidence, freedom) * math.sqrt(math.log1p(cv * cv)))
+    return mean / factor, mean * factor
+
+
+def student(confidence: float, freedom: float) -> float:
+    """Quantile of Student's distribution for a two-sided interval."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, (1 + confidence) / 2))
+
+
+def tail_index(weights: Float[np.ndarray, " n"]) -> float:
+    """Shape of the generalised Pareto distribution fitted to the largest weights, k-hat.
+
+    Sources: Vehtari, Simpson, Gelman, Yao and Gabry, Pareto smoothed importance sampling, JMLR 25
+    (2024); the fit is that of Zhang and Stephens, Technometrics 51 (2009).
+    """
+    n = len(weights)
+    count = int(min(0.2 * n, 3 * math.sqrt(n)))
+    if count < 10:
+        return math.inf
+    ordered = np.sort(weights)
+    x = ordered[-count:] - ordered[-count - 1]
+    x = x[x > 0]
+    if len(x) < 10:
+        return -math.inf  # They are all alike.
+    count = len(x)
+    grid = 30 + int(math.sqrt(count))
+    quartile = x[max(0, int(count / 4 + 0.5) - 1)]
+    j = np.arange(1, grid + 1)
+    b = (1 - np.sqrt(grid / (j - 0.5))) / 3 / quartile + 1 / x[-1]
+    k = np.mean(np.log1p(-b[:, None] * x), axis=1)
+    likelihood = count * (np.log(-b / k) - k - 1)
+    share = np.exp(likelihood - likelihood.max())
+    share /= share.sum()
+    shape = float(np.mean(np.log1p(-float(b @ share) * x)))
+    return (count * shape + 5) / (count + 10)  # Their weak prior at one half.
+
+
+def simulations_until(
+    rate: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
+) -> int:
+    """How many more simulations of the prior show that the failure rate is below `rate`.
+
+    If none of them fails: the least `n` for which `upper_bound(failures, simulations + n)` is at
+    most `rate`.
+
+    **Raises:** `ValueError` unless `0 < rate < 1`.
+    """
+    if not 0 < rate < 1:
+        raise ValueError(f"p0 must lie between 0 and 1; got {rate!r}")
+    low, high = 0, 1
+    while upper_bound(failures, simulations + high, confidence) > rate:
+        low, high = high, 2 * high
+        if high > 2**62:
+            break
+    if upper_bound(failures, max(simulations, 1), confidence) <= rate and simulations:
+        return 0
+    while high - low > 1:
+        middle = (low + high) // 2
+        enough = upper_bound(failures, simulations + middle, confidence) <= rate
+        low, high = (low, middle) if enough else (middle, high)
+    return high
