@@ -8,18 +8,17 @@ value and then the distance from the nominal parameters for a repair.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.proposals import Proposals
-from verifai_jax.search import Search
 from verifai_jax.synthesis.limits import Limits
-from verifai_jax.synthesis.parametric import Pairs, Parametric
+from verifai_jax.synthesis.parametric import Pairs, Parametric, accepted
 
 ACTIVE = 16
 """Environments, the least robust ones, that decide a step; all of them judge its result."""
 LEAST_RADIUS = 1e-5
+MOST_REFUSED = 1000
+"""Draws in a row without one that the constraint accepts, after which no more are made."""
 
 Merit = Callable[[np.ndarray, float], tuple[float, ...]]
 Propose = Callable[[np.ndarray, np.ndarray, np.ndarray, float], list[np.ndarray]]
@@ -97,36 +96,29 @@ def explore(
     archive: Archive,
     limits: Limits,
     *,
-    search: Search,
+    merit: Merit,
     batch: int,
-    seed: Any,
-    cost: Callable[[np.ndarray, float], float],
-    done: Callable[[Archive], bool] = lambda archive: False,
+    rng: np.random.Generator,
 ) -> None:
-    """Drive a search over the whole space of the parameters; they must be features.
-
-    - `cost`: what the search is to make small, positive, from parameters and their value.
-    """
-    assert loop.space is not None
-    proposals = Proposals(search, loop.space, batch, jax.random.key(seed))
-    size = max(1, len(environments))
-    reference = None
-    while limits.left >= size and not proposals.exhausted:
-        thetas = np.asarray(proposals.next(min(batch, limits.left // size)), np.float64)
-        if not len(thetas):
-            proposals.tell_refused()
-            continue
-        values = judged(loop, thetas, environments, archive)
-        if done(archive):
-            break
-        known = np.isfinite(values)
-        costs = np.array([cost(*pair) for pair in zip(thetas, values, strict=True)])
-        if reference is None and known.any():
-            reference = costs[known].min(), max(float(np.std(costs[known])), 1e-9)
-        low, spread = reference or (0.0, 1.0)
-        # A search takes all failures for equally good and progress for a share: so never below 0.
-        told = np.exp(np.clip((costs - low) / spread, -60.0, 60.0))
-        proposals.tell(np.where(known, told, np.nan).astype(np.float32), known, None)
+    """Look over the whole space of the parameters, which are features, then around the best."""
+    size, half = max(1, len(environments)), limits.slice(limits.left // 2)
+    refused = 0
+    while half.left >= size and refused < MOST_REFUSED:
+        # One in each of as many slices of every coordinate: a Latin hypercube.
+        cells = np.argsort(rng.random((batch, loop.dim)), axis=0)
+        thetas = (cells + rng.random(cells.shape)) / batch
+        if loop.environment is None:
+            thetas = thetas[accepted(loop.problem.space, thetas.astype(np.float32))]
+        refused = 0 if len(thetas) else refused + 1
+        thetas = thetas[: half.left // size]
+        if len(thetas):
+            judged(loop, thetas, environments, archive)
+    best = archive.best(max(4, batch // 5), merit)
+    if best:
+        narrow(
+            loop, [c.theta for c in best], environments, archive, limits,
+            merit=merit, batch=batch, rng=rng, rounds=1000,
+        )  # fmt: skip
 
 
 def climb(
@@ -213,7 +205,6 @@ def narrow(
     De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
     3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.
     """
-    assert loop.space is not None
     size = max(1, len(environments))
     if limits.left < len(thetas) * size:
         return
@@ -228,6 +219,8 @@ def narrow(
         points, values = points[order[:most]], values[order[:most]]
         if len(points) == most:
             std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
+            if np.all(std[loop.free] == 1e-4) and loop.free.all():
+                return
         parents = points[rng.integers(0, len(points), batch)]
         drawn = parents + std * rng.normal(size=parents.shape)
         anew = rng.random(parents.shape) < 0.1

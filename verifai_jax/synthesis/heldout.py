@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.features import FeatureSpace
 from verifai_jax.rates import Rate, clopper_pearson
+from verifai_jax.synthesis.limits import Limits
 from verifai_jax.synthesis.parametric import Parametric
 
 MOST_DRAWS = 1000
+ROUND = 256
+"""Simulations between two looks at the clock."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class HeldOut:
 
     def told(self, what: str = "environments") -> str:
         """For people, such as `0 of 2000 held-out environments fail: ...`."""
+        if not self.simulations:
+            return f"no time was left for held-out {what}"
         if self.rate is None:
             return f"none of {self.simulations} held-out {what} gave a verdict"
         judged = self.rate.simulations
@@ -65,23 +69,36 @@ class HeldOut:
 
 
 def held_out(
-    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, margin: float, seed: Any
+    loop: Parametric,
+    theta: Float[np.ndarray, " p"],
+    count: int,
+    margin: float,
+    seed: Any,
+    limits: Limits | None = None,
 ) -> HeldOut:
     """Simulate `count` environments drawn from the prior, which the seed alone decides.
 
-    Fewer where the constraint of the space refuses nearly all.
+    Fewer where the constraint of the space refuses nearly all, or where `limits` end it first.
     """
     points = drawn(loop, theta, count, seed)
-    pairs = loop.judge(theta[None], points)
-    proper, failing = pairs.proper[0], pairs.failing[0]
+    parts = []
+    for start in range(0, len(points), ROUND):
+        if limits is not None and limits.late:
+            break
+        pairs = loop.judge(theta[None], points[start : start + ROUND])
+        short = pairs.violates(margin) & ~pairs.failing
+        parts.append((pairs.rho[0], pairs.proper[0], pairs.failing[0], short[0]))
+    none = (np.zeros(0), *[np.zeros(0, bool)] * 3)
+    rho, proper, failing, short = (
+        np.concatenate(column) for column in zip(none, *parts, strict=True)
+    )
     judged, failures = int(proper.sum()), int(failing.sum())
-    short = int(np.sum(pairs.violates(margin)[0] & ~failing))
     return HeldOut(
-        simulations=len(points),
+        simulations=len(rho),
         failures=failures,
-        short=short,
-        without_verdict=len(points) - judged,
-        least=float(np.min(pairs.rho[0][proper])) if judged else None,
+        short=int(short.sum()),
+        without_verdict=len(rho) - judged,
+        least=float(np.min(rho[proper])) if judged else None,
         rate=clopper_pearson(failures, judged) if judged else None,
     )
 
@@ -101,14 +118,3 @@ def drawn(
         parts.append(points)
         have += len(points)
     return np.concatenate(parts)[:count]
-
-
-def rows_of(space: FeatureSpace | None, points: Any) -> Any:
-    """A DataFrame of the features at these points of the space's cube."""
-    import jax
-    import pandas as pd
-
-    if space is None:
-        return pd.DataFrame(index=range(len(points)))
-    u = np.asarray(points, np.float32).reshape(len(points), space.dim)
-    return pd.DataFrame(space.rows(jax.vmap(space.unflatten)(u)))

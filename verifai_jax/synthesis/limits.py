@@ -23,15 +23,39 @@ class Limits:
     @property
     def left(self) -> int:
         """Simulations left, none after the time."""
-        if self.until is not None and time.perf_counter() >= self.until:
-            return 0
-        return max(0, self.most - self.spent())
+        return 0 if self.late else max(0, self.most - self.spent())
 
     @property
     def over(self) -> bool:
         """Whether nothing is left."""
         return self.left == 0
 
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return self.until is not None and time.perf_counter() >= self.until
+
+    @property
+    def ended(self) -> str:
+        """What ends a work that nothing else has ended."""
+        return "max_seconds" if self.late else "budget"
+
     def slice(self, simulations: int) -> "Limits":
         """The same for a part that may spend so many simulations from now on."""
         return replace(self, most=min(self.most, self.spent() + simulations))
+
+
+SEARCHING = 0.8
+"""Share of `max_seconds` after which the search ends, so that time is left for the check."""
+
+
+def timed(
+    spent: Callable[[], int], budget: int, started: float, max_seconds: float | None
+) -> tuple[Limits, Limits]:
+    """The limits of a search, and of the check after it, whose simulations are not limited."""
+    if max_seconds is None:
+        return Limits(spent, budget), Limits(lambda: 0, 1)
+    return (
+        Limits(spent, budget, started + SEARCHING * max_seconds),
+        Limits(lambda: 0, 1, started + max_seconds),
+    )

@@ -12,8 +12,8 @@ is not simulated, and its robustness is infinite.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,12 @@ from verifai_jax.mtl import robustness, smooth
 from verifai_jax.problem import Problem
 from verifai_jax.run import run_keys
 from verifai_jax.trace import Status
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ROWS = 64
+"""Rows of a table made at a time, so that one shape compiles."""
 
 
 class Pairs(NamedTuple):
@@ -50,37 +56,6 @@ class Pairs(NamedTuple):
     def violates(self, margin: float) -> Bool[np.ndarray, "k n"]:
         """Which pairs break a formula, or keep it with less than this margin."""
         return self.proper & (self.failing | (self.rho < margin))
-
-
-class Parametric(Protocol):
-    """What synthesis and repair need to know of a system with parameters."""
-
-    problem: Problem
-    dim: int
-    """Number `p` of coordinates of the parameters."""
-    bounded: bool
-    """Whether the parameters live in the unit cube."""
-    space: FeatureSpace | None
-    """Of the parameters, where they are features."""
-    environment: FeatureSpace | None
-    """What varies beside the parameters; None where nothing does."""
-    free: Bool[np.ndarray, " p"]
-    """Which coordinates are continuous."""
-    differentiable: bool
-    simulations: int
-    without_verdict: int
-
-    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs: ...
-
-    def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]: ...
-
-    def values(self, theta: Float[np.ndarray, " p"]) -> Any:
-        """The parameters as a person gives them."""
-        ...
-
-    def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
-        """The problem with the parameters held at these values."""
-        ...
 
 
 class FeatureParameters:
@@ -173,8 +148,7 @@ class FeatureParameters:
 
     def values(self, theta: Float[np.ndarray, " p"]) -> dict[str, Any]:
         """Parameter name -> value, as a person writes it."""
-        table = self.space.rows(_one(self.space, theta))
-        columns = {column: entries[0] for column, entries in table.items()}
+        columns = {c: entries[0] for c, entries in columns_of(self.space, theta[None]).items()}
         return {name: _plain(self.space[name], name, columns) for name in self.names}
 
     def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
@@ -269,7 +243,8 @@ class ArrayParameters:
                 for theta in thetas
             ]
         columns: Any = zip(*parts, strict=True)
-        return Pairs(*(None if column[0] is None else np.stack(column) for column in columns))
+        stacked: Any = (None if column[0] is None else np.stack(column) for column in columns)
+        return Pairs(*stacked)
 
     def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
         """Which environments the constraint accepts."""
@@ -349,6 +324,9 @@ class ArrayParameters:
         return jax.jit(program)
 
 
+Parametric = FeatureParameters | ArrayParameters
+
+
 def held(problem: Problem, values: dict[str, Any]) -> Problem:
     """The problem with these features fixed, and nominal there if it has nominal features."""
     nominal = None if problem.nominal is None else {**problem.nominal, **values}
@@ -365,9 +343,33 @@ def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.nda
     return np.asarray(space.accepts_points(padded))[: len(rows)]
 
 
-def _one(space: FeatureSpace, theta: Any) -> Any:
-    features = space.unflatten(jnp.asarray(theta, jnp.float32))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
+def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:
+    """The columns of a table for the features at these points of the space's cube."""
+    u = np.asarray(points, np.float32).reshape(len(points), space.dim)
+    padded = np.pad(u, ((0, -len(u) % ROWS), (0, 0)), constant_values=0.5)
+    parts = [
+        space.rows(jax.tree.map(np.asarray, _unflatten(space)(padded[start : start + ROWS])))
+        for start in range(0, max(len(padded), 1), ROWS)
+        if len(padded)
+    ]
+    if not parts:
+        return {column: np.zeros(0) for column in space.columns}
+    whole = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    return {column: entries[: len(u)] for column, entries in whole.items()}
+
+
+def rows_of(space: FeatureSpace | None, points: Any) -> "pd.DataFrame":
+    """A table of the features at these points of the space's cube."""
+    import pandas as pd
+
+    if space is None:
+        return pd.DataFrame(index=range(len(points)))
+    return pd.DataFrame(columns_of(space, points))
+
+
+@lru_cache(maxsize=32)
+def _unflatten(space: FeatureSpace) -> Any:
+    return jax.jit(jax.vmap(space.unflatten))
 
 
 def _plain(domain: Any, name: str, columns: dict[str, Any]) -> Any:

@@ -23,9 +23,9 @@ from verifai_jax import search as searches
 from verifai_jax.backends import resolved
 from verifai_jax.engine import in_precision
 from verifai_jax.errors import suggests_options
-from verifai_jax.options import check_options, check_search
+from verifai_jax.options import check_options, check_search, usual_batch
 from verifai_jax.problem import Problem
-from verifai_jax.search import CrossEntropy, Search
+from verifai_jax.search import Search
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.choosing import (
     Archive,
@@ -34,12 +34,13 @@ from verifai_jax.synthesis.choosing import (
     climb,
     explore,
     judged,
+    least,
     narrow,
     scale_of,
 )
-from verifai_jax.synthesis.heldout import HeldOut, drawn, held_out, rows_of
-from verifai_jax.synthesis.limits import Limits
-from verifai_jax.synthesis.parametric import FeatureParameters
+from verifai_jax.synthesis.heldout import HeldOut, drawn, held_out
+from verifai_jax.synthesis.limits import Limits, timed
+from verifai_jax.synthesis.parametric import FeatureParameters, held, rows_of
 from verifai_jax.synthesis.steps import uphill
 
 if TYPE_CHECKING:
@@ -63,9 +64,9 @@ class Synthesis:
     that many `environments`, all over the same set; `environments`: a table of the set, with the
     `rho` of the best parameters; `held_out`: how they did in fresh samples, None without a check;
     `attacks`: environments that were tried against the best parameters; `converged`: whether the
-    last attack found no environment worse than those of the set; `simulations`, `without_verdict`
-    and `seconds`; `stopped`: `"converged"`, `"budget"`, `"max_seconds"` or `"interrupted"`;
-    `problem`: the one given; `seed`.
+    last attack found no environment worse than those of the set; `simulations` (without
+    those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
+    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`.
     """
 
     problem: Problem = field(repr=False)
@@ -92,17 +93,15 @@ class Synthesis:
     @cached_property
     def chosen(self) -> Problem:
         """The problem with the parameters held at their values: ready to `falsify`."""
-        from verifai_jax.synthesis.parametric import held
-
         return held(self.problem, self.parameters)
 
     @property
     def robust(self) -> "pd.DataFrame":
         """The candidates that keep the margin over the whole set."""
-        return self.candidates[self.candidates["rho"] >= self.margin]
+        return self.candidates.loc[self.candidates["rho"] >= self.margin]
 
     def __str__(self) -> str:
-        shown = ", ".join(f"{name} = {_short(value)}" for name, value in self.parameters.items())
+        shown = ", ".join(f"{name} = {short(value)}" for name, value in self.parameters.items())
         wanted = f" by the margin of {self.margin:g}" if self.margin else ""
         lines = [f"synthesis for {self.problem.name}: {shown}"]
         around = self.environments.shape[1] > 1
@@ -124,8 +123,11 @@ class Synthesis:
         elif around:
             lines.append("  not checked in held-out environments")
         found, of = len(self.robust), len(self.candidates)
-        over = f" over {len(self.environments)} environments" if around else ""
-        lines.append(f"  {found} of the best {of} candidates keep the margin{over} (.candidates)")
+        if around:
+            over = f"over {len(self.environments)} environments"
+            lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
+        else:
+            lines.append(f"  {found} of the points simulated keep it (.robust)")
         lines.append(f"  {self._told()}")
         return "\n".join(lines)
 
@@ -138,7 +140,8 @@ class Synthesis:
         return text
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A parameter's value, for people."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -173,6 +176,7 @@ def synthesize(
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `batch`: simulations at once.
+    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - the others as in `falsify`.
 
     Ctrl-C ends it and returns what is finished, without the check.
@@ -184,18 +188,23 @@ def synthesize(
     check_numbers(margin, environments=environments, held_out=held_out)
     loop = feature_loop(problem, parameters, gradient, batch, budget, precision, backend, seed)
     search = attacker(problem, search, loop)
-    until = None if max_seconds is None else started + max_seconds
-    limits = Limits(lambda: loop.simulations, budget, until)
+    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
     work = _Search(loop, search, limits, margin, environments, seed)
     try:
         work.go()
         stopped = work.stopped
     except KeyboardInterrupt:
         stopped = "interrupted"
-    best, robustness = work.best()
+    if stopped != "interrupted":
+        try:
+            work.conclude()
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+    best, robustness = work.best, work.robustness
+    searched = loop.simulations
     checked = None
     if stopped != "interrupted" and held_out and (loop.environment is not None or problem.draws()):
-        checked = _held_out_or_none(loop, best.theta, held_out, margin, seed)
+        checked = _held_out_or_none(loop, best.theta, held_out, margin, seed, checking)
     if checked is not None and checked.least is not None:
         robustness = min(robustness, checked.least)
     return Synthesis(
@@ -204,11 +213,11 @@ def synthesize(
         robustness=robustness,
         margin=margin,
         candidates=work.table(),
-        environments=work.environment_table(best),
+        environments=work.environment_table(),
         held_out=checked,
         attacks=work.attacks.get(best.theta.tobytes(), 0) + len(work.environments),
         converged=work.stopped == "converged",
-        simulations=loop.simulations,
+        simulations=searched,
         without_verdict=loop.without_verdict,
         seconds=time.perf_counter() - started,
         stopped=stopped,
@@ -216,9 +225,11 @@ def synthesize(
     )
 
 
-def _held_out_or_none(loop: Any, theta: Any, count: int, margin: float, seed: int) -> Any:
+def _held_out_or_none(
+    loop: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
+) -> Any:
     try:
-        return held_out(loop, theta, count, margin, (seed, 1))
+        return held_out(loop, theta, count, margin, (seed, 1), limits)
     except KeyboardInterrupt:
         return None
 
@@ -237,13 +248,16 @@ class _Search:
     ) -> None:
         self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
         self.margin = margin
+        # One shape for all attacks: a twentieth of what one may cost.
+        self.batch = min(128, usual_batch(search, max(256, limits.most // 4)))
         self.archive = Archive()
         self.rng = np.random.default_rng((seed, 2))
         self.scale = 1.0
         self.stopped = "budget"
         self.attacked: list[Choice] = []
         self.attacks: dict[bytes, int] = {}
-        self._finalists: list[Choice] = []
+        self.final: list[Choice] = []
+        self.rho: Any = None  # Of the best, in each environment of the set.
         self.environments: Any = np.zeros((1, 0), np.float32)
         if loop.environment is not None:
             self.environments = drawn(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
@@ -253,14 +267,24 @@ class _Search:
                 self.environments = rng.random((environments, loop.environment.dim), np.float32)
 
     def go(self) -> None:
+        whole = self.limits
+        if self.loop.environment is not None:
+            # A tenth is kept for comparing the candidates over the whole set at last.
+            self.limits = whole.slice(int(0.9 * whole.left))
+        try:
+            self.rounds()
+        finally:
+            self.limits = whole
+
+    def rounds(self) -> None:
+        """All but the conclusion."""
         total = self.limits.left
         first = self.limits.slice(
             int(0.5 * total if self.loop.environment is None else 0.3 * total)
         )
         explore(
             self.loop, self.environments, self.archive, first,
-            search=CrossEntropy(least_std=0.003), batch=CANDIDATES, seed=self.seed,
-            cost=lambda theta, value: -value,
+            merit=by_value, batch=CANDIDATES, rng=self.rng,
         )  # fmt: skip
         if not self.archive.choices:
             # Not even one choice fits into the share: at least one is judged.
@@ -268,7 +292,7 @@ class _Search:
         self.scale = scale_of([choice.value for choice in self.archive.choices])
         if self.loop.environment is None:
             self.improve(self.limits, 2 * STARTS)
-            self.stopped = "converged" if not self.limits.over else self.ended()
+            self.stopped = self.limits.ended if self.limits.over else "converged"
             return
         number = 0
         while not self.limits.over:
@@ -282,7 +306,7 @@ class _Search:
             share = max(self.limits.left // 4, min(self.limits.left, 256))
             found = attack(
                 self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
-                batch=min(128, max(8, share // 10)), seed=self.seed + 7919 * number,
+                batch=self.batch, seed=self.seed + 7919 * number,
                 scale=self.scale,
             )  # fmt: skip
             worst = min(choice.value, found.worst)
@@ -290,14 +314,12 @@ class _Search:
             self.attacks[name] = self.attacks.get(name, 0) + len(found.rho)
             self.attacked.append(choice._replace(value=worst))
             if not found.violating.any():
-                self.stopped = "converged"
-                break
+                # What a handful of simulations does not find says nothing.
+                thorough = len(found.rho) >= max(32, self.limits.most // 20)
+                self.stopped = "converged" if thorough else self.limits.ended
+                return
             self.extend(found.chosen(ADDED))
-        if self.stopped != "converged":
-            self.stopped = self.ended()
-
-    def ended(self) -> str:
-        return "budget" if self.loop.simulations >= self.limits.most else "max_seconds"
+        self.stopped = self.limits.ended if self.limits.over else "no verdict"
 
     def improve(self, limits: Limits, starts: int) -> None:
         best = self.archive.best(starts, by_value, apart=1e-3)
@@ -336,48 +358,70 @@ class _Search:
     def archive_best(self) -> Choice:
         return self.archive.best(1, by_value)[0]
 
-    def best(self) -> tuple[Choice, float]:
-        """The choice that has stood up best to all that was tried against it, and how well."""
-        if not self.archive.choices and not self.attacked:
-            return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0), -np.inf
-        if self.loop.environment is None or not self.attacked:
-            choice = self.archive_best()
-            return choice, choice.value
-        known: dict[bytes, Choice] = {}
-        for choice in self.attacked:
-            name = choice.theta.tobytes()
-            if name not in known or choice.value < known[name].value:
-                known[name] = choice
-        choices = list(known.values())
-        values = judged(self.loop, [c.theta for c in choices], self.environments)
-        least = [min(c.value, v) for c, v in zip(choices, values, strict=True)]
-        place = int(np.argmax(least))
-        return choices[place], float(least[place])
+    @property
+    def best(self) -> Choice:
+        """The choice that has stood up best to all that was tried against it."""
+        if self.attacked:
+            known: dict[bytes, Choice] = {}
+            for choice in self.attacked:
+                name = choice.theta.tobytes()
+                if name not in known or choice.value < known[name].value:
+                    known[name] = choice
+            return max(known.values(), key=lambda choice: choice.value)
+        if self.archive.choices:
+            return self.archive_best()
+        return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0)
+
+    @property
+    def robustness(self) -> float:
+        """Of the best, the least that was seen."""
+        return self.best.value
+
+    def conclude(self) -> None:
+        """With what is left: judge the attacked and the best other choices over the whole set."""
+        if self.loop.environment is None:
+            return
+        pool = Archive()
+        pool.choices = [*self.attacked, *self.archive.best(CANDIDATES, by_value, apart=1e-3)]
+        thetas: dict[bytes, Any] = {}
+        for choice in pool.best(len(pool.choices), by_value):
+            thetas.setdefault(choice.theta.tobytes(), choice)
+        affordable = max(0, self.limits.most - self.loop.simulations) // len(self.environments)
+        chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
+        if not chosen:
+            return
+        pairs = self.loop.judge(np.stack([c.theta for c in chosen]), self.environments)
+        values = least(pairs)
+        self.final = [
+            Choice(c.theta, float(v), len(self.environments))
+            for c, v in zip(chosen, values, strict=True)
+        ]
+        seen = {c.theta.tobytes(): c.value for c in self.final}
+        self.attacked = [
+            c._replace(value=min(c.value, seen.get(c.theta.tobytes(), c.value)))
+            for c in self.attacked
+        ]
+        names = [c.theta.tobytes() for c in self.final]
+        if (name := self.best.theta.tobytes()) in names:
+            self.rho = pairs.rho[names.index(name)]
 
     def table(self) -> "pd.DataFrame":
-        """The best candidates, all over the whole set."""
-        pool = Archive()
-        pool.choices = [*self.archive.choices, *self.attacked]
-        apart = 1e-3 if self.loop.environment is not None else 0.0
-        most = CANDIDATES if self.loop.environment is not None else len(pool.choices)
-        best = pool.best(most, by_value, apart)
-        if not best:
-            return rows_of(self.loop.space, np.zeros((0, self.loop.dim))).assign(rho=[])
-        thetas = np.stack([c.theta for c in best])
+        """The candidates, best first."""
         if self.loop.environment is None:
-            values = np.array([c.value for c in best])
-            keep = (values >= self.margin) | (np.arange(len(values)) < CANDIDATES)
-            thetas, values = thetas[keep], values[keep]
+            pool = self.archive.best(len(self.archive.choices), by_value)
+            chosen = [c for i, c in enumerate(pool) if c.value >= self.margin or i < CANDIDATES]
         else:
-            values = judged(self.loop, thetas, self.environments)
-        frame = rows_of(self.loop.space, thetas).assign(
-            rho=values, environments=len(self.environments)
+            chosen = sorted(self.final or [self.best], key=lambda c: c.value, reverse=True)
+        thetas = np.array([c.theta for c in chosen]).reshape(len(chosen), self.loop.dim)
+        frame = rows_of(self.loop.space, thetas)
+        return frame.assign(
+            rho=[c.value for c in chosen], environments=[c.environments for c in chosen]
         )
-        return frame.sort_values("rho", ascending=False, kind="stable", ignore_index=True)
 
-    def environment_table(self, best: Choice) -> "pd.DataFrame":
-        pairs = self.loop.judge(best.theta[None], self.environments)
-        return rows_of(self.loop.environment, self.environments).assign(rho=pairs.rho[0])
+    def environment_table(self) -> "pd.DataFrame":
+        """The set, with the robustness of the best parameters where it is known."""
+        rho = self.rho if self.rho is not None else np.full(len(self.environments), np.nan)
+        return rows_of(self.loop.environment, self.environments).assign(rho=rho)
 
 
 def check_numbers(margin: Any, **counts: Any) -> None:

@@ -1,0 +1,533 @@
+"""Parameters of a controller that fails, changed as little as removes its failures.
+
+    repair(problem, ["k_theta", "k_theta_dot"])          # from the problem's nominal features
+    repair(run, ["k_theta"])                              # with the counterexamples of a run
+    repair(problem, weights, system_of=closed_loop)       # a pytree of arrays, by gradients
+
+Falsification and repair take turns: attack the environment with the present parameters; add the
+counterexamples to a set; go to the parameters nearest to the nominal ones that keep the formula in
+all of the set. Along gradients this is a sequence of least-distance problems (sequential quadratic
+programming: Nocedal and Wright, Numerical optimization, 2006, chapter 18), without them a
+cross-entropy search. It ends when an attack finds nothing, which proves nothing: the failure rates
+before and after are those of fresh samples, which the repair has never seen.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.errors import check_names, suggests_options
+from verifai_jax.options import check_options, usual_batch
+from verifai_jax.problem import Problem
+from verifai_jax.proposals import units
+from verifai_jax.run import Run
+from verifai_jax.search import Search
+from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.choosing import Archive, Choice, climb, explore, judged, narrow
+from verifai_jax.synthesis.heldout import HeldOut, held_out
+from verifai_jax.synthesis.limits import Limits, timed
+from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
+from verifai_jax.synthesis.steps import least_change, uphill
+from verifai_jax.synthesis.synthesize import attacker, check_numbers, feature_loop, short
+
+ADDED = 8
+"""Counterexamples that a round adds to the set at most."""
+CANDIDATES = 32
+SLACK = 0.02
+"""Share of the first deficit that a repair aims above the margin: the next worst case is near."""
+
+
+class Round(NamedTuple):
+    """One turn: what the attack on the present parameters found.
+
+    - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
+    - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
+      arrays' own).
+    """
+
+    attacked: int
+    counterexamples: int
+    worst: float
+    change: float
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """What `repair` returns.
+
+    **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
+    pytree; `rounds`: a `Round` each; `held_out_before`, `held_out_after`: how both did in the same
+    number of fresh samples, None without a check; `robustness`: the least seen with the repaired
+    parameters; `environments`: how many are in the set of counterexamples; `margin` that was
+    wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
+    found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
+    `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
+    `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
+    parameters are a pytree; `notes`; `seed`.
+    """
+
+    name: str
+    before: Any
+    parameters: Any
+    rounds: tuple[Round, ...]
+    held_out_before: HeldOut | None
+    held_out_after: HeldOut | None
+    robustness: float
+    environments: int
+    margin: float
+    change: float
+    found: bool
+    simulations: int
+    without_verdict: int
+    seconds: float
+    stopped: str
+    seed: int
+    arrays: bool = False
+    notes: tuple[str, ...] = ()
+    make: Callable[[], Problem] | None = field(default=None, repr=False)
+
+    @property
+    def repaired(self) -> bool:
+        """Whether neither the last attack nor the check found a failure, and the check was made."""
+        return self.found and self.held_out_after is not None and self.held_out_after.passed
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The problem with the repaired parameters: ready to `falsify`."""
+        assert self.make is not None
+        return self.make()
+
+    def __str__(self) -> str:
+        lines = [f"repair of {self.name}: {self._changes()}"]
+        if self.found and not self.change:
+            lines.append("  the nominal parameters were kept: no attack found a failure")
+        elif self.found:
+            lines.append(
+                f"  an attack finds nothing any more; {self.environments} counterexamples are kept "
+                f"with robustness {self.robustness:.4g} at least"
+            )
+        elif self.stopped == "no parameters":
+            lines.append(
+                f"  NO REPAIR FOUND: the best parameters have robustness {self.robustness:.4g} "
+                f"over {self.environments} counterexamples; this does not prove that none has more"
+            )
+        else:
+            lines.append(
+                f"  NOT FINISHED ({self.stopped}): robustness {self.robustness:.4g} over "
+                f"{self.environments} counterexamples so far"
+            )
+        if self.held_out_before is not None:
+            lines.append(f"  before: {self.held_out_before.told()}")
+        if self.held_out_after is not None:
+            lines.append(f"  after:  {self.held_out_after.told()}")
+        else:
+            lines.append("  not checked in held-out environments")
+        if self.found and self.held_out_after is not None and not self.held_out_after.passed:
+            lines.append(
+                "  the check found what the attacks did not: try a larger budget or margin"
+            )
+        counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
+        lines.append(f"  counterexamples round by round: {counts}")
+        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        if self.without_verdict:
+            text += f"; {self.without_verdict} gave no verdict"
+        lines.append(f"  {text}")
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    def _changes(self) -> str:
+        if self.arrays:
+            return f"arrays changed by {self.change:.4g} (Euclidean)"
+        pairs = []
+        for name, value in self.parameters.items():
+            same = short(self.before[name]) == short(value)
+            shown = "unchanged" if same else f"-> {short(value)}"
+            pairs.append(f"{name} {short(self.before[name])} {shown}")
+        return ", ".join(pairs)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the worst robustness that each attack found; returns the figure."""
+        from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+        figure = new_figure(figsize=(5.0, 3.0))
+        axes = figure.subplots()
+        worst = [turn.worst for turn in self.rounds]
+        colours = [FAILING if turn.counterexamples else SAFE for turn in self.rounds]
+        axes.plot(range(1, len(worst) + 1), worst, color=BOUND, linewidth=0.8)
+        axes.scatter(range(1, len(worst) + 1), worst, color=colours, zorder=3)
+        axes.axhline(self.margin, color=BOUND, linewidth=0.8, linestyle="--")
+        axes.set(xlabel="round", ylabel="worst robustness found", title=self.name)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        tidy(axes)
+        return show_or_save(figure, path)
+
+
+@suggests_options
+def repair(
+    problem: Problem | Run,
+    parameters: Any,
+    budget: int = 20_000,
+    *,
+    nominal: Mapping[str, Any] | None = None,
+    system_of: Callable[[Any], Any] | None = None,
+    search: str | Search = "cross_entropy",
+    margin: float = 0.0,
+    rounds: int = 30,
+    held_out: int = 2000,
+    gradient: bool | None = None,
+    batch: int = 256,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+) -> Repair:
+    """Change parameters as little as makes the formula hold in all environments that are found.
+
+    **Arguments:**
+
+    - `problem`: what fails, or a run of it, whose counterexamples come first.
+    - `parameters`: names of features; or, with `system_of`, a pytree of arrays.
+    - `budget`: simulations at most, the check not counted.
+    - `nominal`: values of the parameters to start from; the problem's own when left out.
+    - `system_of(parameters) -> system`: pure, and traced by JAX. All features are the environment.
+    - `search`: attacks the parameters, over the environment.
+    - `margin`: robustness that is wanted.
+    - `rounds`: turns of attack and repair at most.
+    - `held_out`: fresh environments for the failure rates before and after; 0 for no check.
+    - `gradient`: whether to follow gradients; by default where the system has them without
+      changing the backend.
+    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - the others as in `falsify`.
+
+    Ctrl-C ends it and returns what is finished, without the check.
+
+    **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
+    nominal value, no environment, options out of range, or arrays of a system without gradients.
+    """
+    started = time.perf_counter()
+    run = problem if isinstance(problem, Run) else None
+    whole: Any = problem.problem if isinstance(problem, Run) else problem
+    if whole is None:
+        assert run is not None
+        raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
+    check_options(budget, batch, seed, max_seconds, None)
+    check_numbers(margin, rounds=rounds, held_out=held_out)
+    loop: Parametric
+    if system_of is not None:
+        loop = _arrays(whole, parameters, system_of, nominal, gradient, batch, precision, seed)
+        start = loop.start
+    else:
+        loop, start = _features(
+            whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
+        )
+    search = attacker(whole, search, loop)
+    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
+    work = _Repair(loop, start, search, limits, margin, seed)
+    try:
+        if run is not None:
+            work.add_run(run)
+        work.go(rounds)
+        stopped = work.stopped
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    before = after = None
+    searched = loop.simulations
+    if stopped != "interrupted" and held_out:
+        before, after = _checked(loop, start, work.now.theta, held_out, margin, seed, checking)
+    robustness = work.robustness
+    if after is not None and after.least is not None:
+        robustness = min(robustness, after.least)
+    theta = work.now.theta
+    return Repair(
+        name=whole.name,
+        before=loop.values(start),
+        parameters=loop.values(theta),
+        rounds=tuple(work.turns),
+        held_out_before=before,
+        held_out_after=after,
+        robustness=robustness,
+        environments=len(work.environments),
+        margin=margin,
+        change=float(np.linalg.norm(theta - start)),
+        found=stopped == "repaired",
+        simulations=searched,
+        without_verdict=loop.without_verdict,
+        seconds=time.perf_counter() - started,
+        stopped=stopped,
+        seed=seed,
+        arrays=system_of is not None,
+        notes=tuple(work.notes),
+        make=lambda: loop.with_parameters(theta),
+    )
+
+
+def _checked(
+    loop: Any, start: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
+) -> Any:
+    try:
+        # What was repaired first: it matters more where time is short.
+        after = held_out(loop, theta, count, margin, (seed, 1), limits)
+        return held_out(loop, start, count, margin, (seed, 1), limits), after
+    except KeyboardInterrupt:
+        return None, None
+
+
+def _arrays(
+    problem: Any,
+    parameters: Any,
+    system_of: Any,
+    nominal: Any,
+    gradient: Any,
+    batch: int,
+    precision: str,
+    seed: int,
+) -> ArrayParameters:
+    if not isinstance(problem, Problem):
+        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
+    if nominal is not None:
+        raise ValueError("with system_of the parameters are their own nominal values")
+    if gradient is False:
+        raise ValueError(
+            "arrays of parameters are repaired by gradients; leave gradient out, or make the "
+            "parameters features of the space"
+        )
+    problem.space.check_where()
+    return ArrayParameters(
+        problem, parameters, system_of, batch=batch, precision=precision, seed=seed
+    )
+
+
+def _features(
+    problem: Any,
+    names: Any,
+    nominal: Any,
+    gradient: Any,
+    batch: int,
+    budget: int,
+    precision: str,
+    backend: Any,
+    seed: int,
+) -> tuple[Any, Float[np.ndarray, " p"]]:
+    named = isinstance(names, str) or (
+        isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
+    )
+    if not named or not len(names):
+        raise ValueError(
+            "parameters must be names of features, at least one; arrays need "
+            f"system_of=function that makes the system of them; got {names!r}"
+        )
+    loop = feature_loop(problem, names, gradient, batch, budget, precision, backend, seed)
+    if loop.environment is None:
+        raise ValueError(
+            "all features are parameters, so that nothing can vary to find counterexamples in; "
+            "use synthesize"
+        )
+    check_names("parameter of nominal", nominal or {}, loop.names)
+    given = {**(problem.nominal or {}), **(nominal or {})}
+    missing = [name for name in loop.names if name not in given]
+    if missing:
+        raise ValueError(
+            f"a repair starts from nominal values; {', '.join(missing)} "
+            f"{'has' if len(missing) == 1 else 'have'} none: give nominal={{...}}"
+        )
+    values = {name: given[name] for name in loop.names}
+    for name, value in values.items():
+        loop.space[name].check(value, name)
+    return loop, np.asarray(loop.space.flatten(values), np.float64)
+
+
+class _Repair:
+    """The work of a repair, of which all that is finished can be had at any time."""
+
+    def __init__(
+        self,
+        loop: Parametric,
+        start: Float[np.ndarray, " p"],
+        search: Search,
+        limits: Limits,
+        margin: float,
+        seed: int,
+    ) -> None:
+        assert loop.environment is not None
+        self.loop, self.start, self.search, self.limits = loop, start, search, limits
+        self.margin, self.seed = margin, seed
+        self.rng = np.random.default_rng((seed, 2))
+        # A twentieth of the budget for an attack at first, a tenth where it finds nothing.
+        self.share = max(64, limits.most // 10)
+        self.batch = min(128, usual_batch(search, self.share))
+        self.environments = np.zeros((0, loop.environment.dim), np.float32)
+        self.now = Choice(start, np.inf, 0)
+        self.robustness = np.inf
+        self.deficit: float | None = None
+        self.turns: list[Round] = []
+        self.notes: list[str] = []
+        self.stopped = "rounds"
+
+    def add_run(self, run: Run) -> None:
+        """Begin with the environments of a run in which the nominal parameters fail."""
+        rows = run.table.counterexamples
+        space = self.loop.environment
+        assert space is not None
+        if len(rows):
+            order = np.argsort(rows["rho"].to_numpy(), kind="stable")[: 4 * ADDED]
+            points = units(space, rows.iloc[order])
+            pairs = self.loop.judge(self.start[None], points)
+            failing = pairs.violates(self.margin)[0]
+            self.environments = points[failing][: 2 * ADDED].astype(np.float32)
+            if failing.any():
+                self.seen(float(np.min(pairs.rho[0][failing])))
+        self.notes.append(
+            f"{len(self.environments)} counterexamples came from the run of {run.name!r}"
+        )
+
+    def seen(self, worst: float) -> None:
+        """The deficit of the nominal parameters, which the slack is a share of."""
+        if self.deficit is None:
+            self.deficit = max(self.margin - worst, 1e-6)
+
+    @property
+    def aim(self) -> float:
+        """The robustness that a repair goes for."""
+        return self.margin + SLACK * (self.deficit or 0.0)
+
+    @property
+    def enough(self) -> float:
+        """The robustness at which it is content."""
+        return self.margin + 0.5 * SLACK * (self.deficit or 0.0)
+
+    def go(self, rounds: int) -> None:
+        if len(self.environments) and not self.mend():
+            return
+        for number in range(1, rounds + 1):
+            if self.limits.over:
+                break
+            part = self.limits.slice(self.share)
+            found = attack(
+                self.loop, self.now.theta, self.margin, part, search=self.search,
+                batch=self.batch, seed=self.seed + 7919 * number,
+                scale=self.deficit or 1.0,
+            )  # fmt: skip
+            count = int(found.violating.sum())
+            change = float(np.linalg.norm(self.now.theta - self.start))
+            self.turns.append(Round(len(found.rho), count, found.worst, change))
+            self.robustness = min(found.worst, self.now.value)
+            if not count:
+                # What a handful of simulations does not find says nothing.
+                thorough = not self.limits.over or len(found.rho) >= self.share // 2
+                self.stopped = "repaired" if thorough else self.limits.ended
+                if not np.isfinite(found.rho).any():
+                    self.stopped = "no verdict"
+                return
+            self.seen(found.worst)
+            self.environments = np.concatenate([self.environments, found.chosen(ADDED)])
+            self.environments = self.environments.astype(np.float32)
+            if not self.mend():
+                return
+        self.stopped = self.limits.ended if self.limits.over else "rounds"
+
+    def mend(self) -> bool:
+        """Go to the nearest parameters that keep the whole set; whether there are any."""
+        archive = Archive()
+        judged(self.loop, [self.start, self.now.theta], self.environments, archive)
+        scale = self.deficit or 1.0
+        if self.loop.differentiable:
+            # From where it is now, and from the start anew: the nearest may lie elsewhere.
+            starts = [self.now.theta] if np.all(self.now.theta == self.start) else [
+                self.now.theta, self.start
+            ]  # fmt: skip
+            climb(
+                self.loop, starts, self.environments, archive,
+                self.limits.slice(self.limits.left // 3), propose=self.propose, merit=self.merit,
+                scale=scale, radius=0.1 if self.loop.bounded else 0.1 * self.size,
+            )  # fmt: skip
+        best = archive.best(1, self.merit)[0]
+        if self.loop.bounded and (best.value < self.enough or not self.loop.differentiable):
+            best = self.without_gradients(archive)
+        self.now = best
+        self.robustness = best.value
+        if best.value >= self.enough:
+            return True
+        if self.limits.over:
+            self.stopped = self.limits.ended
+            return False
+        if best.value >= self.margin:
+            return True
+        self.stopped = "no parameters"
+        if not self.loop.bounded:
+            self.notes.append("gradients led no further; nothing else is tried on arrays")
+        return False
+
+    @property
+    def size(self) -> float:
+        """Of an ordinary number in the arrays."""
+        return float(np.sqrt(np.mean(self.start**2))) or 1.0
+
+    def merit(self, theta: Any, value: float) -> tuple[float, ...]:
+        """First enough robustness, then the nearer the better."""
+        far = float(np.linalg.norm(theta - self.start))
+        return (1.0, -far) if value >= self.enough else (0.0, value)
+
+    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
+        loop = self.loop
+        step = least_change(
+            theta, self.start, rho, slopes, self.aim, free=loop.free, bounded=loop.bounded
+        )
+        steps = [] if step is None else [step * share for share in (1.0, 0.5, 0.2, 0.05)]
+        if np.min(rho, initial=np.inf) < self.enough:
+            if loop.dim <= 64:
+                steps.append(
+                    uphill(theta, rho, slopes, radius, free=loop.free, bounded=loop.bounded)
+                )
+            else:
+                worst = slopes[int(np.argmin(rho))]
+                size = np.linalg.norm(worst)
+                if size > 0:
+                    steps.append(radius * np.sqrt(loop.dim) * worst / size)
+        moved = [theta + step for step in steps]
+        return [np.clip(m, 0.0, 1.0) for m in moved] if loop.bounded else moved
+
+    def without_gradients(self, archive: Archive) -> Choice:
+        """Cross-entropy over the whole space where nothing is known, then nearer and nearer."""
+        limits = self.limits.slice(self.limits.left // 3)
+        if archive.best(1, self.merit)[0].value < self.enough:
+            explore(
+                self.loop, self.environments, archive, limits.slice(limits.left // 2),
+                merit=self.merit, batch=CANDIDATES, rng=self.rng,
+            )  # fmt: skip
+        best = archive.best(6, self.merit)
+        narrow(
+            self.loop, [c.theta for c in best], self.environments, archive, limits,
+            merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=10,
+        )  # fmt: skip
+        best = archive.best(1, self.merit)[0]
+        if best.value >= self.enough:
+            self.back(best.theta, archive, limits)
+        return archive.best(1, self.merit)[0]
+
+    def back(self, theta: Any, archive: Archive, limits: Limits) -> None:
+        """Towards the nominal parameters: each coordinate alone first, then all together."""
+        blocks = [np.arange(self.loop.dim) == i for i in range(self.loop.dim)]
+        for block in [*blocks, np.ones(self.loop.dim, bool)]:
+            block = block & self.loop.free if block.sum() > 1 else block
+            low, high = 0.0, 1.0  # Shares of the way that are kept: `high` is known to be enough.
+            for _ in range(3):
+                shares = low + (high - low) * np.arange(8) / 8
+                ways = [np.where(block, self.start + s * (theta - self.start), theta)
+                        for s in shares]  # fmt: skip
+                if limits.left < len(ways) * len(self.environments) or high - low < 1e-3:
+                    return
+                values = judged(self.loop, ways, self.environments, archive)
+                good = values >= self.enough
+                # Nearest above which all are good, so that it is not an island.
+                upper = len(good) - int(np.argmin(np.append(good[::-1], False)))
+                if upper == 0:
+                    high = 0.0
+                    break
+                low, high = shares[upper - 1], shares[upper] if upper < len(shares) else high
+            theta = np.where(block, self.start + high * (theta - self.start), theta)
