@@ -13,7 +13,6 @@ classical Runge-Kutta method with 0.001 s. No trajectory of the original was ava
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int

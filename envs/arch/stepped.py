@@ -64,7 +64,7 @@ class Stepped:
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
-        if not (self.traced_factor and isinstance(factor, jax.core.Tracer)):
+        if not (self.traced_factor and isinstance(factor, jax.Array)):
             check_factor(factor)
         return self if self.finer is None else self.finer(factor)
 
@@ -117,7 +117,10 @@ def real() -> Any:
 
 
 def repeated(step: Callable[[Any, Any], Any], state: Any, count: Any) -> Any:
-    """`state = step(j, state)` for `j` below `count`, which JAX may trace: forward mode only then."""
+    """`state = step(j, state)` for `j` below `count`.
+
+    JAX may trace the count; then there is no derivative in reverse mode.
+    """
     if isinstance(count, int) and count == 1:
         return step(0, state)
     return jax.lax.fori_loop(0, count, step, state)

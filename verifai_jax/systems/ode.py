@@ -66,7 +66,7 @@ class Ode:
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
-        if not isinstance(factor, jax.core.Tracer):
+        if not isinstance(factor, jax.Array):
             check_factor(factor)
         return replace(self, substeps=self.substeps * factor)
 
