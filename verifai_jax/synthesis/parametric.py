@@ -119,6 +119,8 @@ class FeatureParameters:
             other = (seed + 1) % 2**63
             self._slopes = Evaluator(problem, batch, gradient=True, precision=precision, seed=other)
         self.without_verdict = 0
+        self.nominal: dict[str, Any] = {}
+        self.start: Float[np.ndarray, " p"] | None = None
 
     @property
     def simulations(self) -> int:
@@ -149,7 +151,23 @@ class FeatureParameters:
     def values(self, theta: Float[np.ndarray, " p"]) -> dict[str, Any]:
         """Parameter name -> value, as a person writes it."""
         columns = {c: entries[0] for c, entries in columns_of(self.space, theta[None]).items()}
-        return {name: _plain(self.space[name], name, columns) for name in self.names}
+        values = {name: _plain(self.space[name], name, columns) for name in self.names}
+        if self.start is None:
+            return values
+        moved = np.asarray(theta, np.float32) != self.start.astype(np.float32)
+        first = np.cumsum([0, *(self.space[name].size for name in self.names)])
+        for name, begin, end in zip(self.names, first, first[1:], strict=False):
+            if not moved[begin:end].any():
+                values[name] = self.nominal[name]  # Not rounded by the way through the cube.
+        return values
+
+    def begin(self, nominal: dict[str, Any]) -> Float[np.ndarray, " p"]:
+        """The coordinates of these values, by name, which `values` gives back unrounded."""
+        ordered = {name: nominal[name] for name in self.names}
+        fields = [(self.space[name], value) for name, value in ordered.items()]
+        parts = [np.ravel(np.asarray(d.to_unit(d.coerce(value)), float)) for d, value in fields]
+        self.nominal, self.start = ordered, np.concatenate(parts)
+        return self.start
 
     def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
         """The problem with these features fixed."""

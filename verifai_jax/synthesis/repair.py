@@ -39,8 +39,8 @@ from verifai_jax.synthesis.synthesize import attacker, check_numbers, feature_lo
 ADDED = 8
 """Counterexamples that a round adds to the set at most."""
 CANDIDATES = 32
-SLACK = 0.02
-"""Share of the first deficit that a repair aims above the margin: the next worst case is near."""
+SLACK = 0.05
+"""How far above the margin a repair aims, in ordinary robustnesses: the next worst case is near."""
 
 
 class Round(NamedTuple):
@@ -339,7 +339,7 @@ def _features(
     values = {name: given[name] for name in loop.names}
     for name, value in values.items():
         loop.space[name].check(value, name)
-    return loop, np.asarray(loop.space.flatten(values), np.float64)
+    return loop, loop.begin(values)
 
 
 class _Repair:
@@ -365,6 +365,7 @@ class _Repair:
         self.now = Choice(start, np.inf, 0)
         self.robustness = np.inf
         self.deficit: float | None = None
+        self.slack = 0.0
         self.turns: list[Round] = []
         self.notes: list[str] = []
         self.stopped = "rounds"
@@ -381,25 +382,30 @@ class _Repair:
             failing = pairs.violates(self.margin)[0]
             self.environments = points[failing][: 2 * ADDED].astype(np.float32)
             if failing.any():
-                self.seen(float(np.min(pairs.rho[0][failing])))
+                self.seen(pairs.rho[0])
         self.notes.append(
             f"{len(self.environments)} counterexamples came from the run of {run.name!r}"
         )
 
-    def seen(self, worst: float) -> None:
-        """The deficit of the nominal parameters, which the slack is a share of."""
-        if self.deficit is None:
-            self.deficit = max(self.margin - worst, 1e-6)
+    def seen(self, rho: Any) -> None:
+        """How badly the nominal parameters fail, and where they do not, how well they do."""
+        if self.deficit is not None:
+            return
+        rho = rho[np.isfinite(rho)] - self.margin
+        kept = rho[rho > 0]
+        self.deficit = max(-float(np.min(rho, initial=0.0)), 1e-6)
+        # A pole that has fallen has a deficit far beyond any margin that can be had.
+        self.slack = SLACK * min(self.deficit, float(np.median(kept)) if len(kept) else np.inf)
 
     @property
     def aim(self) -> float:
         """The robustness that a repair goes for."""
-        return self.margin + SLACK * (self.deficit or 0.0)
+        return self.margin + self.slack
 
     @property
     def enough(self) -> float:
         """The robustness at which it is content."""
-        return self.margin + 0.5 * SLACK * (self.deficit or 0.0)
+        return self.margin + 0.5 * self.slack
 
     def go(self, rounds: int) -> None:
         if len(self.environments) and not self.mend():
@@ -424,7 +430,7 @@ class _Repair:
                 if not np.isfinite(found.rho).any():
                     self.stopped = "no verdict"
                 return
-            self.seen(found.worst)
+            self.seen(found.rho)
             self.environments = np.concatenate([self.environments, found.chosen(ADDED)])
             self.environments = self.environments.astype(np.float32)
             if not self.mend():
@@ -449,6 +455,10 @@ class _Repair:
         best = archive.best(1, self.merit)[0]
         if self.loop.bounded and (best.value < self.enough or not self.loop.differentiable):
             best = self.without_gradients(archive)
+        if self.margin <= best.value < self.enough:
+            # More than the margin is not to be had; the nearest that keeps it will do.
+            self.slack = 0.0
+            best = archive.best(1, self.merit)[0]
         self.now = best
         self.robustness = best.value
         if best.value >= self.enough:
@@ -456,8 +466,6 @@ class _Repair:
         if self.limits.over:
             self.stopped = self.limits.ended
             return False
-        if best.value >= self.margin:
-            return True
         self.stopped = "no parameters"
         if not self.loop.bounded:
             self.notes.append("gradients led no further; nothing else is tried on arrays")
