@@ -7,7 +7,8 @@
 
 A search simulates in single precision at the model's step; both may break a property that the
 model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
-quarter of the step, and by more than these differ from each other.
+quarter of the step, there in single precision too, and with features that are one rounding away;
+and if it fails by more than twice of what these differ from each other.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +21,17 @@ from jaxtyping import Float
 from verifai_jax.engine import in_precision
 from verifai_jax.errors import check_names
 from verifai_jax.problem import Problem
-from verifai_jax.replays import HostReplays, Replayed, Replays, stored, told
+from verifai_jax.replays import HostReplays, Replayed, Replays, nudged, stored, told
 from verifai_jax.run import run_keys
 
 VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
 """See `Checked`."""
 FINER = {"half_step": 2, "quarter_step": 4}
 """Checks at a finer step, and how many times finer."""
+SINGLE = "quarter_step_float32"
+MARGIN = 2.0
+"""How many times what replays move it by a robustness must be away from zero. Once is what a method
+of order 1 is off at the finer of two steps, by Richardson's extrapolation."""
 SAFE = 10.0
 """Rows are left out only if so many times farther from zero than replays have moved any row,"""
 BLOCK = 64
@@ -38,6 +43,8 @@ IN_WORDS = {
     "again": "simulated again",
     "half_step": "at half the step",
     "quarter_step": "at a quarter of the step",
+    SINGLE: "at a quarter of the step in float32",
+    "nudged": "one rounding of the features away",
     "simulator": "in the other simulator",
 }
 
@@ -45,16 +52,17 @@ IN_WORDS = {
 class Checked(NamedTuple):
     """What came of checking rows, `[n]` each.
 
-    - `verdict`: `confirmed`: it fails in every check, by more than `band`; `fragile`: the checks
-      disagree, one of them gave no robustness, or it fails by less than `band`; `refuted`: none of
-      the finest checks fails (half and quarter of the step and the other simulator, or where there
-      is neither, double precision); `unchecked`: there was nothing finer to check with;
+    - `verdict`: `confirmed`: it fails in every check, by twice `band` at least; `fragile`: the
+      checks disagree, one of them gave no robustness, or it fails by less than that; `refuted`:
+      none of the finer checks fails (half and quarter of the step and the other simulator, or
+      where the step stays, double precision); `unchecked`: there was nothing finer to check with;
       `unexamined`: left out, see `Confirmer`.
     - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
       are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
-      `simulator`.
-    - `band`: how much the robustness moved: between half and quarter of the step, and between the
-      run and its replay where `rho` of the run is known.
+      `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
+      away) and `simulator`.
+    - `band`: how much the robustness moved between two of them that differ in one respect, or
+      between the run and its replay where `rho` of the run is known.
     - `why`: the reason, for people; empty where confirmed.
     - `notes`: which checks could not be made, and why.
     """
@@ -145,7 +153,10 @@ class Confirmer:
         for name, check in self._plan.checks.items():
             if check.precision not in features:
                 features[check.precision] = stored(self.problem.space, rows, check.precision)
-            found[name] = check.replays(check.factor, features[check.precision], numbers)
+            values = features[check.precision]
+            if name == "nudged":
+                values = nudged(self.problem.space, values)
+            found[name] = check.replays(check.factor, values, numbers)
         return _decided(len(numbers), found, run, self._plan)
 
     def _together(
@@ -204,8 +215,13 @@ def _planned(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
         if refined:
             for name, factor in FINER.items():
                 checks[name] = _Check(base, factor, precision)
+            if precision != run:
+                single = Replays(problem, run, base.key, stored(problem.space, rows, run))
+                checks[SINGLE] = _Check(single, FINER["quarter_step"], run)
         else:
             notes.append(f"not checked at a finer step: {reason}")
+        if not problem.black_box:
+            checks["nudged"] = _Check(base, FINER["quarter_step"] if refined else 1, precision)
     if confirmer.other is not None:
         other, precision, said = _replays(confirmer.other, confirmer, rows)
         notes += [f"the other simulator: {note}" for note in said]
@@ -251,27 +267,30 @@ class _Found(NamedTuple):
 
 
 def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _Found:
-    base = next((name for name in ("float64", "again") if name in found), None)
+    base = next((name for name in ("float64", "again") if name in found), "")
+    finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
+    rho = {name: replayed.rho for name, replayed in found.items()}
     band = np.zeros(count)
-    if "quarter_step" in found:
-        band = _moved(found["half_step"].rho, found["quarter_step"].rho)
-    if run is not None and base is not None:
-        band = np.maximum(band, _moved(run, found[base].rho))
+    pairs = (("half_step", "quarter_step"), (SINGLE, "quarter_step"), ("nudged", finest))
+    for one, other in pairs:
+        if one in found:
+            band = np.maximum(band, _moved(rho[one], rho[other]))
+    if run is not None and base:
+        band = np.maximum(band, _moved(run, rho[base]))
     if not plan.independent:
         reason = "; ".join(plan.notes) or "the run was in float64 already"
         return _Found(np.full(count, "unchecked", object), band, [reason] * count, found)
-    finest = next(n for n in ("quarter_step", "simulator", "float64", "again") if n in found)
-    deciding = [name for name in FINER if name in found] or [base]
+    deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
     deciding = [name for name in (*deciding, "simulator") if name in found]
     failing = {name: replayed.failing for name, replayed in found.items()}
     holding = {name: r.proper & ~r.failing for name, r in found.items()}
-    clear = np.abs(found[finest].rho) >= band
+    clear = np.abs(rho[finest]) >= MARGIN * band
     confirmed = np.all(list(failing.values()), axis=0) & clear
     refuted = np.all([holding[name] for name in deciding], axis=0) & (deciding[0] != "again")
     verdict = np.where(confirmed, "confirmed", np.where(refuted, "refuted", "fragile"))
     why = [""] * count
     for i in np.flatnonzero(~confirmed).tolist():
-        why[i] = _reason(i, found, float(found[finest].rho[i]), float(band[i]))
+        why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
     return _Found(verdict.astype(object), band, why, found)
 
 

@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.engine import in_precision, judge, simulation_key, verdict
 from verifai_jax.features import Box, FeatureSpace, Signal
+from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import indexed
+from verifai_jax.features.domain import dotted, indexed
 from verifai_jax.host import HostEngine, _Rows
 from verifai_jax.problem import Problem
 from verifai_jax.systems.simulations import Batched
@@ -33,6 +34,7 @@ from verifai_jax.trace import Status
 
 FEW = 8
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
+ROUNDING = 2.0**-23
 IMPL = "threefry2x32"  # As of the keys of a run.
 LANES = 64
 """Rows that a device replays together, where there are more."""
@@ -74,6 +76,8 @@ def _cast(leaf: np.ndarray, precision: str) -> np.ndarray:
 
 def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
     names = domain.columns(name)
+    if isinstance(domain, Struct):
+        return {part: _batch(inner, columns, dotted(name, part)) for part, inner in domain.fields}
     if isinstance(domain, Box | Continuous):
         values = [np.asarray(columns[column], np.float64) for column in names]
         return values[0] if np.ndim(getattr(domain, "low", 0.0)) == 0 else np.stack(values, axis=1)
@@ -91,6 +95,27 @@ def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
             known[row] = jax.tree.map(np.asarray, domain.from_columns(entries, name))
     each = [known[row] for row in rows] if rows else [known[()]] * count
     return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
+
+
+def nudged(space: FeatureSpace, features: Mapping[str, Any]) -> dict[str, Any]:
+    """The same features `[n, ...]`, their real numbers one rounding of float32 away.
+
+    Not out of their domains, and not numbers of which there are only some (choices, constants).
+    """
+    return {name: _nudged(domain, features[name]) for name, domain in space.domains.items()}
+
+
+def _nudged(domain: Any, value: Any) -> Any:
+    if isinstance(domain, Struct):
+        return {name: _nudged(part, value[name]) for name, part in domain.fields}
+    if isinstance(domain, Signal):
+        return replace(value, knots=_nudged(domain.domain, value.knots))
+    if isinstance(domain, Box | Continuous):
+        low, high = domain.support if isinstance(domain, Continuous) else (domain.low, domain.high)
+        away = (value * (1 + ROUNDING)).astype(value.dtype)
+        inside = (away >= np.asarray(low)) & (away <= np.asarray(high))
+        return np.where(inside, away, (value * (1 - ROUNDING)).astype(value.dtype))
+    return value
 
 
 class Refiner:
@@ -164,7 +189,7 @@ class Replays:
 
     def _keys(self, numbers: np.ndarray) -> Any:
         if not self.draws:  # Any will do.
-            return jax.random.wrap_key_data(np.zeros((len(numbers), 2), np.uint32), impl=IMPL)
+            return jax.random.wrap_key_data(jnp.zeros((len(numbers), 2), jnp.uint32), impl=IMPL)
         return jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
 
     def _block(self, factor: int, lanes: int | None, features: Any, keys: Any) -> Replayed:
