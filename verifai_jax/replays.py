@@ -23,14 +23,16 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.engine import in_precision, judge, simulation_key, verdict
+from verifai_jax.errors import unknown_name
 from verifai_jax.features import Box, FeatureSpace, Signal
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import dotted, indexed
+from verifai_jax.features.domain import as_numbers, dotted, indexed
 from verifai_jax.host import HostEngine, _Rows
 from verifai_jax.problem import Problem
 from verifai_jax.systems.simulations import Batched
 from verifai_jax.trace import Status
+from verifai_jax.waveform import Waveform
 
 FEW = 8
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
@@ -62,10 +64,11 @@ def stored(space: FeatureSpace, rows: Mapping[str, Any], precision: str) -> dict
 
     **Raises:** as `space.from_row`.
     """
-    columns = {name: np.asarray(rows[name]) for name in space.columns if name in rows}
+    for name in space.columns:
+        if name not in rows:
+            raise unknown_name("column", name, rows)
+    columns = {name: np.asarray(rows[name]) for name in space.columns}
     with in_precision(precision):
-        # Refuses what does not fit, and is the form that all rows have.
-        space.from_row({name: column[0] for name, column in columns.items()})
         batch = {name: _batch(domain, columns, name) for name, domain in space.domains.items()}
         return jax.tree.map(lambda leaf: _cast(leaf, precision), batch)
 
@@ -79,12 +82,12 @@ def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
     if isinstance(domain, Struct):
         return {part: _batch(inner, columns, dotted(name, part)) for part, inner in domain.fields}
     if isinstance(domain, Box | Continuous):
-        values = [np.asarray(columns[column], np.float64) for column in names]
+        # In NumPy: a first use of JAX takes longer than the simulation.
+        values = [as_numbers(columns[column], column) for column in names]
         return values[0] if np.ndim(getattr(domain, "low", 0.0)) == 0 else np.stack(values, axis=1)
     if isinstance(domain, Signal):
         knots = [_batch(domain.domain, columns, knot) for knot in indexed(name, domain.knots)]
-        one = domain.from_columns({column: columns[column][0] for column in names}, name)
-        return replace(one, knots=np.stack(knots, axis=1))
+        return Waveform(np.stack(knots, axis=1), domain.hold, domain.duration)  # pyright: ignore[reportArgumentType]
     # One row at a time, but equal ones once.
     rows = list(zip(*(columns[column].tolist() for column in names), strict=True))
     count = len(next(iter(columns.values())))
@@ -180,43 +183,41 @@ class Replays:
         lanes = None if count <= FEW else LANES * len(jax.local_devices())
         parts = []
         with in_precision(self.precision):
-            keys = self._keys(numbers)
             for start in range(0, count, lanes or 1):
-                block = slice(start, start + (lanes or 1))
-                rows = jax.tree.map(lambda leaf, block=block: leaf[block], features)
-                parts.append(self._block(factor, lanes, rows, keys[block]))
+                block = np.arange(start, min(start + (lanes or 1), count))
+                parts.append(self._block(factor, lanes, features, numbers, block))
         return Replayed.of(parts)
 
-    def _keys(self, numbers: np.ndarray) -> Any:
-        if not self.draws:  # Any will do.
-            return jax.random.wrap_key_data(jnp.zeros((len(numbers), 2), jnp.uint32), impl=IMPL)
-        return jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
+    def _block(
+        self, factor: int, lanes: int | None, features: Any, numbers: Any, block: np.ndarray
+    ) -> Replayed:
+        count = len(block)
+        if lanes is None:
+            place, key = block[0], self.key
+            if self.draws:  # Without it any key will do.
+                key = simulation_key(self.key, int(numbers[place]))
+        else:
+            place = block[np.minimum(np.arange(lanes), count - 1)]
+            many = jnp.asarray(numbers[place], jnp.int32)
+            key = jax.vmap(partial(simulation_key, self.key))(many)
+        rows = jax.tree.map(lambda leaf: leaf[place], features)
 
-    def _block(self, factor: int, lanes: int | None, features: Any, keys: Any) -> Replayed:
-        count = len(keys)
+        def run(mode: str) -> Any:
+            result = self._executable(mode, factor, lanes)(rows, key, np.int32(factor))
+            result = jax.tree.map(np.asarray, result)
+            return jax.tree.map(lambda leaf: leaf[None] if lanes is None else leaf[:count], result)
+
         try:
-            rho, status = self._run("rho", factor, lanes, features, keys)
+            rho, status = run("rho")
             broken, proper = np.any(rho < 0, axis=1), status == Status.OK
             undecided = proper & ~broken & np.any(rho == 0, axis=1)
             if undecided.any():
                 # At exactly zero the Boolean semantics decide, as in a run.
-                holds = self._run("holds", factor, lanes, features, keys)
-                broken |= undecided & ~np.all(holds, axis=1)
+                broken |= undecided & ~np.all(run("holds"), axis=1)
         except Exception as error:
             nothing, no = np.full(count, np.nan), np.zeros(count, bool)
             return Replayed(nothing, no, no, [told(error)] * count)
         return Replayed(np.min(rho, axis=1), broken & proper, proper, [""] * count)
-
-    def _run(self, mode: str, factor: int, lanes: int | None, features: Any, keys: Any) -> Any:
-        count = len(keys)
-        if lanes is None:
-            features, keys = jax.tree.map(lambda leaf: leaf[0], (features, keys))
-        else:
-            filled = np.minimum(np.arange(lanes), count - 1)
-            features, keys = jax.tree.map(lambda leaf: leaf[filled], (features, keys))
-        result = self._executable(mode, factor, lanes)(features, keys, np.int32(factor))
-        result = jax.tree.map(np.asarray, result)
-        return jax.tree.map(lambda leaf: leaf[None] if lanes is None else leaf[:count], result)
 
     def _executable(self, mode: str, factor: int, lanes: int | None) -> Any:
         place = ("run", *self._place(mode, factor, lanes))
