@@ -1,7 +1,7 @@
 """Intervals and bounds: of prior samples, of weighted samples, and of splitting.
 
-    upper_bound(0, 2000)                            # 0.0015: what no failure in 2000 says
-    simulations_until(1e-4, failures=0, simulations=2000)
+upper_bound(0, 2000)                            # 0.0015: what no failure in 2000 says
+simulations_until(1e-4, failures=0, simulations=2000)
 """
 
 import math

@@ -138,7 +138,7 @@ class Judge:
 
 
 def unit(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """The points of the unit cube, in the precision that simulations take."""
+    """The points of the unit cube, in double precision: single has no probabilities near one."""
     from scipy.special import ndtr
 
-    return ndtr(z).astype(np.float32)
+    return ndtr(z)

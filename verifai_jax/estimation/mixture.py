@@ -25,6 +25,8 @@ MODES = (1, 2, 4, 8)
 MOST_POINTS = 1500
 """Failures that a half of the candidates is fitted to at most: more change the fit little."""
 SWEEPS = 12
+TOGETHER = 0.3
+LEAST_SHARE = 1e-3
 
 
 class Component(Protocol):
@@ -177,22 +179,23 @@ def fitted(
     half = (rng.permutation(int(family.max()) + 1) % 2)[family].astype(bool)
     if min(_size(weight[half]), _size(weight[~half])) < 4:
         half = rng.random(len(z)) < 0.5
-    components: list[Any] = [Prior(d)]
-    shares = [defensive]
+    found: list[Any] = []
+    crossed: list[float] = []
     for fit in (half, ~half):
         test = ~fit
         if not fit.any() or not test.any():
             continue
-        found = candidates(*_thinned(z[fit], weight[fit], rng), rng)
-        table = np.exp(ratios(found, z[test]))
-        share = stacked(table, weight[test] / weight[test].sum(), defensive)
-        components += [c for c, s in zip(found, share, strict=True) if s > 0]
-        shares += list(share[share > 0] * (1 - defensive) / 2)
-    total = np.array(shares)
-    if len(components) == 1:
-        return Mixture(tuple(components), np.ones(1))
-    total[1:] *= (1 - defensive) / total[1:].sum()
-    return Mixture(tuple(components), total)
+        made = candidates(*_thinned(z[fit], weight[fit], rng), rng)
+        table = np.exp(ratios(made, z[test]))
+        crossed += list(stacked(table, weight[test] / weight[test].sum(), defensive))
+        found += made
+    # A mode that only one half has seen gets nothing from the other: so a part of the shares is
+    # what all points together say.
+    together = stacked(np.exp(ratios(found, z)), weight, defensive)
+    share = np.array(crossed) / 2 * (1 - TOGETHER) + together * TOGETHER
+    kept = np.flatnonzero(share >= LEAST_SHARE)
+    shares = share[kept] / share[kept].sum() * (1 - defensive)
+    return Mixture((Prior(d), *(found[i] for i in kept)), np.append(defensive, shares))
 
 
 def stacked(
@@ -202,7 +205,7 @@ def stacked(
 
     - `table`: densities over the prior's, at failures; the defensive part (1) is not among them.
 
-    By multiplicative steps, whose fixed points are the minima; shares below 0.2 % are dropped.
+    By multiplicative steps, whose fixed points are the minima.
     """
     k = table.shape[1]
     share = np.full(k, 1 / k)
@@ -215,8 +218,7 @@ def stacked(
         share = new
         if sweep > 20 and moved < 1e-4:
             break
-    share = np.where(share < 2e-3, 0.0, share)
-    return share / share.sum()
+    return share
 
 
 def candidates(
@@ -227,7 +229,7 @@ def candidates(
     found: list[Any] = []
     size = _size(weight)
     if d > 1:
-        found.append(shell(z, weight))
+        found += [shell(z, weight), alike(z, weight)]
     for modes in MODES:
         if modes > 1 and size < 6 * modes:
             break
@@ -343,35 +345,51 @@ def _borders() -> list[Float[np.ndarray, " k"]]:
 
 
 _BORDERS = _borders()
+_FINEST = np.unique(np.concatenate(_BORDERS))
+_AMONG = [np.searchsorted(_FINEST, border) for border in _BORDERS]
 
 
 def marginals(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Marginals:
-    """The step function of each coordinate, with the borders that Akaike's criterion prefers."""
-    from scipy.special import ndtr, ndtri
+    """The step function of each coordinate."""
+    from scipy.special import ndtr
 
     size = _size(weight)
-    u = ndtr(z)
-    edges, logs, masses = [], [], []
-    whole = (np.array([-np.inf, np.inf]), np.zeros(1), np.ones(1))
-    for column in u.T:
-        best, chosen = 0.0, whole
-        for border in _BORDERS:
-            k = len(border) - 1
-            if k > size:
-                continue
-            width = np.diff(border)
-            place = np.clip(np.searchsorted(border, column, side="right") - 1, 0, k - 1)
-            share = np.bincount(place, weight, k)
-            # Two points spread as the prior is, so that no step is empty.
-            mass = (share * size + 2 * width) / (size + 2)
-            gain = size * float(share @ np.log(mass / width)) - 1.5 * (k - 1)
-            if gain > best:
-                best = gain
-                chosen = (ndtri(border), np.log(mass / width), mass / mass.sum())
-        edges.append(chosen[0])
-        logs.append(chosen[1])
-        masses.append(chosen[2])
-    return Marginals(tuple(edges), tuple(logs), tuple(masses))
+    found = [_steps(column, weight, size) for column in ndtr(z).T]
+    return Marginals(*(tuple(parts) for parts in zip(*found, strict=True)))
+
+
+def alike(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Marginals:
+    """One step function for all coordinates, from all of them together."""
+    from scipy.special import ndtr
+
+    n, d = z.shape
+    found = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, _size(weight) * d)
+    return Marginals(*((part,) * d for part in found))
+
+
+def _steps(
+    u: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Borders, logarithmic heights and masses, with the borders that Akaike's criterion prefers."""
+    from scipy.special import ndtri
+
+    best = 0.0
+    chosen = (np.array([-np.inf, np.inf]), np.zeros(1), np.ones(1))
+    # Counted once, in the finest borders, of which the others are sums.
+    place = np.clip(np.searchsorted(_FINEST, u, side="right") - 1, 0, len(_FINEST) - 2)
+    fine = np.append(0, np.cumsum(np.bincount(place, weight, len(_FINEST) - 1)))
+    for border, among in zip(_BORDERS, _AMONG, strict=True):
+        k = len(border) - 1
+        if k > size:
+            continue
+        width, share = np.diff(border), np.diff(fine[among])
+        # Two points spread as the prior is, so that no step is empty.
+        mass = (share * size + 2 * width) / (size + 2)
+        gain = size * float(share @ np.log(mass / width)) - 1.5 * (k - 1)
+        if gain > best:
+            best = gain
+            chosen = (ndtri(border), np.log(mass / width), mass / mass.sum())
+    return chosen
 
 
 def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:

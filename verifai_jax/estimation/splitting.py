@@ -140,7 +140,7 @@ def _walk(
     and taken where the robustness stays below the level.
     """
     # Coordinates in which the level set is wide are moved further (their equation 22).
-    spread = np.minimum(z.std(axis=0) + 1e-3, 1.0)
+    spread = np.minimum(z.std(axis=0) + 1e-6, 1.0)
     states, scores, taken = [z], [score], []
     for step in range(1, steps):
         s = np.minimum(scale * spread, 1.0)
@@ -154,7 +154,7 @@ def _walk(
         states.append(z)
         scores.append(score)
         taken.append(take.mean())
-        scale = float(np.clip(scale * np.exp((taken[-1] - ACCEPTED) / np.sqrt(step)), 1e-3, 3.0))
+        scale = float(np.clip(scale * np.exp((taken[-1] - ACCEPTED) / np.sqrt(step)), 1e-6, 3.0))
     return np.concatenate(states), np.concatenate(scores), float(np.mean(taken or [1.0])), scale
 
 

@@ -1,0 +1,145 @@
+"""The result of an estimate: what is known of the failure probability, and how surely.
+
+found = vj.estimate(problem)
+found.probability, found.interval, found.upper_bound
+found.simulations_until(1e-6)
+print(found); found.plot()
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import verifai_jax.estimation.bounds as bounds
+from verifai_jax.figure import new_figure
+
+METHODS = {
+    "monte_carlo": "Monte Carlo",
+    "importance": "importance sampling",
+    "splitting": "multilevel splitting",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What `estimate` returns.
+
+    - `probability`: of failing, under the prior of the feature space; None where none is claimed.
+    - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
+    - `upper_bound`: guaranteed at `confidence` by independent samples of the prior alone, whatever
+      a search may have missed: `prior_failures` of `prior_simulations` failed, and
+      `prior_no_verdict` had no verdict, which counts as failing.
+    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
+    - `simulations`: in all; `failures` and `no_verdict` of them. A value with gradient counts 2.
+    - `no_verdict_probability`: of a simulation without a verdict, among the prior's samples.
+    - `effective`: weighted samples are worth so many failures, NaN where that has no meaning.
+    - `relative_error`: one standard error over the estimate.
+    - `diagnostics`: what else the method knows of itself.
+    - `notes`: what would surprise.
+    - `seed`, `version`, `precision`, `backend`: with the problem enough to get the same again.
+    """
+
+    name: str
+    probability: float | None
+    low: float
+    high: float
+    confidence: float
+    method: str | None
+    simulations: int
+    budget: int
+    failures: int
+    no_verdict: int
+    upper_bound: float
+    prior_simulations: int
+    prior_failures: int
+    prior_no_verdict: int
+    effective: float = math.nan
+    relative_error: float = math.nan
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    p0: float | None = None
+    seed: int = 0
+    version: str = ""
+    precision: str = "float32"
+    backend: str | None = None
+    seconds: float = 0.0
+    drawn: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """`(low, high)`."""
+        return self.low, self.high
+
+    @property
+    def no_verdict_probability(self) -> float:
+        """Share of the prior's samples without a verdict."""
+        return self.prior_no_verdict / max(self.prior_simulations, 1)
+
+    def simulations_until(self, p0: float, confidence: float | None = None) -> int:
+        """How many more samples of the prior, none failing, show that the probability is below.
+
+        After those that `upper_bound` stands on; 0 if they show it already.
+
+        **Raises:** `ValueError` unless `0 < p0 < 1`.
+        """
+        return bounds.simulations_until(
+            p0,
+            self.prior_failures + self.prior_no_verdict,
+            self.prior_simulations,
+            self.confidence if confidence is None else confidence,
+        )
+
+    def __str__(self) -> str:
+        sure = f"{100 * self.confidence:g} %"
+        if self.probability is None or self.method is None:
+            lines = [
+                f"{self.name}: no estimate of the failure probability; at most "
+                f"{self.upper_bound:.2g} ({sure} bound)"
+            ]
+        else:
+            lines = [
+                f"{self.name}: fails with probability {self.probability:.3g} "
+                f"({sure} interval {self.low:.3g} to {self.high:.3g}), by {METHODS[self.method]}"
+            ]
+        without = f", {self.no_verdict:,} without a verdict" if self.no_verdict else ""
+        lines.append(
+            f"  simulations  {self.simulations:,} of {self.budget:,}, {self.failures:,} failing"
+            f"{without}, {self.seconds:.1f} s"
+        )
+        if self.probability is not None and math.isfinite(self.relative_error):
+            worth = ""
+            if math.isfinite(self.effective):
+                worth = f", worth {self.effective:,.0f} independent failures"
+            lines.append(f"  precision    relative error {100 * self.relative_error:.2g} %{worth}")
+        lines.append(
+            f"  guaranteed   at most {self.upper_bound:.2g} at {sure}, by {self.prior_failures:,} "
+            f"failures in {self.prior_simulations:,} independent samples of the prior alone"
+        )
+        if self.no_verdict:
+            lines.append(
+                f"  no verdict   {100 * self.no_verdict_probability:.2g} % of the prior's samples; "
+                "neither safe nor failing: the upper ends count them as failing"
+            )
+        if self.p0 is not None:
+            lines.append(f"  p < {self.p0:g}    {self._decided(self.p0)}")
+        lines += [f"  note         {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _decided(self, p0: float) -> str:
+        if self.upper_bound <= p0:
+            return "shown, by samples of the prior alone"
+        more = self.simulations_until(p0)
+        if self.low > p0:
+            return "refuted: the whole interval is above"
+        prior = f"samples of the prior alone would need {more:,} more without a failure"
+        if self.probability is not None and self.high < p0:
+            return f"shown, unless the method has missed a part of the failures; {prior}"
+        return f"open; {prior}"
+
+    def plot(self, figure: Any = None) -> Any:
+        """Levels of the splitting and weights of the failures, as far as there are any."""
+        from verifai_jax.estimation.picture import draw
+
+        return draw(self, new_figure if figure is None else (lambda *_: figure))
