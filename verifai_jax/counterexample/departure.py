@@ -75,11 +75,19 @@ class Nominal:
         u = np.clip(np.asarray(points, np.float64), 0.0, 1.0).astype(np.float32)
         discrete = self.cube.discrete
         if len(discrete):
-            cells = np.asarray(self.cube.cells(u))
-            same = cells == np.asarray(self.cube.cells(self.u))
-            middles = np.asarray(self.cube.centres(cells))
+            cells = self.cells(u)
+            same = cells == self.cells(self.u)
+            middles = self.centres(cells)
             u[:, discrete] = np.where(same, self.u[discrete], middles)
         return u
+
+    def cells(self, points: Any) -> Int[np.ndarray, "*n k"]:
+        """Which cell holds each discrete coordinate."""
+        return np.asarray(self.cube.cells(np.asarray(points, np.float32)))  # pyright: ignore[reportArgumentType]
+
+    def centres(self, cells: Any) -> Float[np.ndarray, "*n k"]:
+        """The middles of cells."""
+        return np.asarray(self.cube.centres(np.asarray(cells, np.int32)))  # pyright: ignore[reportArgumentType]
 
     def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
         """Which coordinates of settled points are not nominal."""
@@ -93,8 +101,8 @@ class Nominal:
         gap = np.abs(np.asarray(points, np.float64) - self.u)
         discrete = self.cube.discrete
         if len(discrete):
-            places = np.asarray(self.cube.cells(np.asarray(points, np.float32)), np.float64)
-            apart = np.abs(places - np.asarray(self.cube.cells(self.u)))
+            places = self.cells(points).astype(np.float64)
+            apart = np.abs(places - self.cells(self.u))
             steps = np.array([max(self.cube.levels[i] - 1, 1) for i in discrete])
             ordered = np.array([self.cube.ordered[i] for i in discrete])
             gap[:, discrete] = np.where(ordered, apart / steps, apart > 0)

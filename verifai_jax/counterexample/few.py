@@ -87,7 +87,7 @@ def values_of(judge: Judge, i: int) -> list[float]:
         every = np.zeros((len(cells), len(cube.discrete)), int)
         place = int(np.flatnonzero(cube.discrete == i)[0])
         every[:, place] = cells
-        values = np.asarray(cube.centres(every))[:, place]
+        values = judge.nominal.centres(every)[:, place]
     return [float(v) for v in values if np.float32(v) != judge.nominal.u[i]]
 
 

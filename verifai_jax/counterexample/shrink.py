@@ -18,22 +18,25 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.backends import resolved
 from verifai_jax.counterexample.departure import Nominal
-from verifai_jax.counterexample.few import fewest
+from verifai_jax.counterexample.few import fewest, grown, reduced
 from verifai_jax.counterexample.judge import Judge
 from verifai_jax.counterexample.keyed import with_key_of
+from verifai_jax.counterexample.row import columns_at, other_failures, problem_of, row_of
 from verifai_jax.counterexample.small import nearest
 from verifai_jax.errors import suggests_options, unknown_name
 from verifai_jax.problem import Problem
-from verifai_jax.proposals import units
 from verifai_jax.run import Replay, Run, replay, run_keys
 
 ORDERS = ("few", "small")
 STARTS = 32
 """Other counterexamples of the run that are looked at,"""
 FOLLOWED = 5
-"""and points that are followed along the boundary."""
+"""points that are followed along the boundary,"""
+DESCENTS = 8
+"""and descents at once towards a failure elsewhere."""
+AWAY = 0.002
+"""How much farther than the nearest failing point the result is, for rounding's sake."""
 
 
 class Step(NamedTuple):
@@ -51,8 +54,8 @@ class Shrunk:
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
     margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
     name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
-    coordinates; `start_count` and `start_distance` of the row; `simulations` spent; `history`;
-    `by`: what was made least first; `notes` for people.
+    coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
+    `simulations` spent; `by`: what was made least first; `history`; `notes` for people.
     """
 
     problem: Problem
@@ -62,6 +65,7 @@ class Shrunk:
     rho: float
     changed: dict[str, tuple[Any, Any]]
     distance: float
+    nominal: Float[np.ndarray, " d"]
     start_count: int
     start_distance: float
     simulations: int
@@ -78,7 +82,7 @@ class Shrunk:
 
     def replay(self, precision: str | None = None) -> Replay:
         """Simulate it again, with the random key of the row, and keep the trace."""
-        columns = _columns(self.problem, self.u)
+        columns = columns_at(self.problem, self.u)
         return replay(self.problem, columns, self.key, self.row, precision or self.precision)  # pyright: ignore[reportArgumentType]
 
     def plot(self, path: Any = None) -> Any:
@@ -144,18 +148,20 @@ def shrink(
     - `seed`: of the random candidates.
     - `others`: whether other counterexamples of the run may be taken where they are nearer.
 
-    All simulations have the random key of the row. The result was simulated alone, in the
-    precision of the run, and failed. Ctrl-C ends the search and returns the least so far.
+    All simulations have the random key of the row. The result was simulated alone and failed, in
+    the precision of the run, and in float64 too unless the system draws random numbers or is a
+    black box. It is 0.2 % farther than the nearest failing point, for rounding's sake. Ctrl-C ends
+    the search and returns the least so far.
 
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
     is none or does not fail when simulated again, a feature without a nominal value.
     """
-    problem = _problem(run)
+    problem = problem_of(run)
     if by not in ORDERS:
         raise unknown_name("order", by, ORDERS)
     if isinstance(budget, bool) or not isinstance(budget, int | np.integer) or budget < 1:
         raise ValueError(f"budget must be an integer of at least 1; got {budget!r}")
-    number, first = _row(run, row)
+    number, first = row_of(run, row)
     at = Nominal.of(problem, nominal)
     problem = with_key_of(problem, run, number)
     key = run_keys(run.seed)[1]
@@ -171,13 +177,13 @@ def shrink(
     start = at.settle(
         np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))[None]
     )
-    points = np.concatenate([start, _others(run, at, number)]) if others else start
+    points = np.concatenate([start, other_failures(run, at, number, STARTS)]) if others else start
     notes = []
     try:
         shrinking.search(points)
     except KeyboardInterrupt:
         notes.append("interrupted: the least so far")
-    found = _verified(problem, shrinking, key, number, run.precision, notes)
+    found = _verified(problem, shrinking, key, number, run.precision)
     u = start[0] if found is None else found[0]
     replayed = seen if found is None else found[1]
     if judge.note:
@@ -190,6 +196,7 @@ def shrink(
         rho=min(replayed.rho.values()),
         changed=_changed(at, u),
         distance=float(at.distance(u[None])[0]),
+        nominal=at.u,
         start_count=int(at.count(start)[0]),
         start_distance=float(at.distance(start)[0]),
         simulations=judge.simulations,
@@ -239,22 +246,29 @@ class _Shrinking:
         spread = [abs(r) for r in rho if math.isfinite(r)]
         # Smooth enough for a slope where several instants compete, and near the hard value.
         judge.temperature = max(0.02 * max(spread, default=1.0), 1e-6)
+        # Half for what decides where to go, so that some is left to go there.
+        judge.limit = judge.budget // 2
         if self.by == "few":
-            # Half for the number of features, so that some is left for the distance.
-            judge.limit = judge.budget // 2
             fewest(judge, failures[:4], self.rng)
-            judge.limit = judge.budget
-            self.note()
+        else:
+            grown(judge, failures[:1], 1)
+            reduced(judge, failures[0])
+        self.note()
         self.follow(self.starts())
+        judge.limit = judge.budget - 2 * nominal.space.dim
+        self.follow(self.starts()[:2])
         for _ in range(3):
             if judge.left < judge.budget // 20:
                 break
             before = self.failures()[0]
             elsewhere(judge, before, self.by == "few", self.rng)
             self.note()
-            if np.array_equal(self.failures()[0], before):
-                continue
-            self.follow(self.failures()[:1])
+            if not np.array_equal(self.failures()[0], before):
+                self.follow(self.failures()[:1])
+        # What departs by next to nothing need not depart.
+        judge.limit = judge.budget
+        reduced(judge, self.failures()[0])
+        self.note()
 
     def starts(self) -> Float[np.ndarray, "n d"]:
         """The least failures in different directions, or on different features."""
@@ -277,115 +291,80 @@ class _Shrinking:
         self.note()
 
 
-def elsewhere(judge: Judge, u: Float[np.ndarray, " d"], few: bool, rng: Any) -> None:
-    """Look for a failure nearer than `u` in other directions, with no more departures if `few`."""
+def elsewhere(
+    judge: Judge, u: Float[np.ndarray, " d"], few: bool, rng: np.random.Generator
+) -> None:
+    """Look for a failure nearer than `u` in other directions, with no more departures if `few`.
+
+    Descents of the robustness from random points that are nearer, each for itself, so that the
+    known failure does not draw them all.
+    """
     nominal = judge.nominal
-    d = nominal.space.dim
     free = np.flatnonzero(np.array(nominal.cube.levels) == 0)
     most = min(int(nominal.count(u[None])[0]), len(free)) if few else len(free)
-    reach = float(nominal.distance(u[None])[0])
-    if not most:
+    reach = 0.98 * float(nominal.distance(u[None])[0])
+    if not most or not reach:
         return
-    near = np.zeros((0, d))
-    for turn in range(4):
-        n = 48
-        moved = np.zeros((n, d))
-        for row in moved:
-            places = rng.permutation(free)[:most]
-            row[places] = rng.standard_normal(most)
-        if turn and len(near):
-            # Around what came nearest to failing, on the same coordinates.
-            parents = near[rng.integers(len(near), size=n)] - nominal.u
-            step = 0.35 * 0.6**turn * reach
-            moved = parents + step * moved / np.maximum(
-                np.linalg.norm(moved, axis=1, keepdims=True), 1e-9
-            ) * (parents != 0)
-            length = np.linalg.norm(moved, axis=1, keepdims=True)
-            moved *= np.minimum(1, 0.98 * reach / np.maximum(length, 1e-9))
-        else:
-            length = np.linalg.norm(moved, axis=1, keepdims=True)
-            moved *= reach * rng.uniform(0.3, 0.98, (n, 1)) / np.maximum(length, 1e-9)
-        points = nominal.settle(nominal.u + moved)
-        rho, failing = judge(points)
-        if failing.any() or judge.left <= 0:
+    moved = np.zeros((40, nominal.space.dim))
+    for row in moved:
+        row[rng.permutation(free)[:most]] = rng.standard_normal(most)
+    moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
+    points = nominal.settle(nominal.u + moved)
+    rho, failing = judge(points)
+    if failing.any():
+        return
+    order = np.argsort(rho)[:DESCENTS]
+    here, level = points[order].astype(np.float64), rho[order]
+    for turn in range(5):
+        if judge.left <= 0:
             return
-        near = points[np.argsort(rho)[:8]].astype(np.float64)
+        children = []
+        for point, linear in zip(here, judge.linear(here), strict=True):
+            same = (point != nominal.u) | (not few)
+            noise = rng.standard_normal((5, len(point))) * same
+            noise[:, np.array(nominal.cube.levels) > 0] = 0
+            steps = 0.3 * 0.6**turn * reach * noise / _length(noise)
+            if linear is not None and (slope := linear.slope * same).any():
+                # To where the tangent is zero, half and twice as far.
+                full = -max(linear.value, 1e-9) * slope / (slope @ slope)
+                steps[:3] = np.outer([1.05, 0.5, 2.0], full)
+            away = point + steps - nominal.u
+            children.append(nominal.u + away * np.minimum(1, reach / _length(away)))
+        points = nominal.settle(np.concatenate(children))
+        rho, failing = judge(points)
+        if failing.any():
+            return
+        best = rho.reshape(len(here), -1).argmin(axis=1) + 5 * np.arange(len(here))
+        better = rho[best] < level
+        here[better], level[better] = points[best][better], rho[best][better]
+
+
+def _length(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
+    return np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
 
 
 def _verified(
-    problem: Problem, shrinking: _Shrinking, key: Any, number: int, precision: str, notes: list[str]
+    problem: Problem, shrinking: _Shrinking, key: Any, number: int, precision: str
 ) -> tuple[np.ndarray, Replay] | None:
-    """The least failure that fails alone too; None where none does."""
-    failures = shrinking.failures()
-    for i, u in enumerate(failures[:50]):
-        again = replay(problem, _columns(problem, u), key, number, precision)
-        if again.violated:
-            if i:
-                notes.append(f"{i} smaller ones fail in a batch and not alone: too near to zero")
-            return u, again
-    return None
+    """The least failure that fails alone too, in float64 as well; None where none does.
 
-
-def _problem(run: Any) -> Problem:
-    if not isinstance(run, Run):
-        raise TypeError(f"a run of falsify is needed; got {type(run).__name__}")
-    if run.problem is None:
-        raise ValueError(
-            f"the run of {run.name!r} was loaded without its problem; "
-            "give it: vj.load(path, problem)"
-        )
-    return resolved(run.problem, wanted=run.backend).problem
-
-
-def _row(run: Run, row: Any) -> tuple[int, Any]:
-    """The number and the entries of a counterexample.
-
-    **Raises:** `ValueError` where there is none, or this is none.
+    It is taken a little farther from nominal than the boundary, where rounding would decide.
     """
-    failing = run.table.counterexamples
-    if not len(failing):
-        raise ValueError(
-            f"the run of {run.name!r} has no counterexample in {run.simulations} simulations"
-        )
-    number = failing["rho"].idxmin() if row is None else getattr(row, "name", row)
-    if isinstance(number, bool) or not isinstance(number, int | np.integer):
-        raise TypeError(f"row must be the number of a row of the table; got {row!r}")
-    number = int(number)
-    if not 0 <= number < run.simulations:
-        raise IndexError(f"row {number} is not in the table of {run.simulations} simulations")
-    if number not in failing.index:
-        entry = run.table.all.iloc[number]
-        some = ", ".join(map(str, failing.index[:5]))
-        raise ValueError(
-            f"row {number} is no counterexample: status {entry['status']}, robustness "
-            f"{entry['rho']:.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
-        )
-    return number, failing.loc[number]
-
-
-def _others(run: Run, nominal: Nominal, number: int) -> Float[np.ndarray, "n d"]:
-    """Other counterexamples: the nearest, and some of all the rest."""
-    failing = run.table.counterexamples
-    failing = failing.loc[failing.index != number]
-    if not len(failing):
-        return np.zeros((0, nominal.space.dim), np.float32)
-    if len(failing) > 4096:
-        failing = failing.iloc[np.linspace(0, len(failing) - 1, 4096).astype(int)]
-    points = nominal.settle(units(nominal.space, failing))
-    order = np.argsort(nominal.distance(points))
-    if len(order) > STARTS:
-        half = STARTS // 2
-        rest = np.linspace(half, len(order) - 1, STARTS - half).astype(int)
-        order = np.concatenate([order[:half], order[rest]])
-    return points[order]
-
-
-def _columns(problem: Problem, u: Float[np.ndarray, " d"]) -> dict[str, Any]:
-    """The row of a table with the features at this point."""
-    features = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[None], jax.jit(problem.space.unflatten)(u)
-    )
-    return {name: column[0] for name, column in problem.space.rows(features).items()}
+    nominal = shrinking.judge.nominal
+    # In float64 other random numbers would be drawn, and a black box does not compute in it.
+    exact = not problem.black_box and not problem.draws()
+    for u in shrinking.failures()[:20]:
+        farther = nominal.settle(nominal.u + (1 + AWAY) * (u[None].astype(np.float64) - nominal.u))
+        for point in (farther[0], u):
+            if not nominal.space.accepts_points(point[None])[0]:
+                continue
+            columns = columns_at(problem, point)
+            again = replay(problem, columns, key, number, precision)
+            if again.violated and (
+                not exact or replay(problem, columns, key, number, "float64").violated
+            ):
+                return point, again
+    return None
 
 
 def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[Any, Any]]:

@@ -219,10 +219,9 @@ def beside(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) ->
     k = len(v)
     noise = rng.standard_normal((count, k))
     # Half of them in few coordinates: boundaries are often aligned with some.
-    sparse = rng.random((count, k)) < min(1.0, 2 / k)
-    noise = np.where(
-        (rng.random(count) < 0.5)[:, None] & sparse.any(1)[:, None], noise * sparse, noise
-    )
+    kept = rng.random((count, k)) < min(1.0, 2 / k)
+    kept |= (rng.random(count) < 0.5).reshape(-1, 1) | ~kept.any(axis=1, keepdims=True)
+    noise *= kept
     size = track.sigma * rng.uniform(0.2, 1.5, (count, 1))
     norm = np.maximum(np.linalg.norm(noise, axis=1, keepdims=True), 1e-12)
     moved = v / length + size * noise / norm
@@ -239,16 +238,16 @@ def whole_cells(judge: Judge, track: Track) -> Points:
     for place, i in enumerate(cube.discrete):
         if not track.free[i] or track.u[i] == nominal.u[i]:
             continue
-        here = int(np.asarray(cube.cells(track.u[None]))[0, place])
-        home = int(np.asarray(cube.cells(nominal.u[None]))[0, place])
+        here = int(nominal.cells(track.u)[place])
+        home = int(nominal.cells(nominal.u)[place])
         nearer = {home}
         if cube.ordered[i]:
             nearer |= {here + int(np.sign(home - here)), (here + home) // 2}
         for cell in nearer - {here}:
             point = track.u.astype(np.float64)
-            cells = np.zeros((1, len(cube.discrete)), int)
+            cells = np.zeros((1, len(cube.discrete)), np.int32)
             cells[0, place] = cell
-            point[i] = nominal.u[i] if cell == home else np.asarray(cube.centres(cells))[0, place]
+            point[i] = nominal.u[i] if cell == home else nominal.centres(cells)[0, place]
             tried.append(point)
     return np.array(tried).reshape(-1, nominal.space.dim)
 
