@@ -8,7 +8,7 @@
 A search simulates in single precision at the model's step; both may break a property that the
 model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
 quarter of the step, there in single precision too, and with features that are one rounding away;
-and if it fails by more than twice of what these differ from each other.
+and if it fails by more than the finer step has moved it, and by far more than rounding has.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,9 +29,9 @@ VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
 FINER = {"half_step": 2, "quarter_step": 4}
 """Checks at a finer step, and how many times finer."""
 SINGLE = "quarter_step_float32"
-MARGIN = 2.0
-"""How many times what replays move it by a robustness must be away from zero. Once is what a method
-of order 1 is off at the finer of two steps, by Richardson's extrapolation."""
+AMPLIFIED = 4.0
+"""A row must fail by so many times what rounding has moved it. A chaotic system turns roundings into
+any of its outcomes, and two or three programs may agree by chance."""
 SAFE = 10.0
 """Rows are left out only if so many times farther from zero than replays have moved any row,"""
 BLOCK = 64
@@ -52,17 +52,20 @@ IN_WORDS = {
 class Checked(NamedTuple):
     """What came of checking rows, `[n]` each.
 
-    - `verdict`: `confirmed`: it fails in every check, by twice `band` at least; `fragile`: the
-      checks disagree, one of them gave no robustness, or it fails by less than that; `refuted`:
-      none of the finer checks fails (half and quarter of the step and the other simulator, or
-      where the step stays, double precision); `unchecked`: there was nothing finer to check with;
-      `unexamined`: left out, see `Confirmer`.
+    - `verdict`: `confirmed`: it fails in every check, and by more than replays move it; `fragile`:
+      the checks disagree, one of them gave no robustness, or it fails by less than that;
+      `refuted`: none of the finer checks fails (half and quarter of the step and the other
+      simulator, or where the step stays, double precision); `unchecked`: there was nothing finer to
+      check with; `unexamined`: left out, see `Confirmer`.
     - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
       are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
       `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
       away) and `simulator`.
-    - `band`: how much the robustness moved between two of them that differ in one respect, or
-      between the run and its replay where `rho` of the run is known.
+    - `band`: how much the robustness moved: between half and quarter of the step, which is what a
+      method of order 1 is still off at the quarter (Richardson's extrapolation), or by rounding:
+      between two precisions, two neighbouring features, or the run and its replay where `rho` of
+      the run is known. A row is confirmed if it fails by more than the first and by four times the
+      second.
     - `why`: the reason, for people; empty where confirmed.
     - `notes`: which checks could not be made, and why.
     """
@@ -270,13 +273,15 @@ def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _
     base = next((name for name in ("float64", "again") if name in found), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
     rho = {name: replayed.rho for name, replayed in found.items()}
-    band = np.zeros(count)
-    pairs = (("half_step", "quarter_step"), (SINGLE, "quarter_step"), ("nudged", finest))
-    for one, other in pairs:
-        if one in found:
-            band = np.maximum(band, _moved(rho[one], rho[other]))
+    step = rounding = np.zeros(count)
+    if "half_step" in found:
+        step = _moved(rho["half_step"], rho["quarter_step"])
+    for name in (SINGLE, "nudged"):
+        if name in found:
+            rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
     if run is not None and base:
-        band = np.maximum(band, _moved(run, rho[base]))
+        rounding = np.maximum(rounding, _moved(run, rho[base]))
+    band = np.maximum(step, rounding)
     if not plan.independent:
         reason = "; ".join(plan.notes) or "the run was in float64 already"
         return _Found(np.full(count, "unchecked", object), band, [reason] * count, found)
@@ -284,7 +289,7 @@ def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _
     deciding = [name for name in (*deciding, "simulator") if name in found]
     failing = {name: replayed.failing for name, replayed in found.items()}
     holding = {name: r.proper & ~r.failing for name, r in found.items()}
-    clear = np.abs(rho[finest]) >= MARGIN * band
+    clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
     confirmed = np.all(list(failing.values()), axis=0) & clear
     refuted = np.all([holding[name] for name in deciding], axis=0) & (deciding[0] != "again")
     verdict = np.where(confirmed, "confirmed", np.where(refuted, "refuted", "fragile"))
