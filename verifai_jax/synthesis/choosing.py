@@ -16,7 +16,15 @@ from verifai_jax.synthesis.parametric import Pairs, Parametric, accepted
 
 ACTIVE = 16
 """Environments, the least robust ones, that decide a step; all of them judge its result."""
+FIRST = 6
+"""Of the hardest environments, in which candidates are judged before the others."""
+EXPLORED = 0.2
+"""Share of the candidates of cross-entropy that are drawn from anywhere."""
+LEAST_BATCH = 8
+"""Candidates below which a round of cross-entropy is not worth having."""
 LEAST_RADIUS = 1e-5
+MOST_DIFFERENCES = 12
+"""Parameters up to which slopes are taken from differences where there are no gradients."""
 MOST_REFUSED = 1000
 """Draws in a row without one that the constraint accepts, after which no more are made."""
 
@@ -44,10 +52,14 @@ class Archive:
             self.choices.append(Choice(theta, float(value), environments))
 
     def best(self, count: int, merit: Merit, apart: float = 0.0) -> list[Choice]:
-        """The best, no two nearer than `apart` in each coordinate."""
+        """The best, no two the same, or nearer than `apart` in each coordinate."""
         taken: list[Choice] = []
+        seen: set[bytes] = set()
         for choice in sorted(self.choices, key=lambda c: merit(c.theta, c.value), reverse=True):
-            if all(np.abs(choice.theta - other.theta).max() > apart for other in taken):
+            if (name := choice.theta.tobytes()) in seen:
+                continue
+            seen.add(name)
+            if not apart or all(np.abs(choice.theta - t.theta).max() > apart for t in taken):
                 taken.append(choice)
             if len(taken) == count:
                 break
@@ -112,7 +124,9 @@ def explore(
         refused = 0 if len(thetas) else refused + 1
         thetas = thetas[: half.left // size]
         if len(thetas):
-            judged(loop, thetas, environments, archive)
+            known = archive.best(max(4, batch // 5), merit)
+            level = merit(known[-1].theta, known[-1].value) if len(known) > 3 else (-np.inf,)
+            _promising(loop, thetas, np.asarray(environments), archive, merit, level)
     best = archive.best(max(4, batch // 5), merit)
     if best:
         narrow(
@@ -154,14 +168,13 @@ def climb(
             break
         for i in alive:
             few = np.asarray(environments)[np.argsort(rhos[i], kind="stable")[:ACTIVE]]
-            if limits.left < 8 * len(few) + len(environments):
+            tries = 8 if loop.differentiable else 9 + int(loop.free.sum())
+            if limits.left < tries * len(few) + len(environments):
                 return now
             # Cooler as steps get shorter: the kinks of the robustness matter then.
             warmth = scale * max(0.001, 0.02 * min(1.0, radii[i] / radius))
-            seen = loop.judge(now[i].theta[None], few, warmth)
-            assert seen.by_parameters is not None
-            values = np.where(seen.proper[0], seen.rho[0], np.inf)
-            candidates = propose(now[i].theta, values, seen.by_parameters[0], radii[i])
+            values, slopes = _slopes(loop, now[i].theta, few, warmth, 0.1 * radii[i])
+            candidates = propose(now[i].theta, values, slopes, radii[i])
             candidates = [c for c in candidates if np.any(c != now[i].theta)]
             if not candidates:
                 radii[i] = 0.0
@@ -188,6 +201,31 @@ def climb(
     return now
 
 
+def climbs(loop: Parametric) -> bool:
+    """Whether slopes are to be had: from gradients, or from differences of a few parameters."""
+    return loop.differentiable or (loop.bounded and 0 < loop.free.sum() <= MOST_DIFFERENCES)
+
+
+def _slopes(
+    loop: Parametric, theta: np.ndarray, environments: Any, warmth: float, gap: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Robustness `[n]`, infinite where there is no verdict, and its slopes `[n, p]`, zero there."""
+    if loop.differentiable:
+        seen = loop.judge(theta[None], environments, warmth)
+        assert seen.by_parameters is not None
+        return np.where(seen.proper[0], seen.rho[0], np.inf), seen.by_parameters[0]
+    places = np.flatnonzero(loop.free)
+    # Away from the nearer end of the cube; wide enough that float32 has digits left.
+    gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
+    beside = np.repeat(theta[None], len(places), axis=0)
+    beside[np.arange(len(places)), places] += gaps
+    seen = loop.judge(np.concatenate([theta[None], beside]), environments)
+    rho = np.where(seen.proper & np.isfinite(seen.rho), seen.rho, np.nan)
+    slopes = np.zeros((len(environments), loop.dim))
+    slopes[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
+    return np.where(np.isnan(rho[0]), np.inf, rho[0]), slopes
+
+
 def narrow(
     loop: Parametric,
     thetas: Any,
@@ -205,15 +243,22 @@ def narrow(
     De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
     3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.
     """
-    size = max(1, len(environments))
-    if limits.left < len(thetas) * size:
+    environments, size = np.asarray(environments), max(1, len(environments))
+    affordable = limits.left // size
+    if affordable < LEAST_BATCH:
         return
-    points = np.array(thetas, np.float64)
-    values = judged(loop, points, environments, archive)
-    most = max(4, batch // 5)
-    std = np.full(loop.dim, 0.1)
+    points = np.array(thetas, np.float64)[: max(1, affordable // 3)]
+    pairs = loop.judge(points, environments)
+    values = least(pairs)
+    archive.add(points, values, len(environments))
+    # What is hard for the best is hard for most: with these first, few are simulated in all.
+    best = max(range(len(points)), key=lambda j: merit(points[j], values[j]))
+    rho = np.where(pairs.proper[best], pairs.rho[best], np.inf)
+    environments = environments[np.argsort(rho, kind="stable")]
+    most, std = max(4, batch // 5), np.full(loop.dim, 0.1)
     for _ in range(rounds):
-        if limits.left < batch * size:
+        affordable = limits.left // size
+        if affordable < LEAST_BATCH:
             return
         order = sorted(range(len(points)), key=lambda j: merit(points[j], values[j]), reverse=True)
         points, values = points[order[:most]], values[order[:most]]
@@ -221,10 +266,40 @@ def narrow(
             std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
             if np.all(std[loop.free] == 1e-4) and loop.free.all():
                 return
-        parents = points[rng.integers(0, len(points), batch)]
+        count = min(batch, max(LEAST_BATCH, affordable // 3))
+        level = merit(points[-1], values[-1]) if len(points) == most else (-np.inf,)
+        parents = points[rng.integers(0, len(points), 4 * count)]
         drawn = parents + std * rng.normal(size=parents.shape)
+        # A few anywhere: what was best in the old set need not be near what is in this one.
+        anywhere = rng.random((len(parents), 1)) < EXPLORED
+        parents = np.where(anywhere, rng.random(parents.shape), parents)
         anew = rng.random(parents.shape) < 0.1
         other = np.where(anew, rng.random(parents.shape), parents)
         drawn = np.clip(np.where(loop.free, drawn, other), 0.0, 1.0)
-        found = judged(loop, drawn, environments, archive)
+        # Some are too far from the nominal parameters, whatever their value.
+        drawn = drawn[[merit(theta, np.inf) > level for theta in drawn]][:count]
+        if not len(drawn):
+            return
+        drawn, found = _promising(loop, drawn, environments, archive, merit, level)
         points, values = np.concatenate([points, drawn]), np.concatenate([values, found])
+
+
+def _promising(
+    loop: Parametric,
+    thetas: np.ndarray,
+    environments: np.ndarray,
+    archive: Archive,
+    merit: Merit,
+    level: tuple[float, ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those whose merit may exceed `level`, and their values: the first environments rule out."""
+    if len(environments) < 2 * FIRST:
+        return thetas, judged(loop, thetas, environments, archive)
+    bounds = judged(loop, thetas, environments[:FIRST])
+    left = [j for j, pair in enumerate(zip(thetas, bounds, strict=True)) if merit(*pair) > level]
+    thetas, bounds = thetas[left], bounds[left]
+    if not left:
+        return thetas, bounds
+    values = np.minimum(bounds, judged(loop, thetas, environments[FIRST:]))
+    archive.add(thetas, values, len(environments))
+    return thetas, values

@@ -215,11 +215,11 @@ class ArrayParameters:
         from jax.flatten_util import ravel_pytree
 
         for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
-            if not np.issubdtype(np.result_type(leaf), np.floating):
+            if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
                 place = jax.tree_util.keystr(path)
                 raise TypeError(
                     f"parameters must be arrays of real numbers; {place or 'they'} is "
-                    f"{np.result_type(leaf)}"
+                    f"{jnp.result_type(leaf)}"
                 )
         flat, self._restore = ravel_pytree(parameters)
         if not flat.size:

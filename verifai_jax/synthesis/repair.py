@@ -29,7 +29,16 @@ from verifai_jax.proposals import units
 from verifai_jax.run import Run
 from verifai_jax.search import Search
 from verifai_jax.synthesis.adversary import attack
-from verifai_jax.synthesis.choosing import Archive, Choice, climb, explore, judged, narrow
+from verifai_jax.synthesis.choosing import (
+    Archive,
+    Choice,
+    by_value,
+    climb,
+    climbs,
+    explore,
+    judged,
+    narrow,
+)
 from verifai_jax.synthesis.heldout import HeldOut, held_out
 from verifai_jax.synthesis.limits import Limits, timed
 from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
@@ -366,6 +375,7 @@ class _Repair:
         self.robustness = np.inf
         self.deficit: float | None = None
         self.slack = 0.0
+        self.archive = Archive()
         self.turns: list[Round] = []
         self.notes: list[str] = []
         self.stopped = "rounds"
@@ -408,15 +418,15 @@ class _Repair:
         return self.margin + 0.5 * self.slack
 
     def go(self, rounds: int) -> None:
+        """Attack and mend in turn."""
         if len(self.environments) and not self.mend():
             return
         for number in range(1, rounds + 1):
             if self.limits.over:
                 break
-            part = self.limits.slice(self.share)
             found = attack(
-                self.loop, self.now.theta, self.margin, part, search=self.search,
-                batch=self.batch, seed=self.seed + 7919 * number,
+                self.loop, self.now.theta, self.margin, self.limits.slice(self.share),
+                search=self.search, batch=self.batch, seed=self.seed + 7919 * number,
                 scale=self.deficit or 1.0,
             )  # fmt: skip
             count = int(found.violating.sum())
@@ -439,10 +449,14 @@ class _Repair:
 
     def mend(self) -> bool:
         """Go to the nearest parameters that keep the whole set; whether there are any."""
-        archive = Archive()
-        judged(self.loop, [self.start, self.now.theta], self.environments, archive)
+        # What was near and what was robust in the old set may still be in this one.
+        old = self.archive.best(4, self.merit) + self.archive.best(8, by_value, apart=0.05)
+        self.archive = archive = Archive()
+        starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
+        affordable = max(2, self.limits.left // 4 // len(self.environments))
+        judged(self.loop, starts[:affordable], self.environments, archive)
         scale = self.deficit or 1.0
-        if self.loop.differentiable:
+        if climbs(self.loop):
             # From where it is now, and from the start anew: the nearest may lie elsewhere.
             starts = [self.now.theta] if np.all(self.now.theta == self.start) else [
                 self.now.theta, self.start
@@ -453,7 +467,8 @@ class _Repair:
                 scale=scale, radius=0.1 if self.loop.bounded else 0.1 * self.size,
             )  # fmt: skip
         best = archive.best(1, self.merit)[0]
-        if self.loop.bounded and (best.value < self.enough or not self.loop.differentiable):
+        followed = climbs(self.loop) and self.loop.free.all()
+        if self.loop.bounded and (best.value < self.enough or not followed):
             best = self.without_gradients(archive)
         if self.margin <= best.value < self.enough:
             # More than the margin is not to be had; the nearest that keeps it will do.
@@ -502,7 +517,7 @@ class _Repair:
 
     def without_gradients(self, archive: Archive) -> Choice:
         """Cross-entropy over the whole space where nothing is known, then nearer and nearer."""
-        limits = self.limits.slice(self.limits.left // 3)
+        limits = self.limits.slice(max(self.limits.most // 8, self.limits.left // 8))
         if archive.best(1, self.merit)[0].value < self.enough:
             explore(
                 self.loop, self.environments, archive, limits.slice(limits.left // 2),
@@ -510,8 +525,9 @@ class _Repair:
             )  # fmt: skip
         best = archive.best(6, self.merit)
         narrow(
-            self.loop, [c.theta for c in best], self.environments, archive, limits,
-            merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=10,
+            self.loop, [c.theta for c in best], self.environments, archive,
+            limits.slice(limits.left // 2),
+            merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=40,
         )  # fmt: skip
         best = archive.best(1, self.merit)[0]
         if best.value >= self.enough:

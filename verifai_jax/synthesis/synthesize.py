@@ -32,6 +32,7 @@ from verifai_jax.synthesis.choosing import (
     Choice,
     by_value,
     climb,
+    climbs,
     explore,
     judged,
     least,
@@ -323,13 +324,14 @@ class _Search:
 
     def improve(self, limits: Limits, starts: int) -> None:
         best = self.archive.best(starts, by_value, apart=1e-3)
-        if self.loop.differentiable:
+        if climbs(self.loop):
+            part = limits if self.loop.differentiable else limits.slice(limits.left // 2)
             climb(
-                self.loop, [c.theta for c in best], self.environments, self.archive, limits,
+                self.loop, [c.theta for c in best], self.environments, self.archive, part,
                 propose=self.propose, merit=by_value, scale=self.scale, radius=0.1,
             )  # fmt: skip
         if not self.loop.free.all() or not self.loop.differentiable:
-            best = self.archive.best(8, by_value)
+            best = self.archive.best(2, by_value) + self.archive.best(6, by_value, apart=0.05)
             narrow(
                 self.loop, [c.theta for c in best], self.environments, self.archive, limits,
                 merit=by_value, batch=CANDIDATES, rng=self.rng, rounds=1000
@@ -346,7 +348,8 @@ class _Search:
     def extend(self, points: Any) -> None:
         """Add environments to the set; what was judged over the old one starts anew."""
         self.environments = np.concatenate([self.environments, points]).astype(np.float32)
-        best = self.archive.best(12, by_value, apart=1e-3)
+        best = self.archive.best(4, by_value, apart=1e-3)
+        best += self.archive.best(12, by_value, apart=0.1)
         affordable = min(len(best), self.limits.left // len(self.environments))
         kept, self.archive = best[:affordable], Archive()
         if kept:
