@@ -1,8 +1,8 @@
 """Environments in which given parameters do badly: the falsification between two choices of them.
 
-A search drives the environment's own cube with the parameters held; where gradients are to be had
-the worst environments are then followed downhill, with steps as far as a corner of the cube, where
-the worst of a smooth system often lies.
+A search drives the environment's own cube with the parameters held. The worst environments are then
+followed downhill, by gradients or by differences of few coordinates, with steps as far as a corner
+of the cube, where the worst of a smooth system often lies.
 """
 
 from typing import Any, NamedTuple
@@ -17,6 +17,10 @@ from verifai_jax.synthesis.limits import Limits
 from verifai_jax.synthesis.parametric import Pairs, Parametric
 
 MOST_FOLLOWED = 4
+MOST_DIFFERENCES = 12
+"""Coordinates up to which slopes are taken from differences where there are no gradients,"""
+GAP = 0.01
+"""of this length."""
 STEPS = (1.0, 0.3, 0.1, 0.03)
 """Lengths of a step of descent, in each coordinate of the environment."""
 
@@ -85,7 +89,8 @@ def attack(
         if found >= enough:
             break
     result = _collected(seen, level, loop)
-    if loop.differentiable and len(result.rho):
+    free = np.sum(np.array(loop.environment.levels) == 0)
+    if len(result.rho) and (loop.differentiable or 0 < free <= MOST_DIFFERENCES):
         result = _followed(loop, theta, level, limits, result, scale)
     return result
 
@@ -100,13 +105,12 @@ def _followed(
     best = seen.rho[order[:MOST_FOLLOWED]]
     tried: list[tuple[np.ndarray, Pairs]] = []
     for _ in range(4):
-        cost = len(points) * (1 + len(STEPS))
-        if limits.left < cost or not free.any():
+        each = 1 if loop.differentiable else 1 + int(free.sum())
+        if limits.left < len(points) * (each + len(STEPS)) or not free.any():
             break
-        pairs = loop.judge(theta[None], points, 0.02 * scale)
-        assert pairs.by_environment is not None
-        tried.append((points, pairs))
-        down = -np.sign(pairs.by_environment[0]) * free
+        slopes, beside = _slopes(loop, theta, points, 0.02 * scale, free)
+        tried.append(beside)
+        down = -np.sign(slopes) * free
         moved = np.stack([np.clip(points + step * down, 0.0, 1.0) for step in STEPS], axis=1)
         pairs = loop.judge(theta[None], moved.reshape(-1, points.shape[1]))
         tried.append((moved.reshape(-1, points.shape[1]), pairs))
@@ -118,6 +122,27 @@ def _followed(
         points = np.where(better[:, None], moved[np.arange(len(points)), which], points)
         best = np.where(better, least, best)
     return _joined(seen, _collected(tried, level, loop))
+
+
+def _slopes(
+    loop: Parametric, theta: Any, points: np.ndarray, warmth: float, free: np.ndarray
+) -> tuple[Float[np.ndarray, "n d"], tuple[np.ndarray, Pairs]]:
+    """Slopes by the environment, from gradients or differences, and what was simulated for them."""
+    if loop.differentiable:
+        pairs = loop.judge(theta[None], points, warmth)
+        assert pairs.by_environment is not None
+        return pairs.by_environment[0], (points, pairs)
+    places = np.flatnonzero(free)
+    beside = np.repeat(points[:, None], 1 + len(places), axis=1)
+    gaps = np.where(points[:, places] > 0.5, -GAP, GAP)
+    beside[:, 1 + np.arange(len(places)), places] += gaps
+    rows = beside.reshape(-1, points.shape[1])
+    pairs = loop.judge(theta[None], rows)
+    rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)[0]
+    rho = rho.reshape(len(points), -1)
+    slopes = np.zeros(points.shape)
+    slopes[:, places] = np.nan_to_num((rho[:, 1:] - rho[:, :1]) / gaps)
+    return slopes, (rows, pairs)
 
 
 def _collected(seen: list[tuple[np.ndarray, Pairs]], level: float, loop: Parametric) -> Attack:
