@@ -30,8 +30,8 @@ FINER = {"half_step": 2, "quarter_step": 4}
 """Checks at a finer step, and how many times finer."""
 SINGLE = "quarter_step_float32"
 AMPLIFIED = 4.0
-"""A row must fail by so many times what rounding has moved it. A chaotic system turns roundings into
-any of its outcomes, and two or three programs may agree by chance."""
+"""A row must fail by so many times what rounding has moved it: a chaotic system turns roundings
+into any of its outcomes, and two or three programs may agree by chance."""
 SAFE = 10.0
 """Rows are left out only if so many times farther from zero than replays have moved any row,"""
 BLOCK = 64
@@ -311,13 +311,18 @@ def _reason(i: int, found: dict[str, Replayed], rho: float, band: float) -> str:
         message = next((m for name in lost if (m := found[name].messages[i])), "")
         return f"no verdict {_and(lost)}{f': {message}' if message else ', it is not finite'}"
     holds = [name for name, replayed in found.items() if not replayed.failing[i]]
+    if len(holds) == len(found):
+        return "it holds in every replay"
     if holds:
-        return f"it holds {_and(holds)}"
+        fails = [name for name in found if name not in holds]
+        few = len(holds) <= len(fails)
+        return f"it holds {_and(holds)}" if few else f"it fails only {_and(fails)}"
     return f"its robustness {rho:.3g} moves by {band:.2g} between replays"
 
 
 def _and(names: Sequence[str]) -> str:
-    return " and ".join(IN_WORDS[name] for name in names)
+    words = [IN_WORDS[name] for name in names]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _other(problem: Problem, simulator: Any) -> Problem:

@@ -10,6 +10,7 @@ decisions, with a `factor` times smaller step. With `traced_factor = True` its f
 by JAX, and one program replays at every step.
 """
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -283,16 +284,16 @@ class HostReplays:
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
-        self._engines: dict[int, HostEngine] = {}
+        enable_compile_cache()
+        self._engine = HostEngine(problem, precision)
 
     def __call__(
         self, factor: int, features: Mapping[str, Any], numbers: Int[np.ndarray, " n"]
     ) -> Replayed:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""
-        if factor not in self._engines:
-            problem = replace(self.problem, system=self.refiner(factor))
-            self._engines[factor] = HostEngine(problem, self.precision)
-        engine, n = self._engines[factor], len(numbers)
+        # One monitor for all steps.
+        engine, n = copy.copy(self._engine), len(numbers)
+        engine.problem = replace(self.problem, system=self.refiner(factor))
         rows = _Rows(n, len(self.problem.formulas), self.precision)
         with in_precision(self.precision):
             keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))

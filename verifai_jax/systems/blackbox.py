@@ -164,6 +164,14 @@ class BlackBox:
         """A function that refuses features which do not fit, if the simulator has one."""
         return getattr(self.simulation.function, "check", None)
 
+    @property
+    def refined(self) -> Callable[[int], "BlackBox"] | None:
+        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
+        finer = getattr(self.simulation.function, "refined", None)
+        if not callable(finer):
+            return None
+        return lambda factor: BlackBox(replace(self.simulation, function=finer(factor)))  # pyright: ignore[reportArgumentType]
+
 
 @dataclass(frozen=True, eq=False)
 class PooledBlackBox:
@@ -215,6 +223,14 @@ class VectorisedBlackBox:
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
         trace = self._simulate(batch, np.array([seed_of(key)], np.uint32), 1)
         return jax.tree.map(lambda leaf: leaf[0], trace)
+
+    @property
+    def refined(self) -> Callable[[int], "VectorisedBlackBox"] | None:
+        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
+        finer = getattr(self.function, "refined", None)
+        if not callable(finer):
+            return None
+        return lambda factor: replace(self, function=finer(factor))  # pyright: ignore[reportArgumentType]
 
     def simulate_batch(self, features: Any, keys: Key[Array, " n"]) -> Trace:
         """A trace whose leaves are `[n, ...]`; see `simulations.Batched`."""
@@ -280,7 +296,9 @@ def blackbox(
 
     **Arguments:**
 
-    - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy.
+    - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy. It may
+      have a `refined(factor)`, the same function with a smaller step, to confirm failures with (not
+      in workers).
     - `seeded`: call `function(features, seed)` with an integer seed in `[0, 2^32)` of the
       simulation, the same on every replay.
     - `workers`: simulate in that many processes, which start with the first simulation and stay;

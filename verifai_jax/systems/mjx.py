@@ -39,6 +39,9 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
     """Simulate once."""
     mjx = mjx_module()
     model, blank = prepared(loop.bindings, features)
+    if not _is_one(loop.finer):
+        model = model.tree_replace({"opt.timestep": model.opt.timestep / loop.finer})
+    substeps = loop.substeps * loop.finer
     start = loop.start(features, key)
     physics = Physics(
         **{name: start[name] for name in ("qpos", "qvel", "act")},
@@ -78,7 +81,7 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
                     arrays = {name: getattr(data, name) for name in loop.shapes}
                     return loop.sample(k, arrays, lived, features)
 
-                if loop.substeps == 1:
+                if _is_one(substeps):
                     decided = look()
                 else:
                     # The counter is common to all lanes of a batch: this stays a branch.
@@ -89,9 +92,13 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
             return (physics, sampled, after), None
 
         blank_sample = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
-        (after, sampled, lived), _ = jax.lax.scan(
-            substep, (before, blank_sample, lived), jnp.arange(loop.substeps)
-        )
+        begun = (before, blank_sample, lived)
+        if isinstance(substeps, int):
+            (after, sampled, lived), _ = jax.lax.scan(substep, begun, jnp.arange(substeps))
+        else:  # Traced: a loop without a derivative in reverse mode.
+            after, sampled, lived = jax.lax.fori_loop(
+                0, substeps, lambda j, carry: substep(carry, j)[0], begun
+            )
         held = jax.tree.map(lambda new, old: jnp.where(sampled.frozen, old, new), after, before)
         return (held, lived), sampled.signals
 
@@ -111,6 +118,10 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         held=ends,
         finite=loop.vouched(),
     )
+
+
+def _is_one(count: Any) -> bool:
+    return isinstance(count, int) and count == 1
 
 
 @jax.custom_jvp

@@ -82,6 +82,8 @@ class Loop:
     control_period: float
     periods: int
     substeps: int
+    # Integration steps in one of the model's; JAX may trace it.
+    finer: Any = 1
 
     @property
     def compiled(self) -> Any:

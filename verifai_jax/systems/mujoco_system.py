@@ -9,7 +9,7 @@ native(...)                           # the same in C: all cores, a batch in loc
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.errors import suggests_options, unknown_name
+from verifai_jax.systems.integrators import check_factor
 from verifai_jax.systems.mjx import constrained, reverse_hint, rollout, why_not
 from verifai_jax.systems.mujoco_bindings import Bound, bindings
 from verifai_jax.systems.mujoco_loop import Loop, Signals
@@ -44,6 +45,8 @@ class MuJoCo:
     lanes: ClassVar[int] = 128
     loop: Loop
     backend: str = "auto"
+    # Of the native backend; the same at every step of the physics.
+    programs: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
     def duration(self) -> float:
@@ -78,6 +81,22 @@ class MuJoCo:
         if name != "auto" and (reason := self.why_not(name)) is not None:
             raise ValueError(f"backend {name!r} is not possible: {reason}")
         return replace(self, backend=name)
+
+    @property
+    def traced_factor(self) -> bool:
+        """Whether `refined` takes a factor that JAX traces."""
+        return not self.black_box
+
+    def refined(self, factor: int) -> "MuJoCo":
+        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+
+        Sensors of acceleration and force then describe the last of the smaller steps.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
+        """
+        if not (self.traced_factor and isinstance(factor, jax.Array)):
+            check_factor(factor)
+        return replace(self, loop=replace(self.loop, finer=self.loop.finer * factor))
 
     @property
     def black_box(self) -> bool:
@@ -139,7 +158,7 @@ class MuJoCo:
 
     @cached_property
     def _native(self) -> Native:
-        return Native(self.loop)
+        return Native(self.loop, programs=self.programs)
 
 
 @suggests_options

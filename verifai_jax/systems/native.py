@@ -7,6 +7,7 @@ worked through in two halves: while one is stepped, the other's policy is evalua
 """
 
 import contextlib
+import copy
 import ctypes
 import os
 from collections.abc import Callable, Iterator
@@ -84,7 +85,11 @@ class Native:
             module = require("mujoco.batch", extra="mujoco")
             # Batches of other sizes are not needed again, or not soon.
             self.batches = {key: b for key, b in self.batches.items() if key[0] == size}
-            self.batches[size, number] = module.Batch(self.loop.compiled, size)
+            compiled = self.loop.compiled
+            if self.loop.finer != 1:
+                compiled = copy.copy(compiled)
+                compiled.opt.timestep /= self.loop.finer
+            self.batches[size, number] = module.Batch(compiled, size)
         return self.batches[size, number]
 
     def _trace(self, results: list["_Results"]) -> Trace:
@@ -219,7 +224,7 @@ class _Part:
         try:
             self.batch.step(
                 None if going.all() else going,
-                nstep=self.loop.substeps,
+                nstep=self.loop.substeps * self.loop.finer,
                 stage=self.program.stage,
             )
         except self.refused as error:
