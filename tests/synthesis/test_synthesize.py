@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,6 +12,7 @@ import verifai_jax as vj
 from specs.tuning import decay, first_order
 from verifai_jax.commands.synthesize import synthesize as command
 from verifai_jax.synthesis import synthesize
+from verifai_jax.synthesis.parametric import FeatureParameters
 
 W, X0, LIMIT, FORCE, SECONDS = 1.0, 0.5, 1.0, 1.8, 4.0
 
@@ -81,7 +83,7 @@ def test_the_same_seed_gives_the_same(found):
 
 
 def test_no_gain_has_that_margin():
-    result = synthesize(first_order, ["k"], 4000, margin=BEST + 0.1, gradient=False)
+    result = synthesize(first_order, ["k"], 6000, margin=BEST + 0.1, gradient=False)
     assert not result.holds
     assert result.robustness == pytest.approx(BEST, abs=0.02)
     assert len(result.robust) == 0
@@ -95,7 +97,7 @@ def test_no_gain_has_that_margin():
 def test_no_gain_is_safe():
     narrow = vj.FeatureSpace({**first_order.space.domains, "k": vj.Box(0.2, 0.8)})
     problem = dataclasses.replace(first_order, space=narrow)
-    result = synthesize(problem, ["k"], 3000, gradient=False)
+    result = synthesize(problem, ["k"], 6000, gradient=False)
     assert not result.holds
     assert result.robustness == pytest.approx(margin_of(0.8), abs=2e-3)
     # The share of environments in which x goes too far with the gain of 0.8.
@@ -155,7 +157,7 @@ def test_a_black_box_with_a_choice_and_simulations_that_raise():
         vj.blackbox(black_box),
         "always (abs(x) <= 1 & abs(u) <= 1.8)",
     )
-    result = synthesize(problem, ["gain", "direction"], 2500, held_out=200)
+    result = synthesize(problem, ["gain", "direction"], 2000, held_out=100)
     assert result.parameters["direction"] == "back"
     assert margin_of(result.parameters["gain"]) == pytest.approx(BEST, abs=0.05)
     assert result.without_verdict > 0
@@ -168,7 +170,7 @@ def test_a_constraint_between_parameter_and_environment():
     # Weak disturbances alone: |w| / k <= 0.5, so that |x| never grows beyond 0.5.
     space = vj.FeatureSpace(first_order.space.domains, where=lambda f: abs(f["w"]) <= f["k"] / 2)
     problem = dataclasses.replace(first_order, space=space, nominal=None)
-    result = synthesize(problem, ["k"], 3000, gradient=False)
+    result = synthesize(problem, ["k"], 6000, gradient=False)
     assert result.holds
     assert result.robustness == pytest.approx(0.5, abs=0.02)
     assert result.held_out.simulations == 2000
@@ -185,23 +187,46 @@ def test_exactly_zero_is_decided_by_the_comparator():
         assert result.held_out.failures == (0 if holds else 50)
 
 
-def test_ctrl_c_returns_what_is_finished():
-    calls = 0
+def test_ctrl_c_returns_what_is_finished(monkeypatch):
+    judge, calls = FeatureParameters.judge, 0
 
-    def interrupted(features):
+    def interrupted(self, *arguments):
         nonlocal calls
         calls += 1
-        if calls > 600:
+        if calls > 30:
             raise KeyboardInterrupt
-        return black_box({**features, "direction": 0})
+        return judge(self, *arguments)
 
-    space = {"gain": vj.Box(0.2, 4.0), "x0": vj.Box(-0.5, 0.5), "w": vj.Box(-1.0, 1.0)}
-    problem = vj.Problem("ctrl", space, vj.blackbox(interrupted), "always abs(x) <= 1")
-    result = synthesize(problem, ["gain"], 4000)
+    monkeypatch.setattr(FeatureParameters, "judge", interrupted)
+    result = synthesize(first_order, ["k"], 6000)
     assert result.stopped == "interrupted"
     assert result.held_out is None
     assert "not checked in held-out environments" in str(result)
-    assert 0.2 <= result.parameters["gain"] <= 4.0
+    assert margin_of(result.parameters["k"]) == pytest.approx(result.robustness, abs=0.2)
+
+
+def test_parameters_of_every_kind_can_be_held():
+    space = {
+        "point": vj.Box([0.0, 1.0], [1.0, 3.0]),
+        "count": vj.DiscreteBox(1, 4),
+        "kind": vj.Categorical("slow", "fast"),
+        "wave": vj.Signal(vj.Box(-1.0, 1.0), knots=3, hold="linear", duration=1.0),
+        "e": vj.Box(0.0, 1.0),
+    }
+
+    def system(features, key):
+        x = features["point"][0] + features["count"] + 2 * features["kind"] + features["e"]
+        return vj.Trace({"x": x + features["wave"](0.4) + jnp.zeros(2)}, dt=1.0)
+
+    problem = vj.Problem("kinds", space, system, "always x >= 0")
+    loop = FeatureParameters(problem, ["point", "count", "kind", "wave"], batch=8, gradient=False)
+    theta = np.random.default_rng(1).random(loop.dim)
+    rho = loop.judge(theta[None], np.array([[0.25]])).rho[0, 0]
+    held = loop.with_parameters(theta)
+    assert held.space.dim == 1
+    assert loop.values(theta)["kind"] in ("slow", "fast")
+    again = FeatureParameters(held, ["e"], batch=8, gradient=False)
+    assert again.judge(np.array([[0.25]]), np.zeros((1, 0))).rho[0, 0] == pytest.approx(rho)
 
 
 @pytest.mark.parametrize(
