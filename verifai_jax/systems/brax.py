@@ -12,7 +12,7 @@ import importlib.metadata
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from jaxtyping import Array, Int
@@ -27,6 +27,7 @@ from verifai_jax.systems.brax_parts import (
     Place,
     check_read,
     explained,
+    finer,
     joint_place,
     starting_at,
     system_place,
@@ -48,6 +49,7 @@ from verifai_jax.systems.episode import (
     varies,
     vector_action,
 )
+from verifai_jax.systems.integrators import check_factor
 from verifai_jax.systems.structure import outline
 from verifai_jax.trace import Trace
 from verifai_jax.waveform import bound
@@ -83,6 +85,15 @@ class Brax:
             f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges, "
             "unless the model asks for one iteration; the other backends have fixed loops"
         )
+
+    def refined(self, factor: int) -> "Brax":
+        """The same episode, decided and sampled as before, with a `factor` times smaller step.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for an
+        environment that is another model at another step (backends spring and positional).
+        """
+        check_factor(factor)
+        return replace(self, env=finer(self.env, factor, self.name))
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one episode, not reset at its end."""

@@ -189,6 +189,29 @@ def with_system(env: Any, sys: Any) -> Any:
     return other
 
 
+def finer(env: Any, factor: int, name: str) -> Any:
+    """A copy of the environment with a `factor` times smaller step of its physics.
+
+    **Raises:** `ValueError` for one whose physics is another at another step.
+    """
+    other = copy.copy(env)
+    if "env" in vars(other) and "sys" not in vars(other):
+        other.env = finer(other.env, factor, name)
+        return other
+    frames, backend = getattr(other, "_n_frames", None), getattr(other, "_backend", None)
+    if frames is None or not hasattr(getattr(other, "sys", None), "opt"):
+        raise ValueError(f"{name} is no PipelineEnv of Brax, whose step is known")
+    if backend not in ("generalized", "mjx"):
+        raise ValueError(
+            f"{name} on Brax's backend {backend!r}: its constraints are as stiff as its step makes "
+            "them, so that another step is another model"
+        )
+    sys = other.sys
+    other.sys = sys.tree_replace({"opt.timestep": sys.opt.timestep / factor})
+    other._n_frames = frames * factor
+    return other
+
+
 def starting_at(env: Any, values: Mapping[Place, Any]) -> Any:
     """A copy whose reset starts from these entries of `q` and `qd`, and observes what they give."""
     other = copy.copy(env)
