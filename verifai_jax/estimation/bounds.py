@@ -49,7 +49,7 @@ def normal_quantile(confidence: float) -> float:
 
 
 def weighted(x: Float[np.ndarray, " n"]) -> Weighted:
-    """What independent samples `x >= 0`, weights of failures and zero elsewhere, say of their mean."""
+    """The mean of independent `x >= 0`, weights of failures and zero elsewhere, and its tail."""
     n, total = len(x), float(x.sum())
     if n < 2 or total <= 0:
         return Weighted(0.0, math.inf, 0.0, 0.0, 1.0, math.inf)

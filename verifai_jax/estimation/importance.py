@@ -21,8 +21,11 @@ from verifai_jax.estimation.bounds import Weighted, skewed_interval, tail_index,
 from verifai_jax.estimation.judging import Ended, Judge, Seen
 from verifai_jax.estimation.mixture import Mixture, fitted
 
-STAGES = (0.12, 0.18)
-"""Shares of the simulations that improve the proposal before it is frozen."""
+SHARE_OF_STAGE = 0.1
+"""Of the simulations, for each stage that improves the proposal before it is frozen,"""
+MOST_STAGES = 5
+ENOUGH = 2500
+"""Effective failures, of which one stage more would not be worth its simulations."""
 DEFENSIVE = 0.1
 OUTERMOST = 5.54
 """Standard deviations that a normal feature reaches,"""
@@ -109,26 +112,45 @@ def fit(
     **Arguments:**
 
     - `points`, `family`: failures, about as the prior has them, and the chain each comes from.
-    - `simulations`: in all that are left; the stages take their shares of them.
+    - `simulations`: in all that are left; each stage takes a share of them.
     - `defensive`: share of the prior in the proposal.
     """
-    weight, effective, tail = np.ones(len(points)), 0.0, np.inf
-    proposal = fitted(points, weight, family, rng, defensive)
-    for share in STAGES:
-        z, _, seen, ratio = _drawn(judge, rng, proposal, int(share * simulations))
-        new, w = z[seen.failing], 1 / ratio[seen.failing]
-        if len(new) < 10:
+    proposal = fitted(points, np.ones(len(points)), family, rng, defensive)
+    size = max(1, int(SHARE_OF_STAGE * simulations))
+    proposals, zs, failing = [], [], []
+    effective, tail, before, left = 0.0, np.inf, 0.0, simulations
+    for stage in range(MOST_STAGES):
+        z, _, seen, ratio = _drawn(judge, rng, proposal, size)
+        left -= size
+        proposals.append(proposal)
+        zs.append(z)
+        failing.append(seen.failing)
+        w = 1 / ratio[seen.failing]
+        if len(w) < 10:
             continue
-        worth = [float(v.sum() ** 2 / np.sum(v * v)) for v in (weight, w)]
-        effective, tail = worth[1] / len(z), tail_index(w)
-        # Old and new stand for the same distribution, each for as much as it is worth; points of a
-        # chain are alike and worth less than they count.
-        worth[0] /= 3 if family.max() + 1 < len(points) else 1
-        weight = np.concatenate([weight / weight.sum() * worth[0], w / w.sum() * worth[1]])
-        points = np.concatenate([points, new])
-        family = np.concatenate([family, family.max() + 1 + np.arange(len(new))])
-        proposal = fitted(points, weight, family, rng, defensive)
+        effective, tail = _worth(w) / len(z), tail_index(w)
+        # All stages together are samples of the mean of their proposals.
+        new = np.concatenate([z[f] for z, f in zip(zs, failing, strict=True)])
+        counts = np.array([len(z) for z in zs], float)
+        density = np.stack([p.ratio(new) for p in proposals], axis=1) @ (counts / counts.sum())
+        # Failures of the splitting and of the stages stand for the same distribution, each for as
+        # much as they are worth; states of a chain are alike and worth less than they count.
+        worth = np.array([len(points) / 4, _worth(1 / density)])
+        worth[0] *= worth[0] / (worth[0] + worth[1])
+        weight = np.concatenate(
+            [np.full(len(points), worth[0] / len(points)), worth[1] / density / sum(1 / density)]
+        )
+        families = np.append(family, family.max() + 1 + np.arange(len(new)))
+        proposal = fitted(np.concatenate([points, new]), weight, families, rng, defensive)
+        if stage and (effective * left > ENOUGH or effective * left < before):
+            break
+        before = effective * left
     return Fit(proposal, effective, tail)
+
+
+def _worth(weight: Float[np.ndarray, " n"]) -> float:
+    """As many equally weighted samples."""
+    return float(weight.sum() ** 2 / np.sum(weight * weight))
 
 
 def sample(

@@ -20,7 +20,7 @@ from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.bounds import log_interval
 from verifai_jax.estimation.judging import Ended, Judge
 from verifai_jax.estimation.monte_carlo import Counts
-from verifai_jax.estimation.splitting import Climb, split
+from verifai_jax.estimation.splitting import Climb, explore, split
 
 COUNTED = 0.06
 """Relative error at which counting the failures of the prior is good enough."""
@@ -32,6 +32,8 @@ SHARE_OF_LEVEL = 0.09
 """Of the budget, for each level of the splitting that makes the proposal,"""
 SHARE_OF_REPLICATE = 0.02
 """and of those that are the estimate themselves: several, which tell how much they differ."""
+EXPLORED = 0.1
+"""Of what is left then, for more failures before the proposal is fitted."""
 CHAIN = 10
 """States of a chain: as many levels are a tenth as probable as the one before."""
 UNDERSTATED = 1.6
@@ -124,9 +126,11 @@ def by_importance(judge: Judge, rng: np.random.Generator, plan: Plan, first: Any
     if climb.stopped is not None:
         return _not_reached(judge, rng, plan, climb, counts)
     try:
-        made = importance.fit(judge, rng, climb.points, climb.family, judge.left)
+        steps = max(2, round(EXPLORED * judge.left / plan.chains))
+        points, family = explore(judge, rng, climb, plan.chains, steps)
+        made = importance.fit(judge, rng, points, family, judge.left)
         promised = made.effective * judge.left
-        if promised < LEAST_EFFECTIVE or made.tail > WORST_TAIL and promised < 500:
+        if promised < LEAST_EFFECTIVE:
             answer = _replicated(judge, rng, plan, [climb], counts)
             answer.notes.append(
                 "no proposal fits the failures well enough for importance sampling (it promises "

@@ -25,6 +25,8 @@ MODES = (1, 2, 4, 8)
 MOST_POINTS = 1500
 """Failures that a half of the candidates is fitted to at most: more change the fit little."""
 SWEEPS = 12
+KERNELS = 400
+CELLS = 48
 TOGETHER = 0.3
 LEAST_SHARE = 1e-3
 
@@ -98,6 +100,56 @@ class Marginals:
             if len(log) > 1:
                 total += log[np.searchsorted(edges[1:-1], z[:, i], side="right")]
         return total
+
+
+@dataclass(frozen=True)
+class Copula:
+    """Coordinates with these marginals, dependent as those of a normal vector.
+
+    - `axes`, `stds`: of its correlation matrix: eigenvectors `[d, d]` and roots of eigenvalues.
+    """
+
+    marginals: Marginals
+    axes: Float[np.ndarray, "d d"]
+    stds: Float[np.ndarray, " d"]
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        from scipy.special import ndtr, ndtri
+
+        v = (rng.standard_normal((n, len(self.stds))) * self.stds) @ self.axes.T
+        z = v.copy()
+        for i, (edges, mass) in enumerate(
+            zip(self.marginals.edges, self.marginals.masses, strict=True)
+        ):
+            if len(mass) > 1:
+                rank, total = ndtr(v[:, i]), np.append(0, np.cumsum(mass))
+                step = np.clip(np.searchsorted(total, rank, side="right") - 1, 0, len(mass) - 1)
+                within = (rank - total[step]) / mass[step]
+                z[:, i] = _between(edges[step], edges[step + 1], within)
+            else:
+                z[:, i] = ndtri(ndtr(v[:, i]))
+        return z
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        v = _scores(self.marginals, z)
+        white = v @ self.axes / self.stds
+        dependence = (np.sum(v * v, axis=1) - np.sum(white * white, axis=1)) / 2
+        return self.marginals.log_ratio(z) + dependence - np.sum(np.log(self.stds))
+
+
+def _scores(marginals: Marginals, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """Each coordinate as the standard normal number of the same rank."""
+    from scipy.special import ndtr, ndtri
+
+    v = z.copy()
+    for i, (edges, mass) in enumerate(zip(marginals.edges, marginals.masses, strict=True)):
+        if len(mass) > 1:
+            borders = ndtr(edges)
+            step = np.searchsorted(edges[1:-1], z[:, i], side="right")
+            within = (ndtr(z[:, i]) - borders[step]) / (borders[step + 1] - borders[step])
+            rank = np.append(0, np.cumsum(mass))[step] + within * mass[step]
+            v[:, i] = ndtri(np.clip(rank, 1e-12, 1 - 1e-12))
+    return v
 
 
 @dataclass(frozen=True)
@@ -179,13 +231,16 @@ def fitted(
     half = (rng.permutation(int(family.max()) + 1) % 2)[family].astype(bool)
     if min(_size(weight[half]), _size(weight[~half])) < 4:
         half = rng.random(len(z)) < 0.5
+    # States of one chain are alike: a chain is worth two points rather than all of its states.
+    of_families = _size(np.bincount(family, weight))
+    alike_points = min(1.0, 2 * of_families / _size(weight))
     found: list[Any] = []
     crossed: list[float] = []
     for fit in (half, ~half):
         test = ~fit
         if not fit.any() or not test.any():
             continue
-        made = candidates(*_thinned(z[fit], weight[fit], rng), rng)
+        made = candidates(*_thinned(z[fit], weight[fit], rng), rng, alike_points)
         table = np.exp(ratios(made, z[test]))
         crossed += list(stacked(table, weight[test] / weight[test].sum(), defensive))
         found += made
@@ -222,25 +277,33 @@ def stacked(
 
 
 def candidates(
-    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], rng: np.random.Generator
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    worth: float = 1.0,
 ) -> list[Any]:
-    """Components of all kinds, fitted to these points."""
-    n, d = z.shape
+    """Components of all kinds, fitted to these points, each of which is worth so much."""
+    d = z.shape[1]
     found: list[Any] = []
-    size = _size(weight)
+    size = _size(weight) * worth
     if d > 1:
-        found += [shell(z, weight), alike(z, weight)]
+        found += [shell(z, weight, worth), alike(z, weight, worth)]
     for modes in MODES:
         if modes > 1 and size < 6 * modes:
             break
-        shares, gaussians, memberships = mixture_of_gaussians(z, weight, modes, rng)
+        shares, gaussians, memberships = mixture_of_gaussians(z, weight, modes, rng, worth)
         for share, gaussian, member in zip(shares, gaussians, memberships.T, strict=True):
             if share * size < 3:
                 continue
             found.append(gaussian)
+            found.append(Gaussian(gaussian.mean, gaussian.axes, 1.3 * gaussian.stds))
             found.append(Gaussian(gaussian.mean, np.eye(d), np.ones(d)))
-            if modes <= 4:
-                found.append(marginals(z, member / member.sum()))
+            if modes <= 2:
+                own = member / member.sum()
+                for wider in (1.0, 2.0):
+                    steps = smooth(z, own, wider, worth)
+                    linked = copula(z, own, steps, worth)
+                    found.append(steps if linked is None else linked)
     return found
 
 
@@ -262,14 +325,16 @@ def _size(weight: Float[np.ndarray, " n"]) -> float:
     return float(weight.sum() ** 2 / np.sum(weight * weight)) if len(weight) else 0.0
 
 
-def gaussian(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Gaussian:
+def gaussian(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Gaussian:
     """Mean and covariance, of which only what exceeds the noise of so few points is believed.
 
     Eigenvalues within the range that those of white noise have (Marchenko and Pastur, 1967) are
     replaced by their mean.
     """
     d = z.shape[1]
-    size = _size(weight)
+    size = max(_size(weight) * worth, 1.0)
     mean = weight @ z
     centred = z - mean
     values, axes = np.linalg.eigh((centred * weight[:, None]).T @ centred)
@@ -298,9 +363,10 @@ def mixture_of_gaussians(
     weight: Float[np.ndarray, " n"],
     modes: int,
     rng: np.random.Generator,
+    worth: float = 1.0,
 ) -> tuple[list[float], list[Gaussian], Float[np.ndarray, "n modes"]]:
     """Expectation maximisation from spread-out centres, with the covariances of `gaussian`."""
-    n, d = z.shape
+    n = len(z)
     centre = z[rng.choice(n, p=weight)]
     distance = np.sum((z - centre) ** 2, axis=1)
     centres = [centre]
@@ -317,7 +383,7 @@ def mixture_of_gaussians(
         kept = member.sum(axis=0) > 1e-9
         member = member[:, kept]
         shares = list(member.sum(axis=0) / member.sum())
-        found = [gaussian(z, column / column.sum()) for column in member.T]
+        found = [gaussian(z, column / column.sum(), worth) for column in member.T]
         if modes == 1 or sweep == SWEEPS - 1:
             break
         logs = ratios(found, z) + np.log(shares)
@@ -349,21 +415,78 @@ _FINEST = np.unique(np.concatenate(_BORDERS))
 _AMONG = [np.searchsorted(_FINEST, border) for border in _BORDERS]
 
 
-def marginals(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Marginals:
-    """The step function of each coordinate."""
-    from scipy.special import ndtr
+def copula(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    steps: Marginals,
+    worth: float = 1.0,
+) -> Copula | None:
+    """These marginals with the correlations that are no noise; None where there are none."""
+    d, size = z.shape[1], _size(weight) * worth
+    v = _scores(steps, z)
+    centred = v - weight @ v
+    cross = (centred * weight[:, None]).T @ centred
+    spread = np.sqrt(np.maximum(np.diag(cross), 1e-12))
+    correlation = cross / np.outer(spread, spread)
+    noise = 2.5 / np.sqrt(size)
+    kept = np.where(np.abs(correlation) > noise, correlation * (1 - 1 / max(size, 2)), 0.0)
+    np.fill_diagonal(kept, 1.0)
+    if np.count_nonzero(kept) == d:
+        return None
+    values, axes = np.linalg.eigh(kept)
+    values = np.clip(values, 0.02, None)
+    return Copula(steps, axes, np.sqrt(values))
 
-    size = _size(weight)
-    found = [_steps(column, weight, size) for column in ndtr(z).T]
-    return Marginals(*(tuple(parts) for parts in zip(*found, strict=True)))
+
+def smooth(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    wider: float = 1.0,
+    worth: float = 1.0,
+) -> Marginals:
+    """The density of each coordinate by kernels, reflected at the ends, in fine steps.
+
+    - `wider`: than Silverman's rule (Density estimation, 1986, equation 3.31) has the kernels.
+    """
+    from scipy.special import ndtr, ndtri
+
+    size = _size(weight) * worth
+    if len(z) > KERNELS:
+        # Equally many points in each part of the weight: the same density with less work.
+        places = (np.arange(KERNELS) + 0.5) / KERNELS
+        rows = np.searchsorted(np.cumsum(weight), places * weight.sum())
+        z, weight = z[np.minimum(rows, len(z) - 1)], np.full(KERNELS, 1 / KERNELS)
+    edges, logs, masses = [], [], []
+    for column in ndtr(z).T:
+        order = np.argsort(column)
+        total = np.cumsum(weight[order])
+        quarter, three = np.interp([0.25, 0.75], total, column[order])
+        middle = weight @ column
+        std = float(np.sqrt(weight @ (column - middle) ** 2))
+        width = max(0.9 * min(std, (three - quarter) / 1.34 + 1e-9) * size**-0.2, 1e-9) * wider
+        low, high = max(0.0, column.min() - 3 * width), min(1.0, column.max() + 3 * width)
+        border = np.unique(np.concatenate([[0.0], np.linspace(low, high, CELLS + 1), [1.0]]))
+        mass = np.zeros(len(border) - 1)
+        for mirror in (column, -column, 2 - column):
+            mass += weight @ np.diff(ndtr((border[None] - mirror[:, None]) / width), axis=1)
+        prior = np.diff(border)
+        mass = (mass * size + 2 * prior) / (mass.sum() * size + 2)
+        if size * float(mass @ np.log(mass / prior)) < 4.0:
+            border, prior, mass = np.array([0.0, 1.0]), np.ones(1), np.ones(1)
+        edges.append(ndtri(border))
+        logs.append(np.log(mass / prior))
+        masses.append(mass / mass.sum())
+    return Marginals(tuple(edges), tuple(logs), tuple(masses))
 
 
-def alike(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Marginals:
+def alike(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Marginals:
     """One step function for all coordinates, from all of them together."""
     from scipy.special import ndtr
 
-    n, d = z.shape
-    found = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, _size(weight) * d)
+    d = z.shape[1]
+    found = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, _size(weight) * worth * d)
     return Marginals(*((part,) * d for part in found))
 
 
@@ -402,12 +525,14 @@ def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     return np.where(above < 0.5, outer, ndtri(np.maximum(gammainc(half, square), 1e-300)))
 
 
-def shell(z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Shell:
+def shell(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Shell:
     """Shells of the distances that these points have, in steps narrow in probability."""
     from scipy.special import ndtr
 
     score = radial_score(z)
-    size = _size(weight)
+    size = _size(weight) * worth
     order = np.argsort(score)
     total = np.cumsum(weight[order])
     steps = int(np.clip(size // 20, 2, 12))

@@ -114,6 +114,20 @@ def split(
     return climb
 
 
+def explore(
+    judge: Judge, rng: np.random.Generator, climb: Climb, chains: int, steps: int
+) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
+    """More failures, by chains from those of the last level that stay among them.
+
+    Points, and the chain each comes from; those of the climb are among them.
+    """
+    rows = np.resize(rng.permutation(len(climb.points)), chains)
+    z, score = climb.points[rows], np.full(chains, -np.inf)
+    z, _, _, _ = _walk(judge, rng, z, score, -np.inf, steps + 1, 0.5)
+    family = np.concatenate([climb.family, np.tile(climb.family[rows], steps)])
+    return np.concatenate([climb.points, z[chains:]]), family
+
+
 def _level(score: Float[np.ndarray, " n"], share: float, above: float) -> float | None:
     """The next level: the `share` quantile, or lower where that would be no progress."""
     ordered = np.sort(score)
@@ -159,7 +173,7 @@ def _walk(
 
 
 def _cv2(inside: Bool[np.ndarray, " n"], steps: int) -> float:
-    """Squared relative error of a fraction of states of chains (Au and Beck, equations 25 to 29)."""
+    """Squared relative error of a fraction of states (Au and Beck, equations 25 to 29)."""
     n, share = len(inside), float(inside.mean())
     if share >= 1.0:
         return 0.0
