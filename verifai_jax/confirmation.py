@@ -219,7 +219,8 @@ def _planned(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
             for name, factor in FINER.items():
                 checks[name] = _Check(base, factor, precision)
             if precision != run:
-                single = Replays(problem, run, base.key, stored(problem.space, rows, run))
+                first = {column: values[:1] for column, values in rows.items()}
+                single = Replays(problem, run, base.key, stored(problem.space, first, run))
                 checks[SINGLE] = _Check(single, FINER["quarter_step"], run)
         else:
             notes.append(f"not checked at a finer step: {reason}")

@@ -172,7 +172,14 @@ class Replays:
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), features
         )
         self._kept = problem.engines.setdefault("replays", {})
-        traced = self._traced("rho", 1, None)
+        try:
+            traced = self._traced("rho", 1, None)
+        except Exception:
+            if not self.refiner.traced:
+                raise
+            # It takes integers only, whatever it says of itself.
+            self.refiner.traced = False
+            traced = self._traced("rho", 1, None)
         used = traced.jaxpr.jaxpr.invars[len(jax.tree.leaves(features))]
         self.draws = any(used is v for step in traced.jaxpr.jaxpr.eqns for v in step.invars)
 
