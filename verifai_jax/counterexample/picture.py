@@ -93,16 +93,18 @@ def draw_decision(axes: Any, why: Explanation) -> None:
             nearest = min(bounds, key=lambda b: abs(b - values[place]))
             shown = close(float(values[place]), nearest)[0]
         low, high = axes.get_ylim()
-        above = values[place] > (low + high) / 2
+        late = place > len(clock) / 2
+        # Beside the instant's line, at the end of it that is away from the curve.
         axes.annotate(
             f"{shown} at {clock[place]:.4g} s",
-            (clock[place], values[place]),
+            (clock[place], 0.05 if values[place] > (low + high) / 2 else 0.93),
+            xycoords=("data", "axes fraction"),
+            xytext=(-5 if late else 5, 0),
             textcoords="offset points",
-            xytext=(-10 if place > len(clock) / 2 else 10, -14 if above else 10),
-            ha="right" if place > len(clock) / 2 else "left",
+            ha="right" if late else "left",
+            va="center",
             fontsize=8,
             color=FAILING,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
         )
     axes.set_ylabel(_short(label, 28))
     axes.set_title(f"decides: {_short(str(predicate), 60)}", fontsize=9, color=FAILING, loc="left")
@@ -171,7 +173,7 @@ def _draw_bars(axes: Any, explained: "Explained") -> None:
         axes.set_xlabel("change of robustness over the feature's range")
         axes.set_title("steepest features", fontsize=9, loc="left")
     axes.set_yticks(where, [_short(name, 18) for name in names])
-    axes.invert_yaxis()
+    axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
     tidy(axes)
     axes.grid(visible=False, axis="y")
 

@@ -1,0 +1,330 @@
+"""Failures of many kinds: a search that is kept away from the failures that it has found.
+
+    Diverse(CrossEntropy())
+    Diverse(Gradient(), radius=0.3, capacity=100)
+    Diverse.count(state), Diverse.archive(state)        # how many distinct failures, and where
+
+An archive holds failures no two of which are within a radius. The search inside is told that what
+is near an archived failure is worse than safe, and where the robustness is differentiated that it
+rises towards it (deflation, as in Farrell, Birkisson and Funke, Deflation techniques for finding
+distinct solutions of nonlinear partial differential equations, SIAM Journal on Scientific Computing
+37(4), 2015). What it had learned on the way to an archived failure leads back there, so that it
+begins afresh from the best points that lie elsewhere. When it comes no nearer to a new one the
+radius shrinks, so that first the modes are found and then the insides of them filled.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Plan,
+    Search,
+    check_count,
+    check_fraction,
+)
+
+AT_ONCE = 16
+"""Failures archived in a round at most."""
+ABSENT = -1e8
+"""Clauses below are none."""
+
+
+class DiverseState(NamedTuple):
+    inner: Any
+    key: Key[Array, ""]
+    round: Int[Array, ""]
+    archive: Float[Array, "capacity d"]
+    count: Int[Array, ""]
+    radius: Float[Array, ""]
+    idle: Int[Array, ""]  # rounds without a new failure and without coming nearer to one
+    level: Float[Array, ""]  # the least raised robustness since the search began afresh
+    size: Float[Array, ""]  # sum of the sizes of robustness seen
+    seen: Float[Array, ""]  # and how many there were
+    points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
+    rho: Float[Array, " batch"]  # with their own robustness; infinite where there is none
+
+
+@dataclass(frozen=True)
+class Diverse(Search):
+    """Another search, kept away from failures already found.
+
+    **Arguments:**
+
+    - `search`: the one inside.
+    - `radius`: how far distinct failures are apart at first: root mean square over the unit
+      coordinates, in which two random points are 0.41 apart; choices differ by 0 or 1.
+    - `least_radius`: the radius shrinks no further.
+    - `shrink`: factor on the radius, and a new beginning for the search inside, after
+    - `patience` rounds that brought no new failure and came no nearer to one.
+    - `capacity`: of the archive; no more failures than that are told apart.
+
+    **Raises:** `TypeError` for what is no search; `ValueError` for values out of range.
+    """
+
+    search: Search
+    radius: float = 0.25
+    least_radius: float = 0.01
+    shrink: float = 0.8
+    patience: int = 8
+    capacity: int = 256
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.search, Search):
+            raise TypeError(f"Diverse needs a search like CrossEntropy(); got {self.search!r}")
+        check_fraction("radius", self.radius)
+        check_fraction("least_radius", self.least_radius)
+        check_fraction("shrink", self.shrink)
+        check_count("patience", self.patience)
+        check_count("capacity", self.capacity)
+        if self.least_radius > self.radius:
+            raise ValueError(
+                f"least_radius must be at most radius, {self.radius}; got {self.least_radius}"
+            )
+
+    @property
+    def wants_gradient(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.search.wants_gradient
+
+    @property
+    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.search.wants_clauses
+
+    @property
+    def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.search.samples_prior
+
+    @property
+    def most_at_once(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.search.most_at_once
+
+    @staticmethod
+    def count(state: DiverseState) -> Int[Array, ""]:
+        """How many distinct failures there are so far."""
+        return state.count
+
+    @staticmethod
+    def archive(state: DiverseState) -> Float[np.ndarray, "k d"]:
+        """The distinct failures, in the order in which they were found."""
+        return np.asarray(state.archive)[: int(state.count)]
+
+    def check(self, cube: Cube) -> None:
+        self.search.check(cube)
+
+    def total(self, cube: Cube) -> int | None:
+        return self.search.total(cube)
+
+    def plan(self, state: DiverseState, cube: Cube, batch: int) -> Plan:
+        return self.search.plan(state.inner, cube, batch)
+
+    def temperature(self, state: DiverseState) -> Float[Array, ""]:
+        return self.search.temperature(state.inner)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> DiverseState:
+        own, its = jax.random.split(key)
+        return DiverseState(
+            inner=self.search.init(its, cube, batch),
+            key=own,
+            round=jnp.int32(0),
+            archive=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
+            count=jnp.int32(0),
+            radius=jnp.float32(self.radius),
+            idle=jnp.int32(0),
+            level=jnp.float32(jnp.inf),
+            size=jnp.float32(0),
+            seen=jnp.float32(0),
+            points=jnp.full((batch, cube.dim), 0.5, jnp.float32),
+            rho=jnp.full(batch, jnp.inf, jnp.float32),
+        )
+
+    def ask(
+        self, state: DiverseState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], DiverseState]:
+        u, inner = self.search.ask(state.inner, cube, batch)
+        return u, state._replace(inner=inner)
+
+    def tell(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> DiverseState:
+        return self._told(state, cube, evaluated, warm=False)
+
+    def warm(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> DiverseState:
+        return self._told(state, cube, evaluated, warm=True)
+
+    def _told(
+        self, state: DiverseState, cube: Cube, evaluated: Evaluated, warm: bool
+    ) -> DiverseState:
+        judged = evaluated.judged
+        u = jnp.where(judged[:, None], evaluated.u, 0.5)
+        size = jnp.sum(jnp.where(judged, jnp.abs(evaluated.rho), 0.0))
+        before = state.count
+        state = state._replace(
+            round=state.round + 1,
+            size=state.size + size.astype(jnp.float32),
+            seen=state.seen + jnp.sum(judged),
+        )
+        state = self._archived(state, cube, u, judged & (evaluated.rho < 0))
+        found = state.count > before
+        raised = self._raised(state, cube, u, jnp.where(judged, evaluated.rho, jnp.inf))
+        nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
+        progress = found | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
+        idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
+        tired = idle >= self.patience
+        smaller = jnp.maximum(self.shrink * state.radius, self.least_radius)
+        state = state._replace(
+            idle=jnp.where(tired, 0, idle),
+            radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
+            level=jnp.where(found | tired, jnp.inf, jnp.minimum(state.level, nearest)),
+        )
+        state = self._remembered(state, cube, u, jnp.where(judged, evaluated.rho, jnp.inf))
+        # What it had come to without finding anything leads nowhere.
+        state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
+
+        told = self._deflated(state, cube, evaluated)
+        verb = self.search.warm if warm else self.search.tell
+        inner = verb(state.inner, cube, told)
+        if self.search.learns and self.search.total(cube) is None:
+            inner = jax.lax.cond(found | tired, lambda: self._afresh(state, cube), lambda: inner)
+        return state._replace(inner=inner)
+
+    def _archived(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], failing: Any
+    ) -> DiverseState:
+        """With the failures that are beyond the radius of all archived ones, the farthest first."""
+
+        def add(_: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+            archive, count, far = carry
+            place = jnp.argmax(jnp.where(failing, far, -1.0))
+            fresh = failing[place] & (far[place] > state.radius) & (count < self.capacity)
+            slot = jnp.minimum(count, self.capacity - 1)
+            archive = jnp.where(fresh, archive.at[slot].set(u[place]), archive)
+            closer = jnp.minimum(far, apart(cube, u, u[place][None])[:, 0])
+            return archive, count + fresh.astype(count.dtype), jnp.where(fresh, closer, far)
+
+        far = jnp.min(self._distances(state, cube, u), axis=1)
+        most = min(AT_ONCE, len(u))
+        archive, count, _ = jax.lax.fori_loop(0, most, add, (state.archive, state.count, far))
+        return state._replace(archive=archive, count=count)
+
+    def _distances(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
+    ) -> Float[Array, "n capacity"]:
+        """To all archived failures; infinite for places in the archive that are empty."""
+        known = jnp.arange(self.capacity) < state.count
+        return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
+
+    def _nearness(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
+    ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+        """1 at an archived failure, 0 from one and a half radii on; and which one it is."""
+        far = self._distances(state, cube, u)
+        nearest = jnp.argmin(far, axis=1)
+        least = jnp.min(far, axis=1)
+        return jnp.clip(1 - least / (1.5 * state.radius), 0.0, 1.0), nearest
+
+    def _scale(self, state: DiverseState) -> Float[Array, ""]:
+        return 2.0 * state.size / jnp.maximum(state.seen, 1.0) + 1e-6
+
+    def _raised(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
+    ) -> Float[Array, " n"]:
+        """Robustness, raised near archived failures to that of safe points and beyond."""
+        near, _ = self._nearness(state, cube, u)
+        return jnp.where(near > 0, jnp.maximum(rho, 0.0) + self._scale(state) * near, rho)
+
+    def _deflated(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> Evaluated:
+        judged = evaluated.judged
+        u = jnp.where(judged[:, None], evaluated.u, 0.5)
+        near, nearest = self._nearness(state, cube, u)
+        inside = judged & (near > 0)
+        rho = jnp.where(inside, self._raised(state, cube, u, evaluated.rho), evaluated.rho)
+        told = evaluated._replace(rho=rho)
+        if evaluated.gradient is None and evaluated.clauses is None:
+            return told
+
+        offset = jnp.where(np.array(cube.levels) == 0, u - state.archive[nearest], 0.0)
+        length = apart(cube, u, state.archive)[jnp.arange(len(u)), nearest]
+        # Of the root mean square over the coordinates.
+        away = offset / (max(cube.dim, 1) * jnp.maximum(length, 1e-6))[:, None]
+        falls = -away / (1.5 * state.radius)
+        if evaluated.gradient is not None:
+            own = jnp.where((evaluated.rho > 0)[:, None], evaluated.gradient, 0.0)
+            raised = own + self._scale(state) * falls
+            told = told._replace(gradient=jnp.where(inside[:, None], raised, evaluated.gradient))
+        if evaluated.clauses is not None:
+            # These have no unit, and of clauses that there are not the values stay very low.
+            there = inside[:, None] & (evaluated.clauses > ABSENT)
+            lifted = jnp.maximum(evaluated.clauses, 0.0) + near[:, None]
+            told = told._replace(clauses=jnp.where(there, lifted, evaluated.clauses))
+            slopes = evaluated.slopes
+            if slopes is not None:
+                own = jnp.where((evaluated.clauses > 0)[:, :, None], slopes, 0.0)
+                # Zero where the round asked for none.
+                asked = there & jnp.any(slopes != 0)
+                own = jnp.where(asked[:, :, None], own + falls[:, None, :], slopes)
+                told = told._replace(slopes=own)
+        return told
+
+    def _remembered(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
+    ) -> DiverseState:
+        """The best points so far that are away from the archive as it is now."""
+        points = jnp.concatenate([u, state.points])
+        values = jnp.concatenate([rho.astype(jnp.float32), state.rho])
+        raised = self._raised(state, cube, points, values)
+        score = jnp.where(jnp.isfinite(values), raised, jnp.inf)
+        _, best = jax.lax.top_k(-score, len(state.rho))
+        return state._replace(points=points[best], rho=values[best])
+
+    def _afresh(self, state: DiverseState, cube: Cube) -> Any:
+        """The search inside as if it knew only the remembered points."""
+        batch = len(state.rho)
+        inner = self.search.init(jax.random.fold_in(state.key, state.round), cube, batch)
+        known = jnp.isfinite(state.rho)
+        raised = self._raised(state, cube, state.points, jnp.where(known, state.rho, 1.0))
+        return self.search.warm(inner, cube, Evaluated(state.points, raised, known))
+
+
+def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:
+    """Root mean square difference over the coordinates; of places in cells, 0 or 1 for choices."""
+    if cube.dim == 0:
+        return jnp.zeros((len(one), len(other)), jnp.float32)
+    square = jnp.zeros((len(one), len(other)), jnp.float32)
+    if len(cube.continuous):
+        a, b = one[:, cube.continuous], other[:, cube.continuous]
+        # Coordinate by coordinate: the product form would cancel digits of small distances.
+        square = jnp.sum((a[:, None, :] - b[None, :, :]) ** 2, axis=-1)
+    if len(cube.discrete):
+        levels = np.array([max(cube.levels[i] - 1, 1) for i in cube.discrete], np.float32)
+        ordered = np.array([cube.ordered[i] for i in cube.discrete])
+        steps = cube.cells(one)[:, None, :] - cube.cells(other)[None, :, :]
+        gap = jnp.where(ordered, jnp.abs(steps) / levels, (steps != 0).astype(jnp.float32))
+        square += jnp.sum(gap**2, axis=-1)
+    return jnp.sqrt(square / cube.dim)
+
+
+def distinct(
+    points: Any, radius: float, cube: Cube | None = None, order: Any = None
+) -> Int[np.ndarray, " k"]:
+    """Which of these points `[n, d]` are distinct: no two chosen ones are within the radius.
+
+    - `order`: of the points, the most wanted first, such as `np.argsort(rho)`; as they come when
+      left out. The first is chosen, and then each that is beyond the radius of all chosen ones.
+    - `radius`: as of `Diverse`.
+
+    Returns their numbers, in that order.
+    """
+    points = np.asarray(points, np.float32)
+    cube = cube or Cube((0,) * points.shape[1])
+    order = np.arange(len(points)) if order is None else np.asarray(order)
+    chosen: list[int] = []
+    near = np.zeros(len(points), bool)
+    for i in order:
+        if not near[i]:
+            chosen.append(int(i))
+            near |= np.asarray(apart(cube, points[i][None], points))[0] <= radius  # pyright: ignore[reportArgumentType]
+    return np.array(chosen, int)
