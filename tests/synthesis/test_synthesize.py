@@ -65,7 +65,7 @@ def test_the_tables(found):
 def test_the_chosen_problem_is_ready(found):
     assert found.chosen.nominal["k"] == found.parameters["k"]
     assert found.chosen.space.dim == 2
-    assert len(vj.falsify(found.chosen, budget=64, batch=64).table.counterexamples) == 0
+    assert len(vj.falsify(found.chosen, "uniform", 64, batch=64).table.counterexamples) == 0
 
 
 def test_what_it_says(found):

@@ -154,7 +154,9 @@ def climb(
 
     A step is taken where simulations show that it is better; the radius follows its success.
     """
-    thetas = np.array(thetas, np.float64)
+    thetas = np.array(thetas, np.float64)[: limits.left // max(1, len(environments))]
+    if not len(thetas):
+        return []
     rho = loop.judge(thetas, environments)
     now = [Choice(t, v, len(environments)) for t, v in zip(thetas, least(rho), strict=True)]
     rhos = [np.where(ok, r, np.inf) for r, ok in zip(rho.rho, rho.proper, strict=True)]

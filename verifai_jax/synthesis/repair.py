@@ -30,6 +30,7 @@ from verifai_jax.run import Run
 from verifai_jax.search import Search
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.choosing import (
+    LEAST_BATCH,
     Archive,
     Choice,
     by_value,
@@ -43,7 +44,7 @@ from verifai_jax.synthesis.heldout import HeldOut, held_out
 from verifai_jax.synthesis.limits import Limits, timed
 from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
 from verifai_jax.synthesis.steps import least_change, uphill
-from verifai_jax.synthesis.synthesize import attacker, check_numbers, feature_loop, short
+from verifai_jax.synthesis.synthesize import ATTACK, attacker, check_numbers, feature_loop, short
 
 ADDED = 8
 """Counterexamples that a round adds to the set at most."""
@@ -141,6 +142,8 @@ class Repair:
             lines.append(
                 "  the check found what the attacks did not: try a larger budget or margin"
             )
+        if _worse(self.held_out_before, self.held_out_after):
+            lines.append("  the change made it worse: keep the nominal parameters")
         counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
         lines.append(f"  counterexamples round by round: {counts}")
         text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
@@ -276,6 +279,10 @@ def repair(
     )
 
 
+def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:
+    return before is not None and after is not None and after.failures > before.failures
+
+
 def _checked(
     loop: Any, start: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
 ) -> Any:
@@ -367,8 +374,8 @@ class _Repair:
         self.loop, self.start, self.search, self.limits = loop, start, search, limits
         self.margin, self.seed = margin, seed
         self.rng = np.random.default_rng((seed, 2))
-        # A twentieth of the budget for an attack at first, a tenth where it finds nothing.
-        self.share = max(64, limits.most // 10)
+        # An attack that finds nothing costs a tenth of the budget; one that does costs less.
+        self.share = min(ATTACK, max(64, limits.most // 10))
         self.batch = min(128, usual_batch(search, self.share))
         self.environments = np.zeros((0, loop.environment.dim), np.float32)
         self.now = Choice(start, np.inf, 0)
@@ -452,6 +459,9 @@ class _Repair:
         # What was near and what was robust in the old set may still be in this one.
         old = self.archive.best(4, self.merit) + self.archive.best(8, by_value, apart=0.05)
         self.archive = archive = Archive()
+        if self.limits.left < LEAST_BATCH * len(self.environments):
+            self.archive, self.stopped = archive, self.limits.ended
+            return False
         starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
         affordable = max(2, self.limits.left // 4 // len(self.environments))
         judged(self.loop, starts[:affordable], self.environments, archive)
@@ -478,7 +488,7 @@ class _Repair:
         self.robustness = best.value
         if best.value >= self.enough:
             return True
-        if self.limits.over:
+        if self.limits.left < LEAST_BATCH * len(self.environments):
             self.stopped = self.limits.ended
             return False
         self.stopped = "no parameters"

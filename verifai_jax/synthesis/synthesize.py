@@ -53,6 +53,10 @@ STARTS = 4
 """Choices from which gradients are followed."""
 ADDED = 6
 """Environments that a round adds to the set at most."""
+ATTACK = 20_000
+"""Simulations of an attack at most, however large the budget."""
+EXPLORED = 20_000
+"""Simulations of the first look at the parameters at most, where there is no environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,15 @@ class Synthesis:
 
 def short(value: Any) -> str:
     """A parameter's value, for people."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, int | str | bool):
+        return str(value)
+    import jax
+
+    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(value)]).tolist()
+    shown = ", ".join(f"{number:.4g}" for number in numbers[:6])
+    return f"[{shown}{', ...' * (len(numbers) > 6)}]"
 
 
 @suggests_options
@@ -261,6 +273,7 @@ class _Search:
         self.rho: Any = None  # Of the best, in each environment of the set.
         self.environments: Any = np.zeros((1, 0), np.float32)
         if loop.environment is not None:
+            environments = max(1, min(environments, limits.left // 4))
             self.environments = drawn(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
             if not len(self.environments):
                 # The constraint wants other parameters: it is asked with each of them.
@@ -280,9 +293,9 @@ class _Search:
     def rounds(self) -> None:
         """All but the conclusion."""
         total = self.limits.left
-        first = self.limits.slice(
-            int(0.5 * total if self.loop.environment is None else 0.3 * total)
-        )
+        alone = self.loop.environment is None
+        most = EXPLORED if alone else 1000 * len(self.environments)
+        first = self.limits.slice(min(most, int((0.5 if alone else 0.15) * total)))
         explore(
             self.loop, self.environments, self.archive, first,
             merit=by_value, batch=CANDIDATES, rng=self.rng,
@@ -305,6 +318,7 @@ class _Search:
                 break
             level = choice.value - 1e-3 * self.scale
             share = max(self.limits.left // 4, min(self.limits.left, 256))
+            share = min(share, ATTACK)
             found = attack(
                 self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
                 batch=self.batch, seed=self.seed + 7919 * number,
@@ -316,7 +330,7 @@ class _Search:
             self.attacked.append(choice._replace(value=worst))
             if not found.violating.any():
                 # What a handful of simulations does not find says nothing.
-                thorough = len(found.rho) >= max(32, self.limits.most // 20)
+                thorough = len(found.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
                 self.stopped = "converged" if thorough else self.limits.ended
                 return
             self.extend(found.chosen(ADDED))
@@ -481,7 +495,7 @@ def feature_loop(
 def attacker(problem: Problem, search: Any, loop: Any) -> Search:
     """The search over the environment, if it can work there.
 
-    **Raises:** `ValueError` for one that needs gradients where there are none.
+    **Raises:** `ValueError` for one that needs gradients where there are none, or of clauses.
     """
     if isinstance(search, str):
         search = searches.named(search)
@@ -493,6 +507,10 @@ def attacker(problem: Problem, search: Any, loop: Any) -> Search:
     if not isinstance(checked, Search):
         raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
     checked.check(cube_of(loop.environment))
-    if checked.wants_gradient and not loop.differentiable:
-        raise ValueError(f"search {checked!r} needs gradients, which are not to be had here")
+    clauses = bool(getattr(checked, "wants_clauses", False))
+    if clauses or (checked.wants_gradient and not loop.differentiable):
+        raise ValueError(
+            f"search {checked!r} needs gradients that an attack does not have; use one that does "
+            "not, such as 'cross_entropy': its worst environments are followed downhill anyway"
+        )
     return checked
