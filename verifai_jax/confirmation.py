@@ -32,6 +32,8 @@ SINGLE = "quarter_step_float32"
 AMPLIFIED = 4.0
 """A row must fail by so many times what rounding has moved it: a chaotic system turns roundings
 into any of its outcomes, and two or three programs may agree by chance."""
+MOST = 256
+"""Rows that are examined whatever comes: a row costs as much as 15 simulations at the run's step."""
 SAFE = 10.0
 """Rows are left out only if so many times farther from zero than replays have moved any row,"""
 BLOCK = 64
@@ -101,7 +103,7 @@ class Confirmer:
         seed: int = 0,
         *,
         simulator: Any = None,
-        most: int = 1000,
+        most: int = MOST,
     ) -> None:
         if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
             raise ValueError(f"most must be a positive integer; got {most!r}")

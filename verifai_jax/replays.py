@@ -35,7 +35,7 @@ from verifai_jax.systems.simulations import Batched
 from verifai_jax.trace import Status
 from verifai_jax.waveform import Waveform
 
-FEW = 8
+FEW = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
 ROUNDING = 2.0**-23
 IMPL = "threefry2x32"  # As of the keys of a run.

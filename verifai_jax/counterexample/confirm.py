@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.confirmation import IN_WORDS, VERDICTS, Checked, Confirmer
+from verifai_jax.confirmation import IN_WORDS, MOST, VERDICTS, Checked, Confirmer
 from verifai_jax.errors import suggests_options
 from verifai_jax.run import Run
 
@@ -124,7 +124,7 @@ def confirm(
     row: "int | pd.Series | Mapping[str, Any] | None" = None,
     *,
     simulator: Any = None,
-    most: int = 1000,
+    most: int = MOST,
 ) -> Any:
     """Replay counterexamples more finely than they were found, and say which are real.
 
