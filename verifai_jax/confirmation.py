@@ -33,9 +33,9 @@ AMPLIFIED = 4.0
 """A row must fail by so many times what rounding has moved it: a chaotic system turns roundings
 into any of its outcomes, and two or three programs may agree by chance."""
 MOST = 256
-"""Rows that are examined whatever comes: a row costs as much as 15 simulations at the run's step."""
+"""Rows that are examined whatever comes; each costs as much as 15 simulations of the run,"""
 SAFE = 10.0
-"""Rows are left out only if so many times farther from zero than replays have moved any row,"""
+"""Others are left out only if so many times farther from zero than replays have moved any row,"""
 BLOCK = 64
 """and that is looked at after so many rows."""
 
