@@ -146,7 +146,8 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
     # A simulation without a verdict, or one that the constraint refuses, says nothing.
     rho[~np.isfinite(rho)] = np.nan
     spread = np.nanmax(np.abs(rho), initial=0.0)
-    judge.temperature = max(0.02 * float(spread), 1e-6)
+    # Near the hard robustness: the slope is told as a number.
+    judge.temperature = max(0.002 * float(spread), 1e-6)
     linear = judge.linear(u[None])[0]
     slope = np.full(len(u), np.nan) if linear is None else linear.slope
     if judge.note:
