@@ -133,7 +133,7 @@ def test_a_black_box():
         return vj.Trace({"x": x, "u": features["k"] * x}, dt=0.1)
 
     problem = dataclasses.replace(first_order, system=vj.blackbox(simulate))
-    result = repair(problem, ["k"], 1200, held_out=100)
+    result = repair(problem, ["k"], 1200, search="halton", held_out=100)
     assert result.repaired
     assert BOUNDARY <= result.parameters["k"] <= 1.15 * BOUNDARY
 
@@ -184,11 +184,12 @@ def test_a_simulation_without_a_verdict_is_no_repair():
         "always x >= 0",
         nominal={"k": 0.2, "e": 0.5},
     )
-    result = repair(problem, ["k"], 600, gradient=False, held_out=50)
+    result = repair(problem, ["k"], 600, search="halton", gradient=False, held_out=50)
     assert not result.repaired
     assert result.parameters == {"k": 0.2}
     assert "gave no verdict" in str(result)
-    started = repair(problem, ["k"], 600, nominal={"k": 0.8}, gradient=False, held_out=50)
+    options = {"search": "halton", "gradient": False, "held_out": 50}
+    started = repair(problem, ["k"], 600, nominal={"k": 0.8}, **options)
     assert started.stopped == "no verdict"
     assert "none of 50 held-out environments gave a verdict" in str(started)
 
@@ -243,7 +244,8 @@ def test_arrays_must_be_real():
 
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "2500"]
-    options = ["--no-gradient", "--held-out", "100", "--out", str(tmp_path / "rounds.png")]
+    options = ["--no-gradient", "--search", "halton", "--held-out", "100"]
+    options += ["--out", str(tmp_path / "rounds.png")]
     shown = CliRunner().invoke(command, [*arguments, *options, "--nominal", "k=0.6"])
     assert shown.exit_code == 0, shown.output
     assert "repair of first_order: k 0.6 -> " in shown.output

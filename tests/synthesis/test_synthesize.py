@@ -157,7 +157,7 @@ def test_a_black_box_with_a_choice_and_simulations_that_raise():
         vj.blackbox(black_box),
         "always (abs(x) <= 1 & abs(u) <= 1.8)",
     )
-    result = synthesize(problem, ["gain", "direction"], 2000, held_out=100)
+    result = synthesize(problem, ["gain", "direction"], 2000, search="halton", held_out=100)
     assert result.parameters["direction"] == "back"
     assert margin_of(result.parameters["gain"]) == pytest.approx(BEST, abs=0.05)
     assert result.without_verdict > 0
@@ -182,7 +182,7 @@ def test_exactly_zero_is_decided_by_the_comparator():
 
     for formula, holds in (("always x >= 0", True), ("always x > 0", False)):
         problem = vj.Problem("zero", {"k": vj.Box(0, 1), "e": vj.Box(0, 1)}, system, formula)
-        result = synthesize(problem, ["k"], 300, gradient=False, held_out=50)
+        result = synthesize(problem, ["k"], 300, search="halton", gradient=False, held_out=50)
         assert result.holds is holds
         assert result.held_out.failures == (0 if holds else 50)
 
@@ -262,7 +262,8 @@ def test_a_fixed_feature_is_no_parameter():
 
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "1500"]
-    options = ["--no-gradient", "--held-out", "100", "--out", str(tmp_path / "found.csv")]
+    options = ["--no-gradient", "--search", "halton", "--held-out", "100"]
+    options += ["--out", str(tmp_path / "found.csv")]
     shown = CliRunner().invoke(command, [*arguments, *options])
     assert shown.exit_code == 0, shown.output
     assert "0 of 100 held-out environments fail" in shown.output

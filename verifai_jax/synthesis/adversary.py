@@ -17,6 +17,8 @@ from verifai_jax.synthesis.limits import Limits
 from verifai_jax.synthesis.parametric import Pairs, Parametric
 
 MOST_FOLLOWED = 4
+DESCENT = 4
+"""Steps of a descent at most."""
 MOST_DIFFERENCES = 12
 """Coordinates up to which slopes are taken from differences where there are no gradients,"""
 GAP = 0.01
@@ -69,11 +71,16 @@ def attack(
     - `scale`: size of ordinary robustnesses, which the temperature of gradients goes by.
     """
     assert loop.environment is not None
+    free = np.sum(np.array(loop.environment.levels) == 0)
+    follows = free > 0 and (loop.differentiable or free <= MOST_DIFFERENCES)
+    each = 1 if loop.differentiable else 1 + int(free)
+    kept = DESCENT * MOST_FOLLOWED * (each + len(STEPS)) if follows else 0
+    searching = limits.slice(limits.left - min(kept, limits.left // 3))
     proposals = Proposals(search, loop.environment, batch, jax.random.key(seed))
     seen: list[tuple[np.ndarray, Pairs]] = []
     found = 0
-    while not limits.over and not proposals.exhausted:
-        points = np.asarray(proposals.next(min(batch, limits.left)))
+    while not searching.over and not proposals.exhausted:
+        points = np.asarray(proposals.next(min(batch, searching.left)))
         if not len(points):
             break
         warm = float(proposals.temperature) if search.wants_gradient else None
@@ -89,8 +96,7 @@ def attack(
         if found >= enough:
             break
     result = _collected(seen, level, loop)
-    free = np.sum(np.array(loop.environment.levels) == 0)
-    if len(result.rho) and (loop.differentiable or 0 < free <= MOST_DIFFERENCES):
+    if len(result.rho) and follows:
         result = _followed(loop, theta, level, limits, result, scale)
     return result
 
@@ -104,7 +110,7 @@ def _followed(
     points = seen.environments[order[:MOST_FOLLOWED]]
     best = seen.rho[order[:MOST_FOLLOWED]]
     tried: list[tuple[np.ndarray, Pairs]] = []
-    for _ in range(4):
+    for _ in range(DESCENT):
         each = 1 if loop.differentiable else 1 + int(free.sum())
         if limits.left < len(points) * (each + len(STEPS)) or not free.any():
             break
