@@ -24,6 +24,10 @@ from verifai_jax.estimation.mixture import Mixture, fitted
 SHARE_OF_STAGE = 0.1
 """Of the simulations, for each stage that improves the proposal before it is frozen,"""
 MOST_STAGES = 5
+KEPT = 0.25
+"""Share of the proposal before in the next one, so that no stage can spoil it."""
+CHAINS_WORTH = 1.5
+"""Failures that the states of a chain of the splitting stand for."""
 ENOUGH = 2500
 """Effective failures, of which one stage more would not be worth its simulations."""
 DEFENSIVE = 0.1
@@ -135,13 +139,15 @@ def fit(
         density = np.stack([p.ratio(new) for p in proposals], axis=1) @ (counts / counts.sum())
         # Failures of the splitting and of the stages stand for the same distribution, each for as
         # much as they are worth; states of a chain are alike and worth less than they count.
-        worth = np.array([len(points) / 4, _worth(1 / density)])
+        worth = np.array([CHAINS_WORTH * len(np.unique(family)), _worth(1 / density)])
         worth[0] *= worth[0] / (worth[0] + worth[1])
+        inverse = 1 / density
         weight = np.concatenate(
-            [np.full(len(points), worth[0] / len(points)), worth[1] / density / sum(1 / density)]
+            [np.full(len(points), worth[0] / len(points)), worth[1] * inverse / inverse.sum()]
         )
         families = np.append(family, family.max() + 1 + np.arange(len(new)))
         proposal = fitted(np.concatenate([points, new]), weight, families, rng, defensive)
+        proposal = proposal.joined(proposals[-1], KEPT)
         if stage and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left

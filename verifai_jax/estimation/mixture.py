@@ -198,6 +198,22 @@ class Mixture:
         order = rng.permutation(n)
         return z[order], origin[order]
 
+    def joined(self, other: "Mixture", share: float) -> "Mixture":
+        """A mixture of both, with this share of the other."""
+        shares = np.concatenate(
+            [
+                [(1 - share) * self.shares[0] + share * other.shares[0]],
+                (1 - share) * self.shares[1:],
+                share * other.shares[1:],
+            ]
+        )
+        components = (*self.components, *other.components[1:])
+        kept = np.append(True, shares[1:] >= LEAST_SHARE)
+        shares[1:] *= (1 - shares[0]) / max(shares[1:][kept[1:]].sum(), 1e-12)
+        return Mixture(
+            tuple(c for c, keep in zip(components, kept, strict=True) if keep), shares[kept]
+        )
+
     def ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Proposal density over the prior's."""
         return np.exp(ratios(self.components, z)) @ self.shares

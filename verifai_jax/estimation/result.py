@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import verifai_jax.estimation.bounds as bounds
-from verifai_jax.figure import new_figure
 
 METHODS = {
     "monte_carlo": "Monte Carlo",
@@ -138,8 +137,11 @@ class Estimate:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"
 
-    def plot(self, figure: Any = None) -> Any:
-        """Levels of the splitting and weights of the failures, as far as there are any."""
+    def plot(self, path: Any = None) -> Any:
+        """The interval, the levels of the splitting and the weights, as far as there are any."""
         from verifai_jax.estimation.picture import draw
 
-        return draw(self, new_figure if figure is None else (lambda *_: figure))
+        figure = draw(self)
+        if path is not None:
+            figure.savefig(path)
+        return figure
