@@ -14,10 +14,7 @@ before and after are those of fresh samples, which the repair has never seen.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -40,144 +37,18 @@ from verifai_jax.synthesis.choosing import (
     judged,
     narrow,
 )
-from verifai_jax.synthesis.heldout import HeldOut, held_out
+from verifai_jax.synthesis.heldout import held_out
 from verifai_jax.synthesis.limits import Limits, timed
 from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
+from verifai_jax.synthesis.results import Repair, Round
 from verifai_jax.synthesis.steps import least_change, uphill
-from verifai_jax.synthesis.synthesize import ATTACK, attacker, check_numbers, feature_loop, short
+from verifai_jax.synthesis.synthesize import ATTACK, attacker, check_numbers, feature_loop
 
 ADDED = 8
 """Counterexamples that a round adds to the set at most."""
 CANDIDATES = 32
 SLACK = 0.05
 """How far above the margin a repair aims, in ordinary robustnesses: the next worst case is near."""
-
-
-class Round(NamedTuple):
-    """One turn: what the attack on the present parameters found.
-
-    - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
-    - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
-      arrays' own).
-    """
-
-    attacked: int
-    counterexamples: int
-    worst: float
-    change: float
-
-
-@dataclass(frozen=True, eq=False)
-class Repair:
-    """What `repair` returns.
-
-    **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
-    pytree; `rounds`: a `Round` each; `held_out_before`, `held_out_after`: how both did in the same
-    number of fresh samples, None without a check; `robustness`: the least seen with the repaired
-    parameters; `environments`: how many are in the set of counterexamples; `margin` that was
-    wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
-    found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
-    `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
-    `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
-    parameters are a pytree; `notes`; `seed`.
-    """
-
-    name: str
-    before: Any
-    parameters: Any
-    rounds: tuple[Round, ...]
-    held_out_before: HeldOut | None
-    held_out_after: HeldOut | None
-    robustness: float
-    environments: int
-    margin: float
-    change: float
-    found: bool
-    simulations: int
-    without_verdict: int
-    seconds: float
-    stopped: str
-    seed: int
-    arrays: bool = False
-    notes: tuple[str, ...] = ()
-    make: Callable[[], Problem] | None = field(default=None, repr=False)
-
-    @property
-    def repaired(self) -> bool:
-        """Whether neither the last attack nor the check found a failure, and the check was made."""
-        return self.found and self.held_out_after is not None and self.held_out_after.passed
-
-    @cached_property
-    def problem(self) -> Problem:
-        """The problem with the repaired parameters: ready to `falsify`."""
-        assert self.make is not None
-        return self.make()
-
-    def __str__(self) -> str:
-        lines = [f"repair of {self.name}: {self._changes()}"]
-        if self.found and not self.change:
-            lines.append("  the nominal parameters were kept: no attack found a failure")
-        elif self.found:
-            lines.append(
-                f"  an attack finds nothing any more; {self.environments} counterexamples are kept "
-                f"with robustness {self.robustness:.4g} at least"
-            )
-        elif self.stopped == "no parameters":
-            lines.append(
-                f"  NO REPAIR FOUND: the best parameters have robustness {self.robustness:.4g} "
-                f"over {self.environments} counterexamples; this does not prove that none has more"
-            )
-        else:
-            lines.append(
-                f"  NOT FINISHED ({self.stopped}): robustness {self.robustness:.4g} over "
-                f"{self.environments} counterexamples so far"
-            )
-        if self.held_out_before is not None:
-            lines.append(f"  before: {self.held_out_before.told()}")
-        if self.held_out_after is not None:
-            lines.append(f"  after:  {self.held_out_after.told()}")
-        else:
-            lines.append("  not checked in held-out environments")
-        if self.found and self.held_out_after is not None and not self.held_out_after.passed:
-            lines.append(
-                "  the check found what the attacks did not: try a larger budget or margin"
-            )
-        if _worse(self.held_out_before, self.held_out_after):
-            lines.append("  the change made it worse: keep the nominal parameters")
-        counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
-        lines.append(f"  counterexamples round by round: {counts}")
-        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
-        if self.without_verdict:
-            text += f"; {self.without_verdict} gave no verdict"
-        lines.append(f"  {text}")
-        lines += [f"  note: {note}" for note in self.notes]
-        return "\n".join(lines)
-
-    def _changes(self) -> str:
-        if self.arrays:
-            return f"arrays changed by {self.change:.4g} (Euclidean)"
-        pairs = []
-        for name, value in self.parameters.items():
-            same = short(self.before[name]) == short(value)
-            shown = "unchanged" if same else f"-> {short(value)}"
-            pairs.append(f"{name} {short(self.before[name])} {shown}")
-        return ", ".join(pairs)
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the worst robustness that each attack found; returns the figure."""
-        from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
-
-        figure = new_figure(figsize=(5.0, 3.0))
-        axes = figure.subplots()
-        worst = [turn.worst for turn in self.rounds]
-        colours = [FAILING if turn.counterexamples else SAFE for turn in self.rounds]
-        axes.plot(range(1, len(worst) + 1), worst, color=BOUND, linewidth=0.8)
-        axes.scatter(range(1, len(worst) + 1), worst, color=colours, zorder=3)
-        axes.axhline(self.margin, color=BOUND, linewidth=0.8, linestyle="--")
-        axes.set(xlabel="round", ylabel="worst robustness found", title=self.name)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        tidy(axes)
-        return show_or_save(figure, path)
 
 
 @suggests_options
@@ -277,10 +148,6 @@ def repair(
         notes=tuple(work.notes),
         make=lambda: loop.with_parameters(theta),
     )
-
-
-def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:
-    return before is not None and after is not None and after.failures > before.failures
 
 
 def _checked(

@@ -13,8 +13,6 @@ which they do worse than in any of the set, choose again. The result is checked 
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,9 +37,10 @@ from verifai_jax.synthesis.choosing import (
     narrow,
     scale_of,
 )
-from verifai_jax.synthesis.heldout import HeldOut, drawn, held_out
+from verifai_jax.synthesis.heldout import drawn, held_out
 from verifai_jax.synthesis.limits import Limits, timed
-from verifai_jax.synthesis.parametric import FeatureParameters, held, rows_of
+from verifai_jax.synthesis.parametric import FeatureParameters, rows_of
+from verifai_jax.synthesis.results import Synthesis
 from verifai_jax.synthesis.steps import uphill
 
 if TYPE_CHECKING:
@@ -57,105 +56,6 @@ ATTACK = 20_000
 """Simulations of an attack at most, however large the budget."""
 EXPLORED = 20_000
 """Simulations of the first look at the parameters at most, where there is no environment."""
-
-
-@dataclass(frozen=True, eq=False)
-class Synthesis:
-    """What `synthesize` returns.
-
-    **Fields:** `parameters`: the best found, by name; `robustness`: the least that was seen with
-    them, over all `environments` of the set and all attacks (minus infinity without a verdict);
-    `margin` that was wanted; `candidates`: a table of the best parameters with their `rho` over
-    that many `environments`, all over the same set; `environments`: a table of the set, with the
-    `rho` of the best parameters; `held_out`: how they did in fresh samples, None without a check;
-    `attacks`: environments that were tried against the best parameters; `converged`: whether the
-    last attack found no environment worse than those of the set; `simulations` (without
-    those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
-    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`.
-    """
-
-    problem: Problem = field(repr=False)
-    parameters: dict[str, Any]
-    robustness: float
-    margin: float
-    candidates: "pd.DataFrame" = field(repr=False)
-    environments: "pd.DataFrame" = field(repr=False)
-    held_out: HeldOut | None
-    attacks: int
-    converged: bool
-    simulations: int
-    without_verdict: int
-    seconds: float
-    stopped: str
-    seed: int
-
-    @property
-    def holds(self) -> bool:
-        """Whether the formula kept its margin in every simulation with the best parameters."""
-        kept = self.robustness >= self.margin
-        return kept and (self.held_out is None or self.held_out.passed)
-
-    @cached_property
-    def chosen(self) -> Problem:
-        """The problem with the parameters held at their values: ready to `falsify`."""
-        return held(self.problem, self.parameters)
-
-    @property
-    def robust(self) -> "pd.DataFrame":
-        """The candidates that keep the margin over the whole set."""
-        return self.candidates.loc[self.candidates["rho"] >= self.margin]
-
-    def __str__(self) -> str:
-        shown = ", ".join(f"{name} = {short(value)}" for name, value in self.parameters.items())
-        wanted = f" by the margin of {self.margin:g}" if self.margin else ""
-        lines = [f"synthesis for {self.problem.name}: {shown}"]
-        around = self.environments.shape[1] > 1
-        if self.robustness == -np.inf:
-            lines.append("  no simulation with any parameters had a verdict")
-        elif self.holds:
-            where = f", the least over {self.attacks} simulated environments" if around else ""
-            lines.append(f"  holds{wanted} with robustness {self.robustness:.4g}{where}")
-        elif self.robustness >= self.margin:
-            lines.append(f"  no failure was found before the check: {self.robustness:.4g} at least")
-        else:
-            missing = self.margin - self.robustness
-            lines.append(
-                f"  NONE FOUND that holds{wanted}: the best so far has robustness "
-                f"{self.robustness:.4g}, {missing:.4g} too little"
-            )
-        if self.held_out is not None:
-            lines.append(f"  check: {self.held_out.told('environments' if around else 'repeats')}")
-        elif around:
-            lines.append("  not checked in held-out environments")
-        found, of = len(self.robust), len(self.candidates)
-        if around:
-            over = f"over {len(self.environments)} environments"
-            lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
-        else:
-            lines.append(f"  {found} of the points simulated keep it (.robust)")
-        lines.append(f"  {self._told()}")
-        return "\n".join(lines)
-
-    def _told(self) -> str:
-        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
-        if self.without_verdict:
-            text += f"; {self.without_verdict} gave no verdict"
-        if self.environments.shape[1] > 1:
-            text += "; an attack that finds nothing proves nothing, the check above is the evidence"
-        return text
-
-
-def short(value: Any) -> str:
-    """A parameter's value, for people."""
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, int | str | bool):
-        return str(value)
-    import jax
-
-    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(value)]).tolist()
-    shown = ", ".join(f"{number:.4g}" for number in numbers[:6])
-    return f"[{shown}{', ...' * (len(numbers) > 6)}]"
 
 
 @suggests_options

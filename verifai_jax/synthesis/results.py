@@ -1,0 +1,246 @@
+"""What a synthesis and a repair return: parameters, and how sure it is that they hold."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from verifai_jax.problem import Problem
+from verifai_jax.synthesis.heldout import HeldOut
+from verifai_jax.synthesis.parametric import held
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """What `synthesize` returns.
+
+    **Fields:** `parameters`: the best found, by name; `robustness`: the least that was seen with
+    them, over all `environments` of the set and all attacks (minus infinity without a verdict);
+    `margin` that was wanted; `candidates`: a table of the best parameters with their `rho` over
+    that many `environments`, all over the same set; `environments`: a table of the set, with the
+    `rho` of the best parameters; `held_out`: how they did in fresh samples, None without a check;
+    `attacks`: environments that were tried against the best parameters; `converged`: whether the
+    last attack found no environment worse than those of the set; `simulations` (without
+    those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
+    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`.
+    """
+
+    problem: Problem = field(repr=False)
+    parameters: dict[str, Any]
+    robustness: float
+    margin: float
+    candidates: "pd.DataFrame" = field(repr=False)
+    environments: "pd.DataFrame" = field(repr=False)
+    held_out: HeldOut | None
+    attacks: int
+    converged: bool
+    simulations: int
+    without_verdict: int
+    seconds: float
+    stopped: str
+    seed: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the formula kept its margin in every simulation with the best parameters."""
+        kept = self.robustness >= self.margin
+        return kept and (self.held_out is None or self.held_out.passed)
+
+    @cached_property
+    def chosen(self) -> Problem:
+        """The problem with the parameters held at their values: ready to `falsify`."""
+        return held(self.problem, self.parameters)
+
+    @property
+    def robust(self) -> "pd.DataFrame":
+        """The candidates that keep the margin over the whole set."""
+        return self.candidates.loc[self.candidates["rho"] >= self.margin]
+
+    def __str__(self) -> str:
+        shown = ", ".join(f"{name} = {short(value)}" for name, value in self.parameters.items())
+        wanted = f" by the margin of {self.margin:g}" if self.margin else ""
+        lines = [f"synthesis for {self.problem.name}: {shown}"]
+        around = self.environments.shape[1] > 1
+        if self.robustness == -np.inf:
+            lines.append("  no simulation with any parameters had a verdict")
+        elif self.holds:
+            where = f", the least over {self.attacks} simulated environments" if around else ""
+            lines.append(f"  holds{wanted} with robustness {self.robustness:.4g}{where}")
+        elif self.robustness >= self.margin:
+            lines.append(f"  no failure was found before the check: {self.robustness:.4g} at least")
+        else:
+            missing = self.margin - self.robustness
+            lines.append(
+                f"  NONE FOUND that holds{wanted}: the best so far has robustness "
+                f"{self.robustness:.4g}, {missing:.4g} too little"
+            )
+        if self.held_out is not None:
+            lines.append(f"  check: {self.held_out.told('environments' if around else 'repeats')}")
+        elif around:
+            lines.append("  not checked in held-out environments")
+        found, of = len(self.robust), len(self.candidates)
+        if around:
+            over = f"over {len(self.environments)} environments"
+            lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
+        else:
+            lines.append(f"  {found} of the points simulated keep it (.robust)")
+        lines.append(f"  {self._told()}")
+        return "\n".join(lines)
+
+    def _told(self) -> str:
+        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        if self.without_verdict:
+            text += f"; {self.without_verdict} gave no verdict"
+        if self.environments.shape[1] > 1:
+            text += "; an attack that finds nothing proves nothing, the check above is the evidence"
+        return text
+
+
+def short(value: Any) -> str:
+    """A parameter's value, for people."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, int | str | bool):
+        return str(value)
+    import jax
+
+    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(value)]).tolist()
+    shown = ", ".join(f"{number:.4g}" for number in numbers[:6])
+    return f"[{shown}{', ...' * (len(numbers) > 6)}]"
+
+
+class Round(NamedTuple):
+    """One turn: what the attack on the present parameters found.
+
+    - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
+    - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
+      arrays' own).
+    """
+
+    attacked: int
+    counterexamples: int
+    worst: float
+    change: float
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """What `repair` returns.
+
+    **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
+    pytree; `rounds`: a `Round` each; `held_out_before`, `held_out_after`: how both did in the same
+    number of fresh samples, None without a check; `robustness`: the least seen with the repaired
+    parameters; `environments`: how many are in the set of counterexamples; `margin` that was
+    wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
+    found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
+    `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
+    `"max_seconds"`, `"rounds"`, `"no verdict"` or `"interrupted"`; `arrays`: whether the
+    parameters are a pytree; `notes`; `seed`.
+    """
+
+    name: str
+    before: Any
+    parameters: Any
+    rounds: tuple[Round, ...]
+    held_out_before: HeldOut | None
+    held_out_after: HeldOut | None
+    robustness: float
+    environments: int
+    margin: float
+    change: float
+    found: bool
+    simulations: int
+    without_verdict: int
+    seconds: float
+    stopped: str
+    seed: int
+    arrays: bool = False
+    notes: tuple[str, ...] = ()
+    make: Callable[[], Problem] | None = field(default=None, repr=False)
+
+    @property
+    def repaired(self) -> bool:
+        """Whether neither the last attack nor the check found a failure, and the check was made."""
+        return self.found and self.held_out_after is not None and self.held_out_after.passed
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The problem with the repaired parameters: ready to `falsify`."""
+        assert self.make is not None
+        return self.make()
+
+    def __str__(self) -> str:
+        lines = [f"repair of {self.name}: {self._changes()}"]
+        if self.found and not self.change:
+            lines.append("  the nominal parameters were kept: no attack found a failure")
+        elif self.found:
+            lines.append(
+                f"  an attack finds nothing any more; {self.environments} counterexamples are kept "
+                f"with robustness {self.robustness:.4g} at least"
+            )
+        elif self.stopped == "no parameters":
+            lines.append(
+                f"  NO REPAIR FOUND: the best parameters have robustness {self.robustness:.4g} "
+                f"over {self.environments} counterexamples; this does not prove that none has more"
+            )
+        else:
+            lines.append(
+                f"  NOT FINISHED ({self.stopped}): robustness {self.robustness:.4g} over "
+                f"{self.environments} counterexamples so far"
+            )
+        if self.held_out_before is not None:
+            lines.append(f"  before: {self.held_out_before.told()}")
+        if self.held_out_after is not None:
+            lines.append(f"  after:  {self.held_out_after.told()}")
+        else:
+            lines.append("  not checked in held-out environments")
+        if self.found and self.held_out_after is not None and not self.held_out_after.passed:
+            lines.append(
+                "  the check found what the attacks did not: try a larger budget or margin"
+            )
+        if _worse(self.held_out_before, self.held_out_after):
+            lines.append("  the change made it worse: keep the nominal parameters")
+        counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
+        lines.append(f"  counterexamples round by round: {counts}")
+        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        if self.without_verdict:
+            text += f"; {self.without_verdict} gave no verdict"
+        lines.append(f"  {text}")
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    def _changes(self) -> str:
+        if self.arrays:
+            return f"arrays changed by {self.change:.4g} (Euclidean)"
+        pairs = []
+        for name, value in self.parameters.items():
+            same = short(self.before[name]) == short(value)
+            shown = "unchanged" if same else f"-> {short(value)}"
+            pairs.append(f"{name} {short(self.before[name])} {shown}")
+        return ", ".join(pairs)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the worst robustness that each attack found; returns the figure."""
+        from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+        figure = new_figure(figsize=(5.0, 3.0))
+        axes = figure.subplots()
+        worst = [turn.worst for turn in self.rounds]
+        colours = [FAILING if turn.counterexamples else SAFE for turn in self.rounds]
+        axes.plot(range(1, len(worst) + 1), worst, color=BOUND, linewidth=0.8)
+        axes.scatter(range(1, len(worst) + 1), worst, color=colours, zorder=3)
+        axes.axhline(self.margin, color=BOUND, linewidth=0.8, linestyle="--")
+        axes.set(xlabel="round", ylabel="worst robustness found", title=self.name)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        tidy(axes)
+        return show_or_save(figure, path)
+
+
+def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:
+    return before is not None and after is not None and after.failures > before.failures
