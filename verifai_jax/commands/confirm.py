@@ -29,4 +29,3 @@ def confirm(
     )
     if fail and not sure:
         raise SystemExit(1)
-
