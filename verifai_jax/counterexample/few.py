@@ -220,7 +220,12 @@ def pushed(
 def fewest(judge: Judge, starts: Points, rng: np.random.Generator) -> Points:
     """Failing points from these, which fail too: the fewest departures first, then the nearest."""
     nominal = judge.nominal
-    pool = [reduced(judge, u) for u in starts]
+    enough = judge.left // 3
+    pool = []
+    for u in starts:
+        # The first at any rate; the others as long as enough is left to go on with.
+        if not pool or judge.left > enough:
+            pool.append(reduced(judge, u))
     while judge.left > 0:
         u = best(judge, np.array(pool))
         count = int(nominal.count(u[None])[0])

@@ -249,7 +249,8 @@ class _Shrinking:
         # Half for what decides where to go, so that some is left to go there.
         judge.limit = judge.budget // 2
         if self.by == "few":
-            fewest(judge, failures[:4], self.rng)
+            own = points[:1][judge(points[:1])[1]]
+            fewest(judge, self.starts(own, alike=False), self.rng)
         else:
             grown(judge, failures[:1], 1)
             reduced(judge, failures[0])
@@ -270,14 +271,19 @@ class _Shrinking:
         reduced(judge, self.failures()[0])
         self.note()
 
-    def starts(self) -> Float[np.ndarray, "n d"]:
-        """The least failures in different directions, or on different features."""
+    def starts(
+        self, first: Float[np.ndarray, "m d"] | None = None, *, alike: bool = True
+    ) -> Float[np.ndarray, "n d"]:
+        """The least failures in different directions, after those of `first`.
+
+        - `alike`: only with as few departures as the least one.
+        """
         failures, nominal = self.failures(), self.judge.nominal
-        count = nominal.count(failures)
-        if self.by == "few":
+        if self.by == "few" and alike:
+            count = nominal.count(failures)
             failures = failures[count == count[0]]
-        chosen = [failures[0]]
-        for u in failures[1:]:
+        chosen = [] if first is None else list(first)
+        for u in failures:
             if len(chosen) >= FOLLOWED:
                 break
             v = u - nominal.u
