@@ -142,6 +142,11 @@ def _result(
             f"{judge.no_verdict:,} simulations near the failures gave no verdict; should they be "
             "failures, the probability is higher"
         )
+    if judge.no_verdict == judge.simulations > 0:
+        notes.append(
+            "no simulation gave a verdict at all; falsify(problem, 'uniform', 10).table.all has "
+            "their status and what they raised"
+        )
     if judge.ended:
         notes.append(f"ended early: {judge.ended}")
     if answer.method in ("importance", "splitting"):

@@ -573,5 +573,6 @@ def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarr
 
     mirrored = low > 0
     a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
-    z = ndtri(np.clip(ndtr(a) + uniform * (ndtr(b) - ndtr(a)), 1e-300, 1 - 1e-16))
+    rank = np.where(mirrored, 1 - uniform, uniform)  # It must still grow with the result.
+    z = ndtri(np.clip(ndtr(a) + rank * (ndtr(b) - ndtr(a)), 1e-300, 1 - 1e-16))
     return np.where(mirrored, -z, z)

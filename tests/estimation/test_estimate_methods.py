@@ -1,0 +1,151 @@
+"""The methods on closed forms, without a simulation: right, and as sure as they say."""
+
+import numpy as np
+import pytest
+from closed_forms import CASES, half_space, judged, normal
+
+from verifai_jax.estimation.estimate import _one_thread
+from verifai_jax.estimation.methods import (
+    SHARE_OF_LEVEL,
+    SHARE_OF_REPLICATE,
+    Plan,
+    automatic,
+    by_counting,
+    by_splitting,
+    chains_for,
+)
+
+
+def answered(robustness, dim, budget, seed=0, method=automatic, share=SHARE_OF_LEVEL, **options):
+    judge = judged(robustness, dim, budget, **options)
+    plan = Plan(0.95, chains_for(budget, share), np.zeros(dim, bool))
+    with _one_thread():
+        answer = method(judge, np.random.default_rng(seed), plan)
+    assert judge.simulations <= budget
+    return answer, judge
+
+
+@pytest.mark.parametrize(
+    ("name", "dim"),
+    [("half-space", 2), ("sphere", 10), ("uneven modes", 5)],
+)
+def test_one_in_a_million_within_a_factor_of_1_3(name, dim):
+    answer, _ = answered(CASES[name](dim, 1e-6), dim, 50_000)
+    assert answer.method == "importance"
+    assert 1e-6 / 1.3 < answer.probability < 1.3e-6
+    assert answer.low / 1.05 < 1e-6 < answer.high * 1.05
+    assert answer.effective > 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    ("dim", "p", "budget"),
+    [
+        (2, 1e-2, 50_000),
+        (2, 1e-7, 50_000),
+        (5, 1e-6, 50_000),
+        (20, 1e-4, 20_000),
+        (50, 1e-6, 50_000),
+    ],
+)
+def test_intervals_cover_and_estimates_are_within_a_factor(name, dim, p, budget):
+    robustness = CASES[name](dim, p)
+    seeds = 20
+    covered, off = 0, []
+    for seed in range(seeds):
+        answer, _ = answered(robustness, dim, budget, seed)
+        covered += answer.low <= p <= answer.high
+        off.append(abs(np.log(answer.probability / p)))
+    assert covered >= 17
+    assert max(off) < np.log(1.3)
+
+
+def test_frequent_failures_are_counted_in_fresh_samples():
+    answer, judge = answered(half_space(3, 0.05), 3, 20_000)
+    assert answer.method == "monte_carlo"
+    assert answer.prior.simulations < judge.simulations == 20_000
+    assert answer.low < 0.05 < answer.high
+
+
+def test_splitting_alone_gives_the_order_of_magnitude_from_several_runs():
+    answer, _ = answered(
+        half_space(5, 1e-5), 5, 50_000, method=by_splitting, share=SHARE_OF_REPLICATE
+    )
+    assert answer.method == "splitting"
+    assert answer.diagnostics["runs"] >= 3
+    assert answer.low < 1e-5 < answer.high
+    assert 5e-6 < answer.probability < 2e-5
+
+
+def test_what_cannot_fail_gets_a_bound_and_no_estimate():
+    answer, judge = answered(lambda u: 1.0 + u[:, 0], 2, 5_000)
+    assert answer.probability is None
+    assert judge.failures == 0
+    assert any("no failure" in note for note in answer.notes)
+    assert answer.high == pytest.approx(1 - 0.05 ** (1 / answer.prior.simulations), rel=1e-6)
+
+
+def test_boolean_robustness_has_no_slope_and_is_counted():
+    answer, _ = answered(lambda u: np.where(u[:, 0] < 3e-4, -1.0, 1.0), 1, 30_000, seed=1)
+    assert answer.probability is None or answer.low < 3e-4 < answer.high
+    assert answer.high > 3e-4
+
+
+def test_discrete_coordinates_are_cells_of_the_cube():
+    # One of 10 cells, and in it a tail: p = 1e-5.
+    def robustness(u):
+        return np.where(u[:, 0] * 10 >= 9, 3.719 - normal(u)[:, 1], 6.0 - normal(u)[:, 1])
+
+    answer, _ = answered(robustness, 2, 50_000)
+    assert answer.probability == pytest.approx(1e-5, rel=0.1)
+
+
+def test_a_constraint_makes_the_prior_conditional():
+    # Given that the first coordinate lies in its upper quarter, failing is four times as probable.
+    answer, judge = answered(half_space_first(1e-5), 2, 30_000, accepts=lambda u: u[:, 0] > 0.75)
+    assert answer.probability == pytest.approx(4e-5, rel=0.1)
+    assert answer.low < 4e-5 < answer.high
+    assert judge.simulations > 25_000  # What is refused is not simulated.
+
+
+def half_space_first(p):
+    from scipy.stats import norm
+
+    return lambda u: norm.isf(p) - normal(u)[:, 0]
+
+
+def test_simulations_without_verdict_widen_the_upper_end():
+    def robustness(u):
+        return np.where(u[:, 1] < 0.02, np.nan, 0.05 - u[:, 0] + 0.8)
+
+    answer, judge = answered(robustness, 2, 20_000, method=by_counting)
+    assert judge.no_verdict > 300
+    assert answer.probability == pytest.approx(0.15 * 0.98, rel=0.05)
+    assert answer.high > 0.15 * 0.98 + 0.02
+
+
+def test_the_same_seed_gives_the_same():
+    one, other = (answered(half_space(4, 1e-4), 4, 10_000, seed=3)[0] for _ in range(2))
+    assert one.probability == other.probability
+    assert (one.low, one.high) == (other.low, other.high)
+
+
+def test_interruption_keeps_what_is_finished():
+    robustness, calls = half_space(2, 1e-2), []
+
+    def evaluate(u):
+        calls.append(len(u))
+        if len(calls) > 3:
+            raise KeyboardInterrupt
+        rho = robustness(u)
+        return rho, rho < 0, np.ones(len(u), bool)
+
+    from verifai_jax.estimation.judging import Judge
+
+    judge = Judge(evaluate, 2, 50_000, batch=1000)
+    plan = Plan(0.95, 32, np.zeros(2, bool))
+    answer = by_counting(judge, np.random.default_rng(0), plan)
+    assert judge.ended == "interrupted"
+    assert answer.prior.simulations == 3000
+    assert answer.low < 0.01 < answer.high
