@@ -28,7 +28,7 @@ def draw(found: "Estimate") -> Any:
 
 def _interval(axes: Any, found: "Estimate") -> None:
     sure = f"{100 * found.confidence:g} %"
-    rows = [("bound by the prior alone", None, 0.0, found.upper_bound, BOUND)]
+    rows: list[Any] = [("bound by the prior alone", None, 0.0, found.upper_bound, BOUND)]
     if found.probability is not None:
         rows.append(("estimate", found.probability, found.low, found.high, FAILING))
     least = min([found.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
