@@ -1,0 +1,159 @@
+"""How right, and how sure, `estimate` is: closed forms through real problems, and AT6b.
+
+python benchmarks/estimation.py                     # everything, 20 seeds: about 20 minutes
+python benchmarks/estimation.py --seeds 100 --dims 2 10 --levels 1e-6
+python benchmarks/estimation.py --only at6b --truth 1000000
+
+For each problem, dimension and probability: how many of the 95 % intervals hold the truth, the
+standard deviation of estimate over truth, the worst factor, and the methods taken.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import chi2, ncx2, norm
+
+import verifai_jax as vj
+from verifai_jax.estimation import estimate
+
+# The probability that AT6b fails, by Monte Carlo: failures and simulations of `--truth`.
+AT6B = (306, 401_408)
+
+
+def features(dim: int) -> dict[str, vj.Normal]:
+    """Standard normal features."""
+    return {f"x{i}": vj.Normal(0.0, 1.0) for i in range(dim)}
+
+
+def problem(name: str, space: dict, robustness: Callable) -> vj.Problem:
+    """A system of one sample whose only signal is the robustness."""
+
+    def system(features, key):
+        x = jnp.stack([features[f"x{i}"] for i in range(len(space))])
+        return vj.Trace({"margin": robustness(x)[None]}, dt=1.0)
+
+    return vj.Problem(name, space, system, "margin >= 0")
+
+
+def half_space(dim: int, p: float) -> vj.Problem:
+    """One side of a plane in a random direction."""
+    a = np.random.default_rng(dim).standard_normal(dim)
+    a = jnp.asarray(a / np.linalg.norm(a), jnp.float32)
+    return problem("half-space", features(dim), lambda x: norm.isf(p) - a @ x)
+
+
+def sphere(dim: int, p: float) -> vj.Problem:
+    """Farther from the origin than r."""
+    r = math.sqrt(chi2.isf(p, dim))
+    return problem("sphere", features(dim), lambda x: r - jnp.linalg.norm(x))
+
+
+def ball(dim: int, p: float) -> vj.Problem:
+    """Nearer than r to a point two standard deviations out."""
+    centre, r = np.full(dim, 2 / math.sqrt(dim), np.float32), math.sqrt(ncx2.ppf(p, dim, 4.0))
+    return problem("ball", features(dim), lambda x: jnp.linalg.norm(x - centre) - r)
+
+
+def two_modes(dim: int, p: float) -> vj.Problem:
+    """Two opposite half-spaces, one four times as probable as the other."""
+    a = np.random.default_rng(dim).standard_normal(dim)
+    a = jnp.asarray(a / np.linalg.norm(a), jnp.float32)
+    near, far = norm.isf(0.8 * p), norm.isf(0.2 * p)
+    return problem("two modes", features(dim), lambda x: jnp.minimum(near - a @ x, far + a @ x))
+
+
+def corner(dim: int, p: float) -> vj.Problem:
+    """A corner of a box, cut off by a plane: a simplex of side (p dim!)^(1/dim)."""
+    side = (p * math.factorial(dim)) ** (1 / dim)
+    if side > 1:
+        raise ValueError("the simplex does not fit into the box")
+    space = {f"x{i}": vj.Box(0.0, 1.0) for i in range(dim)}
+    return problem("corner", space, lambda x: jnp.sum(x) - side)
+
+
+PROBLEMS = {
+    "half-space": half_space,
+    "sphere": sphere,
+    "ball": ball,
+    "two modes": two_modes,
+    "corner": corner,
+}
+
+
+def closed_form(name: str, dim: int, p: float, budget: int, seeds: int) -> None:
+    """One line of the table."""
+    try:
+        known = PROBLEMS[name](dim, p)
+    except ValueError:
+        return
+    started, covered, ratio, methods = time.perf_counter(), 0, [], set()
+    for seed in range(seeds):
+        found = estimate(known, budget=budget, seed=seed, progress=False)
+        covered += found.low <= p <= found.high
+        ratio.append((found.probability or math.nan) / p)
+        methods.add(found.method)
+    seconds = (time.perf_counter() - started) / seeds
+    line(name, dim, p, budget, covered, np.array(ratio), methods, seconds)
+
+
+def line(name, dim, p, budget, covered, ratio, methods, seconds) -> None:
+    """Print it."""
+    worst = np.exp(np.nanmax(np.abs(np.log(ratio))))
+    print(
+        f"| {name} | {dim} | {p:.3g} | {budget:,} | {covered}/{len(ratio)} | "
+        f"{np.nanmean(ratio):.3f} | {100 * np.nanstd(ratio):.1f} % | {worst:.2f} | "
+        f"{', '.join(sorted(map(str, methods)))} | {seconds:.1f} |",
+        flush=True,
+    )
+
+
+def at6b(seeds: int, truth: int | None) -> None:
+    """AT6b in 10 000 simulations against Monte Carlo."""
+    from specs.arch.automatic_transmission import at6b as transmission
+
+    failures, simulations = AT6B
+    if truth:
+        counted = estimate(transmission, "monte_carlo", truth, batch=2048, seed=12345)
+        failures, simulations = counted.prior_failures, counted.prior_simulations
+        print(f"\nAT6b by Monte Carlo: {failures} of {simulations:,}")
+    p = failures / simulations
+    started, covered, ratio, methods = time.perf_counter(), 0, [], set()
+    for seed in range(seeds):
+        found = estimate(transmission, budget=10_000, seed=seed, progress=False)
+        covered += found.low <= p <= found.high
+        ratio.append((found.probability or math.nan) / p)
+        methods.add(found.method)
+    ratio = np.array(ratio)
+    seconds = (time.perf_counter() - started) / seeds
+    line("AT6b", 12, p, 10_000, covered, ratio, methods, seconds)
+    within = int(np.sum(np.abs(ratio / np.median(ratio) - 1) <= 0.1))
+    print(f"\nAT6b: {within} of {seeds} within 10 % of their median {p * np.median(ratio):.3e}")
+
+
+def main() -> None:
+    """The table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--budget", type=int, default=50_000)
+    parser.add_argument("--dims", type=int, nargs="+", default=[2, 10, 50])
+    parser.add_argument("--levels", type=float, nargs="+", default=[1e-2, 1e-4, 1e-6, 1e-7])
+    parser.add_argument("--only", nargs="+", default=[*PROBLEMS, "at6b"])
+    parser.add_argument("--truth", type=int, help="Simulations of AT6b by Monte Carlo.")
+    options = parser.parse_args()
+    print("| problem | d | p | simulations | covered | mean | sd | worst | methods | s |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for name in options.only:
+        if name != "at6b":
+            for dim in options.dims:
+                for p in options.levels:
+                    closed_form(name, dim, p, options.budget, options.seeds)
+    if "at6b" in options.only:
+        at6b(options.seeds, options.truth)
+
+
+if __name__ == "__main__":
+    main()
