@@ -137,6 +137,15 @@ def test_another_nominal(edges):
     assert "the nominal features fail themselves" in str(already)
 
 
+def test_each_kind_by_itself():
+    problem = problem_of("sides", 2, lambda u: jnp.where(u[0] > 0.5, 0.8 - u[0], u[0] - 0.4))
+    run = vj.simulate(problem, [{"x0": 5.5, "x1": 5.0}, {"x0": -1.0, "x1": 0.0}], progress=False)
+    assert shrink(run, 0, budget=200).changed["x0"][1] == pytest.approx(1.2, rel=0.01)
+    there = shrink(run, 0, budget=200, stay=True)
+    assert there.changed["x0"][1] == pytest.approx(4.4, rel=0.01)
+    assert shrink(run, 1, budget=200, stay=True).changed["x0"][1] == pytest.approx(1.2, rel=0.01)
+
+
 def test_refusals(edges):
     safe = int(edges.table.safe.index[0])
     with pytest.raises(ValueError, match=rf"row {safe} is no counterexample: status ok, robustn"):

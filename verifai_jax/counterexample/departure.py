@@ -8,7 +8,7 @@ coordinate counts for itself, a control point of a signal too.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -25,10 +25,15 @@ from verifai_jax.search import Cube
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """The features of an ordinary day, as the point `u` `[d]` of the unit cube."""
+    """The features of an ordinary day, as the point `u` `[d]` of the unit cube.
+
+    `low` and `high` `[d]` are the ends of the coordinates that may be departed to.
+    """
 
     space: FeatureSpace
     u: Float[np.ndarray, " d"]
+    low: Float[np.ndarray, " d"] | float = 0.0
+    high: Float[np.ndarray, " d"] | float = 1.0
 
     @classmethod
     def of(cls, problem: Problem, nominal: Mapping[str, Any] | None = None) -> "Nominal":
@@ -49,6 +54,13 @@ class Nominal:
         # What a view of the space holds fixed is not said again.
         features = space.coerce({name: whole[name] for name in varied})
         return cls(space, np.asarray(jax.jit(space.flatten)(features), np.float32))
+
+    def on_the_side_of(self, u: Float[np.ndarray, " d"]) -> "Nominal":
+        """The same, and continuous coordinates depart only to where those of `u` do."""
+        free = (np.array(self.space.levels) > 0) | (u == self.u)
+        low = np.where(free | (u < self.u), 0.0, self.u)
+        high = np.where(free | (u > self.u), 1.0, self.u)
+        return replace(self, low=low, high=high)
 
     @cached_property
     def cube(self) -> Cube:
@@ -72,7 +84,7 @@ class Nominal:
 
     def settle(self, points: Any) -> Float[np.ndarray, "n d"]:
         """These points inside the cube, in the middles of cells, nominal where they mean it."""
-        u = np.clip(np.asarray(points, np.float64), 0.0, 1.0).astype(np.float32)
+        u = np.clip(np.asarray(points, np.float64), self.low, self.high).astype(np.float32)
         discrete = self.cube.discrete
         if len(discrete):
             cells = self.cells(u)

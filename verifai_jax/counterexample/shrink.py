@@ -131,6 +131,7 @@ def shrink(
     budget: int = 2000,
     seed: int = 0,
     others: bool = True,
+    stay: bool = False,
 ) -> Shrunk:
     """The least departure from the nominal features that still fails.
 
@@ -146,7 +147,9 @@ def shrink(
       signal and every component of a vector is a coordinate of its own.
     - `budget`: simulations at most; a gradient counts as one.
     - `seed`: of the random candidates.
-    - `others`: whether other counterexamples of the run may be taken where they are nearer.
+    - `others`: whether other counterexamples of the run are looked at too.
+    - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
+      that failures of several kinds are shrunk each by itself.
 
     All simulations have the random key of the row. The result was simulated alone and failed, in
     the precision of the run, and in float64 too unless the system draws random numbers or is a
@@ -172,11 +175,12 @@ def shrink(
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
             f"({told}); see what confirm says of it, and shrink another"
         )
+    u = np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))
+    start = at.settle(u[None])
+    if stay:
+        at = at.on_the_side_of(start[0])
     judge = Judge(problem, at, int(budget), run.precision)
     shrinking = _Shrinking(judge, by, np.random.default_rng(seed))
-    start = at.settle(
-        np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))[None]
-    )
     points = np.concatenate([start, other_failures(run, at, number, STARTS)]) if others else start
     notes = []
     try:

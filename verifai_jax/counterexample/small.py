@@ -123,6 +123,8 @@ def rays(track: Track) -> Float[np.ndarray, " n"]:
 def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Departures at, and on the way to, the nearest points of the linearised boundary."""
     u0 = judge.nominal.u.astype(np.float64)[places]
+    ends = np.zeros(len(track.u))
+    low, high = (ends + judge.nominal.low)[places], (ends + judge.nominal.high)[places]
     pieces = track.pieces[-1:] or fitted(judge, track, places)
     targets = []
     for some in (pieces, track.pieces[-6:]) if len(track.pieces) > 1 else (pieces,):
@@ -130,7 +132,7 @@ def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.n
         if not len(rows) or not rows.any():
             continue
         levels = np.array([p.slope[places] @ (p.point[places] - u0) - p.value for p in some])
-        found = least(rows, levels, -u0, 1 - u0)
+        found = least(rows, levels, low - u0, high - u0)
         if found is not None:
             targets.append(found)
     track.aimed = None
