@@ -27,6 +27,7 @@ from verifai_jax.estimation.methods import (
     by_importance,
     by_splitting,
     chains_for,
+    cut_off,
 )
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.estimation.simulated import Simulated
@@ -104,7 +105,12 @@ def estimate(
             told=bar.update,
         )
         plan = Plan(confidence, chains, simulated.clamped)
-        answer = _METHODS[method](judge, np.random.default_rng(seed), plan)
+        try:
+            answer = _METHODS[method](judge, np.random.default_rng(seed), plan)
+        except KeyboardInterrupt:
+            # Between simulations, while a proposal is fitted: the first level still counts.
+            judge.ended = "interrupted"
+            answer = cut_off(judge, plan)
     seconds = time.perf_counter() - started
     return _result(problem, choice.backend, answer, judge, plan, seed, precision, p0, seconds)
 

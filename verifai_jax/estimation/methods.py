@@ -104,7 +104,7 @@ def automatic(judge: Judge, rng: np.random.Generator, plan: Plan) -> Answer:
     """The method that suits what the first samples show."""
     first = _first_level(judge, rng, plan)
     if first is None:
-        return _cut_off(judge, Counts(judge.simulations, judge.failures, judge.no_verdict), plan)
+        return cut_off(judge, plan)
     counts = _counts(first)
     expected = counts.failures / counts.simulations * judge.left
     if counts.failures >= 10 and expected >= COUNTED**-2:
@@ -120,7 +120,7 @@ def by_importance(judge: Judge, rng: np.random.Generator, plan: Plan, first: Any
     """Splitting for a proposal, importance sampling for the estimate."""
     first = _first_level(judge, rng, plan) if first is None else first
     if first is None:
-        return _cut_off(judge, Counts(judge.simulations, judge.failures, judge.no_verdict), plan)
+        return cut_off(judge, plan)
     counts = _counts(first)
     climb = split(judge, rng, len(first[0]), plan.chains, first)
     if climb.stopped is not None:
@@ -261,8 +261,9 @@ def _not_reached(
     return answer
 
 
-def _cut_off(judge: Judge, counts: Counts, plan: Plan) -> Answer:
-    answer = _counted(counts, plan)
+def cut_off(judge: Judge, plan: Plan) -> Answer:
+    """What the samples of the prior say that were finished before an early end."""
+    answer = _counted(Counts(*judge.first), plan)
     answer.notes.insert(0, f"ended early ({judge.ended})")
     return answer
 
@@ -270,9 +271,12 @@ def _cut_off(judge: Judge, counts: Counts, plan: Plan) -> Answer:
 def _first_level(judge: Judge, rng: np.random.Generator, plan: Plan) -> Any:
     try:
         z = judge.prior(rng, min(CHAIN * plan.chains, judge.left))
-        return (z, *judge(z))
+        seen = judge(z)
     except Ended:
+        judge.first = (judge.simulations, judge.failures, judge.no_verdict)
         return None
+    judge.first = (len(z), int(seen.failing.sum()), int((~seen.proper).sum()))
+    return (z, *seen)
 
 
 def _counts(first: Any) -> Counts:
