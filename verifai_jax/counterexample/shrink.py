@@ -261,8 +261,11 @@ class _Shrinking:
         self.note()
         self.follow(self.starts())
         judge.limit = judge.budget - 2 * nominal.space.dim
-        self.follow(self.starts()[:2])
-        for _ in range(3):
+        self.follow(self.starts()[:1])
+        # A boundary of many pieces has a nearest point on each: some of those beside this one.
+        beyond(judge, self.failures()[0], self.rng)
+        self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+        for _ in range(2):
             if judge.left < judge.budget // 20:
                 break
             before = self.failures()[0]
@@ -270,17 +273,23 @@ class _Shrinking:
             self.note()
             if not np.array_equal(self.failures()[0], before):
                 self.follow(self.failures()[:1])
+        self.follow(self.failures()[:1])
         # What departs by next to nothing need not depart.
         judge.limit = judge.budget
         reduced(judge, self.failures()[0])
         self.note()
 
     def starts(
-        self, first: Float[np.ndarray, "m d"] | None = None, *, alike: bool = True
+        self,
+        first: Float[np.ndarray, "m d"] | None = None,
+        *,
+        alike: bool = True,
+        cosine: float = 0.7,
     ) -> Float[np.ndarray, "n d"]:
         """The least failures in different directions, after those of `first`.
 
         - `alike`: only with as few departures as the least one.
+        - `cosine`: of the angle between directions, at most.
         """
         failures, nominal = self.failures(), self.judge.nominal
         if self.by == "few" and alike:
@@ -292,13 +301,27 @@ class _Shrinking:
                 break
             v = u - nominal.u
             ways = [w - nominal.u for w in chosen]
-            if all(v @ w < 0.7 * np.linalg.norm(v) * np.linalg.norm(w) for w in ways):
+            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in ways):
                 chosen.append(u)
         return np.array(chosen)
 
-    def follow(self, starts: Float[np.ndarray, "n d"]) -> None:
-        nearest(self.judge, starts, self.rng, few=self.by == "few")
-        self.note()
+    def follow(self, starts: Float[np.ndarray, "n d"], rounds: int = 60) -> None:
+        """Bring these points nearer."""
+        if len(starts):
+            nearest(self.judge, starts, self.rng, few=self.by == "few", rounds=rounds)
+            self.note()
+
+
+def beyond(judge: Judge, u: Float[np.ndarray, " d"], rng: np.random.Generator) -> None:
+    """Look for failures on the same coordinates a little farther away, in other directions."""
+    nominal = judge.nominal
+    v = u.astype(np.float64) - nominal.u
+    v[np.array(nominal.cube.levels) > 0] = 0
+    reach = float(np.linalg.norm(v))
+    moved = v * (1 + 0.6 * rng.standard_normal((64, len(v))))
+    moved *= reach * rng.uniform(1, 1.2, (64, 1)) / _length(moved)
+    points = np.repeat(u[None].astype(np.float64), 64, axis=0)
+    judge(np.where(v != 0, nominal.u + moved, points))
 
 
 def elsewhere(

@@ -70,7 +70,7 @@ def nearest(
     for _ in range(rounds):
         if not active or judge.left <= 0:
             break
-        each = max(12, min(64, 96 // len(active)))
+        each = max(12, min(40, 64 // len(active)))
         batches = [candidates(judge, track, each, rng) for track in active]
         _, failing = judge(np.concatenate(batches))
         first = 0
@@ -78,7 +78,7 @@ def nearest(
             advance(judge, track, nominal.settle(batch), failing[first : first + len(batch)])
             first += len(batch)
         follow(judge, active)
-        active = [track for track in active if track.dull < 4]
+        active = [track for track in active if track.dull < 3]
         if len(active) > 1:
             # What is far behind the best gets no more of the budget.
             reach = min(float(nominal.distance(track.u[None])[0]) for track in tracks)
