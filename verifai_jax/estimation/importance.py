@@ -35,6 +35,8 @@ OUTERMOST = 5.54
 """Standard deviations that a normal feature reaches,"""
 HIDDEN = 3.0
 """and how many times the failures seen beyond them may be hidden there."""
+LIGHT, SLOPE = 0.2, 0.8
+"""Tail index up to which intervals cover as they are, and how fast they widen beyond; measured."""
 AT_ONCE = 8
 """Batches after which nothing of them is lost when time ends."""
 
@@ -78,11 +80,19 @@ class Sampled:
     def interval(self, confidence: float) -> tuple[float, float]:
         """Of the probability of failing; without verdict counts as failing at the upper end."""
         share, error = self.acceptance
-        low, high = skewed_interval(self.x, confidence)
+        low, high = self._widened(self.x, confidence)
         if self.without.any():
-            high = skewed_interval(self.x + self.without, confidence)[1]
+            high = self._widened(self.x + self.without, confidence)[1]
         widened = float(np.exp(2 * error)) * (1 + self.unresolved)
         return low / share / widened, min(high / share * widened, 1.0)
+
+    def _widened(self, x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
+        """Heavy tails hide a part of the variance that samples show: wider by what they lack."""
+        told = weighted(x)
+        factor = 1 + SLOPE * float(np.clip(told.tail - LIGHT, 0.0, 1.0))
+        low, high = skewed_interval(x, confidence)
+        low = max(told.mean - factor * (told.mean - low), low / factor**2)
+        return low, told.mean + factor * (high - told.mean)
 
     @property
     def by_prior(self) -> tuple[int, int]:

@@ -64,7 +64,11 @@ class Judge:
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.accepts_unit, self.deadline, self.told = accepts, deadline, told
         self.simulations = self.failures = self.no_verdict = 0
-        self.first = (0, 0, 0)  # Simulations, failures and no verdicts of a pilot of the prior.
+        self.first: tuple[int, int, int] = (
+            0,
+            0,
+            0,
+        )  # Simulations, failures and no verdicts of a pilot of the prior.
         self.least = np.inf
         self.ended: str | None = None
 
