@@ -4,6 +4,7 @@
     engine.compile()
     engine.evaluate(u, key, first=0)                                  # robustness, status
     engine_for(problem, 1024, gradient=True).evaluate(u, key, 0, temperature=0.1)
+    engine_for(problem, 16, gradient=True, clauses=True)              # told clause by clause
 
 A batch is padded to a fixed shape, split over the devices, and worked through in chunks of lanes
 small enough for the cache, so that there is one executable for each (problem, batch, mode).
@@ -23,7 +24,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.carried import carried_monitor, with_status
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.gradients import FORWARD_UP_TO, Derivative, reverse_refused
-from verifai_jax.mtl import robustness, satisfied, smooth
+from verifai_jax.mtl import hard, robustness, satisfied, smooth
+from verifai_jax.mtl.clauses import ABSENT, CLAUSES, Goals, goals_of
 from verifai_jax.packing import Packing
 from verifai_jax.problem import Problem
 from verifai_jax.trace import Status, Trace
@@ -39,7 +41,8 @@ class Evaluation(NamedTuple):
     `[n, d]`, of the least smooth robustness with respect to the unit coordinates. `features` are
     the simulated values. `messages` say what a black box raised, one a row, empty where nothing.
     `holds` are its Boolean verdicts where the robustness is exactly zero; None where `verdicts` has
-    to be asked.
+    to be asked. `clauses` are the scaled values of the clauses of the goal that is nearest to being
+    broken (`mtl.clauses`), `slopes` their derivatives; None unless told clause by clause.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -48,6 +51,18 @@ class Evaluation(NamedTuple):
     gradient: Float[np.ndarray, "n d"] | None = None
     messages: list[str] | None = None
     holds: Bool[np.ndarray, "n formulas"] | None = None
+    clauses: Float[np.ndarray, "n clauses"] | None = None
+    slopes: Float[np.ndarray, "n clauses d"] | None = None
+
+
+class ToldRow(NamedTuple):
+    """What a search is told of one row, traced; see `Evaluation`."""
+
+    rho: Float[Array, ""]
+    status: Int[Array, ""]
+    gradient: Float[Array, " d"] | None
+    clauses: Float[Array, " clauses"] | None
+    slopes: Float[Array, "clauses d"] | None
 
 
 def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array, ""]:
@@ -100,6 +115,7 @@ class Engine:
     - `problem`: a checked `Problem` whose system JAX can trace.
     - `batch`: rows of a call at most; fewer are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
+    - `clauses`: whether it tells, and differentiates, clause by clause instead.
     - `devices`: JAX devices to split the batch over; all of this process when left out.
     - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
 
@@ -113,10 +129,12 @@ class Engine:
         gradient: bool = False,
         devices: list[Any] | None = None,
         precision: str = "float32",
+        clauses: bool = False,
     ) -> None:
         self.problem = problem
         self.batch = batch
         self.gradient = gradient
+        self.goals: Goals | None = goals_of(problem.formulas.values()) if clauses else None
         self.precision = precision
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
@@ -143,15 +161,16 @@ class Engine:
         u: Float[Array, "n d"],
         key: Key[Array, ""],
         first: int,
-        temperature: Float[Array, ""] | float = 1.0,
+        temperature: Float[Array, " n"] | Float[Array, ""] | float = 1.0,
     ) -> Evaluation:
         """Simulate and judge `n <= batch` points of the unit cube.
 
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
-        - `temperature`: of the smooth robustness that is differentiated; unused without gradient.
+        - `temperature`: of the smooth robustness that is differentiated, one for all rows or one
+          each; unused without gradient. Clause by clause it has no unit.
         """
-        rho, status, features, gradient = self._run("evaluate", u, key, first, temperature)
-        return Evaluation(rho, status, features, gradient if self.gradient else None)
+        rho, status, features, told = self._run("evaluate", u, key, first, temperature)
+        return Evaluation(rho, status, features)._replace(**told)
 
     def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
         """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
@@ -159,14 +178,21 @@ class Engine:
 
     def told_row(
         self, u: Float[Array, " d"], key: Key[Array, ""], temperature: Float[Array, ""]
-    ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, " d"] | None]:
-        """One row under `vmap`: what a search is told of it. Least robustness, status, gradient."""
-        rho, status, _, gradient = self._evaluate_row(u.astype(self.precision), key, temperature)
-        return jnp.min(rho), status, gradient.astype(jnp.float32) if self.gradient else None
+    ) -> ToldRow:
+        """One row under `vmap`: what a search is told of it."""
+        rho, status, _, told = self._evaluate_row(u.astype(self.precision), key, temperature)
+        told = {name: value.astype(jnp.float32) for name, value in told.items()}
+        nothing = dict.fromkeys(("gradient", "clauses", "slopes"))
+        return ToldRow(jnp.min(rho), status, **{**nothing, **told})
 
     def _run(self, mode: str, u: Any, key: Any, first: int, temperature: Any) -> Any:
         with in_precision(self.precision):
-            arguments = (_pad(u, self.padded), key, np.int32(first), np.float32(temperature))
+            temperatures = np.asarray(temperature, np.float32)
+            if temperatures.ndim:
+                temperatures = _pad(temperatures, self.padded)
+            else:
+                temperatures = np.full(self.padded, temperatures)
+            arguments = (_pad(u, self.padded), key, np.int32(first), temperatures)
             packed = self._executable(mode)(*arguments)
             return self._packing[mode].unpack(packed, len(u))
 
@@ -184,7 +210,7 @@ class Engine:
             jax.ShapeDtypeStruct((self.padded, self.problem.space.dim), jnp.float32),
             jax.eval_shape(lambda: jax.random.key(0)),
             jax.ShapeDtypeStruct((), jnp.int32),
-            jax.ShapeDtypeStruct((), jnp.float32),
+            jax.ShapeDtypeStruct((self.padded,), jnp.float32),
         )
         packing = self._packing[mode] = Packing()
 
@@ -214,15 +240,16 @@ class Engine:
         """Spread `one_row(u, key, temperature)` over chunks of lanes and over the devices."""
 
         def on_device(u: Array, rows: Array, key: Array, temperature: Array) -> Any:
-            def chunk(block: tuple[Array, Array]) -> Any:
+            def chunk(block: tuple[Array, Array, Array]) -> Any:
                 keys = jax.vmap(partial(simulation_key, key))(block[1])
-                return jax.vmap(one_row, in_axes=(0, 0, None))(block[0], keys, temperature)
+                return jax.vmap(one_row)(block[0], keys, block[2])
 
             if self.chunks == 1:
-                return chunk((u, rows))
+                return chunk((u, rows, temperature))
             blocks = (
                 u.reshape(self.chunks, self.lanes, u.shape[-1]),
                 rows.reshape(self.chunks, self.lanes),
+                temperature.reshape(self.chunks, self.lanes),
             )
             results = jax.lax.map(chunk, blocks)
             return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), results)
@@ -232,7 +259,7 @@ class Engine:
             on_device = jax.shard_map(
                 on_device,
                 mesh=Mesh(np.array(self.devices), ("batch",)),
-                in_specs=(split, split, whole, whole),
+                in_specs=(split, split, whole, split),
                 out_specs=split,
                 # A user's scan need not say that its carry differs between devices.
                 check_vma=False,
@@ -245,6 +272,8 @@ class Engine:
         return program
 
     def _evaluate_row(self, u: Array, key: Array, temperature: Array) -> Any:
+        if self.goals is not None:
+            return self._clauses_row(self.goals, u, key, temperature)
         if not self.gradient:
             features = self.problem.space.unflatten(u)
             carried = carried_monitor(self.problem)
@@ -252,7 +281,7 @@ class Engine:
                 rho, status = carried(features, key)
             else:
                 rho, status = judge(self.problem, self.problem.system(features, key))
-            return rho.astype(u.dtype), status, features, ()
+            return rho.astype(u.dtype), status, features, {}
 
         def objective(u: Array) -> tuple[Array, Any]:
             features = self.problem.space.unflatten(u)
@@ -265,7 +294,32 @@ class Engine:
             return jnp.min(jnp.stack(smoothed)), (*judge(self.problem, trace), features)
 
         derivative, (rho, status, features) = self._derivative(objective, u)
-        return rho.astype(u.dtype), status, features, derivative.astype(u.dtype)
+        return rho.astype(u.dtype), status, features, {"gradient": derivative.astype(u.dtype)}
+
+    def _clauses_row(self, goals: Goals, u: Array, key: Array, temperature: Array) -> Any:
+        """Robustness as ever, and the clauses of the goal that is nearest to being broken."""
+
+        def objective(u: Array) -> tuple[Array, Any]:
+            features = self.problem.space.unflatten(u)
+            trace = self.problem.system(features, key).hold()
+            values = goals.values(trace, hard, self.problem.end)
+            nearest = jnp.argmin(jnp.max(values, axis=1))
+            results = (*judge(self.problem, trace), features, values[nearest])
+            if not self.gradient:
+                return values[nearest], results
+            semantics = smooth(temperature.astype(u.dtype))
+            return goals.values(trace, semantics, self.problem.end)[nearest], results
+
+        if self.gradient:
+            slopes, (rho, status, features, values) = self._derivative.slopes(objective, u)
+        else:
+            _, (rho, status, features, values) = objective(u)
+            slopes = jnp.zeros((0, 0))
+        missing = CLAUSES - len(values)
+        told = {"clauses": jnp.pad(values, (0, missing), constant_values=ABSENT).astype(u.dtype)}
+        if self.gradient:
+            told["slopes"] = jnp.pad(slopes, ((0, missing), (0, 0))).astype(u.dtype)
+        return rho.astype(u.dtype), status, features, told
 
     def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
         return verdict(self.problem, self.problem.system(self.problem.space.unflatten(u), key))
@@ -276,14 +330,20 @@ def _pad(u: Any, rows: int) -> Any:
         return u
     # In NumPy: JAX would compile a program for each number of missing rows.
     u = np.asarray(u)
-    return np.concatenate([u, np.broadcast_to(u[-1:], (rows - len(u), u.shape[1]))])
+    return np.concatenate([u, np.broadcast_to(u[-1:], (rows - len(u), *u.shape[1:]))])
 
 
 def engine_for(
-    problem: Problem, batch: int, gradient: bool = False, precision: str = "float32"
+    problem: Problem,
+    batch: int,
+    gradient: bool = False,
+    precision: str = "float32",
+    clauses: bool = False,
 ) -> Engine:
     """The engine of this (problem, batch, mode), made once and kept as long as the problem."""
-    mode = (batch, gradient, precision)
+    mode = (batch, gradient, precision, clauses)
     if mode not in problem.engines:
-        problem.engines[mode] = Engine(problem, batch, gradient, precision=precision)
+        problem.engines[mode] = Engine(
+            problem, batch, gradient, precision=precision, clauses=clauses
+        )
     return problem.engines[mode]

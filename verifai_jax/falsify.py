@@ -25,7 +25,9 @@ from verifai_jax.options import (
     check_search,
     described,
     earlier_rows,
+    needs_slopes,
     new_folder,
+    usable,
     usual_batch,
     writing,
 )
@@ -53,7 +55,7 @@ class RunError(RuntimeError):
 @suggests_options
 def falsify(
     problem: Problem,
-    search: str | Search = "cross_entropy",
+    search: str | Search = "portfolio",
     budget: int = 10_000,
     *,
     batch: int | None = None,
@@ -105,14 +107,16 @@ def falsify(
     check_rule(search, stop_when)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
-    batch = min(usual_batch(search, budget) if batch is None else batch, budget)
+    usual = usual_batch(search, budget, stop_after)
+    batch = min(usual if batch is None else batch, budget)
     choice = resolved(
-        problem, gradient=search.wants_gradient, batch=batch, budget=budget, precision=precision,
+        problem, gradient=needs_slopes(search), batch=batch, budget=budget, precision=precision,
         wanted=backend,
     )  # fmt: skip
     problem = choice.problem
     check_gradient(problem, search)
     problem.check()
+    search, notes = usable(problem, search)
     place = new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
     rounds = Rounds(problem, search, batch, seed, table, precision, place)
@@ -122,7 +126,7 @@ def falsify(
             rounds.warm(earlier)
 
     ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
-    return _play(rounds, ends, seed, choice, progress, target, prepare)
+    return _play(rounds, ends, seed, choice, progress, target, prepare, notes)
 
 
 @suggests_options
@@ -234,7 +238,8 @@ def resume(
             rounds.resume(snapshot)
 
     ends = _Ends(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
-    return _play(rounds, ends, run.seed, choice, progress, run.target, prepare)
+    told = [note for note in run.notes if note.startswith("portfolio ")]
+    return _play(rounds, ends, run.seed, choice, progress, run.target, prepare, told)
 
 
 class _Ends(NamedTuple):
@@ -274,6 +279,7 @@ def _play(
     progress: bool | None,
     target: str | None,
     prepare: Callable[[], None],
+    told: Sequence[str] = (),
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -302,7 +308,7 @@ def _play(
             snapshot=rounds.snapshot,
             precision=rounds.precision,
             backend=choice.backend,
-            notes=(*chosen, *rounds.engine.notes),
+            notes=(*chosen, *told, *rounds.notes),
         )
 
     if place is not None:

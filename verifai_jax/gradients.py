@@ -2,6 +2,7 @@
 
     derivative = Derivative(dim)
     gradient, auxiliary = derivative(objective, u)      # objective(u) -> (value, auxiliary)
+    slopes, auxiliary = derivative.slopes(objective, u) # of several values [k] at once: [k, d]
 
 Forward mode takes a sweep for each coordinate, several at a time, and works for every model.
 Reverse mode takes one sweep whatever their number, but keeps what the way back needs, and JAX has
@@ -57,6 +58,17 @@ class Derivative:
             return jax.grad(objective, has_aux=True)(u)
         return _forward(objective, u)
 
+    def slopes(
+        self, objective: Callable[..., tuple[Float[Array, " k"], Any]], u: Float[Array, " d"]
+    ) -> tuple[Float[Array, "k d"], Any]:
+        """The same for an objective of several values: a reverse sweep for each, or as above."""
+        if self.reverse:
+            values, sweep, auxiliary = jax.vjp(objective, u, has_aux=True)
+            each = jnp.eye(len(values), dtype=values.dtype)
+            return jax.vmap(lambda weight: sweep(weight)[0])(each), auxiliary
+        by_coordinate, auxiliary = _forward(objective, u)
+        return by_coordinate.T, auxiliary
+
 
 def reverse_refused(error: Exception) -> bool:
     """Whether this is JAX's refusal to differentiate a loop of unknown length in reverse."""
@@ -65,7 +77,7 @@ def reverse_refused(error: Exception) -> bool:
 
 def _forward(
     objective: Callable[..., tuple[Array, Any]], u: Float[Array, " d"]
-) -> tuple[Float[Array, " d"], Any]:
+) -> tuple[Float[Array, "d *k"], Any]:
     def sweep(direction: Array) -> Any:
         return jax.jvp(objective, (u,), (direction,), has_aux=True)
 
@@ -80,4 +92,5 @@ def _forward(
     blocks = jnp.pad(directions, ((0, missing), (0, 0))).reshape(-1, SWEEPS, d)
     _, derivative, auxiliary = sweeps(blocks[0])
     rest = jax.lax.map(lambda block: sweeps(block)[1], blocks[1:])
-    return jnp.concatenate([derivative, rest.ravel()])[:d], auxiliary
+    rest = rest.reshape(-1, *derivative.shape[1:])
+    return jnp.concatenate([derivative, rest])[:d], auxiliary

@@ -9,6 +9,7 @@ import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax.errors import check_names
+from verifai_jax.informative import informative
 from verifai_jax.problem import Problem
 from verifai_jax.proposals import cube_of
 from verifai_jax.rates import StoppingRule
@@ -29,11 +30,15 @@ def writing(place: Path | None) -> Iterator[None]:
         ) from error
 
 
-def usual_batch(search: Search, budget: int) -> int:
-    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few."""
+def usual_batch(search: Search, budget: int, stop_after: int | None = None) -> int:
+    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few.
+
+    One that stops at few counterexamples gets small batches: it is likely to end in its first.
+    """
     if not search.learns:
         return search.most_at_once
-    return min(search.most_at_once, 1 << max(3, (int(budget) // 20).bit_length() - 1))
+    most = search.most_at_once if stop_after is None else min(search.most_at_once, 16 * stop_after)
+    return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
 def _is_integer(value: Any) -> bool:
@@ -81,17 +86,49 @@ def _why_not_traced(system: Any) -> str:
     return f". It does not run on mjx: {system.why_not('mjx')}"
 
 
+def needs_slopes(search: Search) -> bool:
+    """Whether this search can do nothing without derivatives; a portfolio can."""
+    clauses = search.wants_clauses and not isinstance(search, searches.Portfolio)
+    return search.wants_gradient or clauses
+
+
 def check_gradient(problem: Problem, search: Search) -> None:
     """Refuse a search that needs gradients of a system that has none.
 
     **Raises:** `ValueError`.
     """
-    if problem.black_box and search.wants_gradient:
+    wants = needs_slopes(search)
+    if wants and problem.rulebook is not None and search.wants_clauses:
+        raise ValueError(
+            f"search {search!r} descends on clauses, which have no order; problem "
+            f"{problem.name!r} has a priority. Use 'portfolio' or 'cross_entropy'"
+        )
+    if problem.black_box and wants:
         why = _why_not_traced(problem.system)
         raise ValueError(
             f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
             f"search {search!r} needs one; use one that does not, such as 'cross_entropy'{why}"
         )
+
+
+def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
+    """The search as it can work on this problem, and notes on what it does without.
+
+    A portfolio does without slopes where there are none.
+    """
+    if not isinstance(search, searches.Portfolio) or not search.slopes:
+        return search, ()
+    if problem.black_box:
+        why = "the system is a black box"
+    elif problem.rulebook is not None:
+        why = "a priority has no gradient"
+    elif not len(cube_of(problem.space).continuous):
+        why = "all features are discrete"
+    elif not informative(problem):
+        why = "the robustness is constant almost everywhere"
+    else:
+        return search, ()
+    return search.without_slopes(), (f"portfolio without slopes: {why}",)
 
 
 def check_rule(search: Search, rule: StoppingRule | None) -> None:

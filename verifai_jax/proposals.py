@@ -3,6 +3,7 @@
     proposals = Proposals(search, space, batch=1024, key=key)
     points = proposals.next(1024)                       # [m, d], m <= 1024
     proposals.tell(rho, counted, gradient)              # of these points
+    proposals.slopes, proposals.temperature             # what the search wants to know of them
 
 A constraint (`where=`) refuses points; only accepted ones are simulated. A search that does not
 learn is asked until there are enough, so that the accepted points are a subsequence of its own,
@@ -21,7 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.features import FeatureSpace
-from verifai_jax.search import Cube, Evaluated, Search
+from verifai_jax.search import Cube, Evaluated, Plan, Search
+from verifai_jax.search.base import CLAUSES
 
 TRIES = 32
 """Asks in one round at most until every row of a search that learns is accepted."""
@@ -41,6 +43,7 @@ def cube_of(space: FeatureSpace) -> Cube:
         ordered=space.ordered,
         names=space.coordinates,
         lengths=space.lengths,
+        signals=space.signals,
     )
 
 
@@ -73,6 +76,7 @@ class Proposals:
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
         self._rows = np.zeros(0, int)  # and which of them are simulated.
+        self._plan: Plan | None = None
         self._barren = 0  # Rounds without any, so far.
 
     @property
@@ -81,9 +85,19 @@ class Proposals:
         return self.total is not None and self.asked >= self.total and not len(self._queue)
 
     @property
+    def slopes(self) -> bool:
+        """Whether the points that `next` gave last are to be simulated with slopes."""
+        return self._plan is not None and bool(self._plan.slopes)
+
+    @property
     def temperature(self) -> Any:
-        """Of the smooth robustness to differentiate next; only for searches with gradients."""
-        return self._program.temperature(self._state)
+        """Of the smooth robustness to differentiate; only for searches with gradients.
+
+        One for the next points, or, for a search that wants clauses, one for each of the last.
+        """
+        if self._plan is None:
+            return self._program.temperature(self._state)
+        return np.asarray(self._plan.temperature)[self._rows]
 
     def next(self, most: int) -> Float[Any, "m d"]:
         """The next points, at most `most`; none if all rows of a round are refused.
@@ -99,6 +113,8 @@ class Proposals:
         rho: Float[np.ndarray, " m"],
         counted: Bool[np.ndarray, " m"],
         gradient: Float[np.ndarray, "m d"] | None,
+        clauses: Float[np.ndarray, "m clauses"] | None = None,
+        slopes: Float[np.ndarray, "m clauses d"] | None = None,
     ) -> None:
         """Tell the search what came of the points that `next` gave last."""
         if not self.search.learns:
@@ -109,6 +125,12 @@ class Proposals:
             counted=self._spread(counted, False),
             gradient=None if gradient is None else self._spread(gradient, 0.0),
         )
+        if self.search.wants_clauses:
+            none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
+            told = told._replace(
+                clauses=self._spread(none[:, :, 0] if clauses is None else clauses, 0.0),
+                slopes=self._spread(none if slopes is None else slopes, 0.0),
+            )
         self._state = self._program.tell(self._state, told)
 
     def tell_refused(self) -> None:
@@ -197,18 +219,24 @@ class Proposals:
 
     def _learned(self, most: int) -> Float[Any, "m d"]:
         points = self._ask()
-        self.asked += len(points)
-        accepted = self._accepted_rows(points)
+        self._plan = None
+        planned = len(points)
+        if self.search.wants_clauses:
+            self._plan = self._program.plan(self._state)
+            planned = int(self._plan.rows)
+        self.asked += planned
+        wanted = np.arange(len(points)) < planned
+        accepted = self._accepted_rows(points) & wanted
         for _ in range(TRIES - 1):
-            if accepted.all() or self.total is not None:
+            if accepted.sum() == planned or self.total is not None:
                 break
             others = self._ask()
-            fresh = ~accepted
+            fresh = wanted & ~accepted
             if np.array_equal(np.asarray(others)[fresh], np.asarray(points)[fresh]):
                 break  # This search proposes the same until it is told something.
             self.asked += int(fresh.sum())
             points = jnp.where(fresh[:, None], others, points)
-            accepted = accepted | self._accepted_rows(points)
+            accepted = accepted | (self._accepted_rows(points) & wanted)
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MOST_REFUSED:
             self._give_up()
@@ -238,6 +266,7 @@ class _Program(NamedTuple):
     ask: Any
     tell: Any
     temperature: Any
+    plan: Any
 
 
 @lru_cache(maxsize=64)
@@ -251,6 +280,13 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     counted: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
     evaluated = Evaluated(points, rho, counted, points if search.wants_gradient else None)
+    plan: Any = None
+    if search.wants_clauses:
+        evaluated = evaluated._replace(
+            clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
+            slopes=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
+        )
+        plan = jax.jit(lambda state: search.plan(state, cube, batch)).lower(state).compile()
     tell = None
     if search.learns:
         tell = jax.jit(lambda state, told: search.tell(state, cube, told))
@@ -258,4 +294,4 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants_gradient:
         temperature = jax.jit(search.temperature).lower(state).compile()
-    return _Program(init, ask, tell, temperature)
+    return _Program(init, ask, tell, temperature, plan)

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from verifai_jax.engine import Evaluation, engine_for
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
+MOST_SLOPES = 16
+"""Rows with slopes in one call of the engine."""
 MOST_WARM = 2048
 """Rows of an earlier table at most that a search starts with; the worst of a longer one."""
 
@@ -55,7 +58,15 @@ class Rounds:
         self.engine = (
             HostEngine(problem, precision, self._journal)
             if problem.black_box
-            else engine_for(problem, batch, search.wants_gradient, precision)
+            else engine_for(
+                problem, batch, search.wants_gradient, precision, clauses=search.wants_clauses
+            )
+        )
+        # Slopes are wanted of few points at a time, and now and then: compiled when they are.
+        self._slopes_engine = (
+            engine_for(problem, min(batch, MOST_SLOPES), True, precision, clauses=True)
+            if search.wants_clauses
+            else None
         )
         self.search_key, self.simulation_key = run_keys(seed)
         self.found = self.judged = 0
@@ -71,6 +82,12 @@ class Rounds:
         self.engine.compile()
         self._proposals = Proposals(self.search, self.problem.space, self.batch, self.search_key)
         self._keep()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the engines decided by themselves and would surprise."""
+        slopes = () if self._slopes_engine is None else self._slopes_engine.notes
+        return (*self.engine.notes, *slopes)
 
     @property
     def exhausted(self) -> bool:
@@ -92,8 +109,7 @@ class Rounds:
             self._proposals.tell_refused()
             self._keep()
             return
-        temperature = self._proposals.temperature
-        evaluation = self.engine.evaluate(points, self.simulation_key, first, temperature)
+        evaluation = self._evaluated(points, first)
         violated = self._violated(evaluation, points, first)
         rho = np.min(evaluation.rho, axis=1)
         proper = evaluation.status == Status.OK
@@ -105,12 +121,37 @@ class Rounds:
             told.astype(np.float32),  # Searches compute in float32, whatever the simulations do.
             proper,
             None if gradient is None else gradient.astype(np.float32),
+            None if evaluation.clauses is None else evaluation.clauses.astype(np.float32),
+            None if evaluation.slopes is None else evaluation.slopes.astype(np.float32),
         )
         self.table.append(self._columns(evaluation, rho, violated))
         self.found += int(np.sum(violated))
         self.judged += int(np.sum(proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
         self._keep()
+
+    def _evaluated(self, points: Any, first: int) -> Evaluation:
+        temperature = self._proposals.temperature
+        if self._slopes_engine is None or not self._proposals.slopes:
+            if self._slopes_engine is not None:
+                temperature = 1.0  # Nothing is differentiated.
+            return self.engine.evaluate(points, self.simulation_key, first, temperature)
+        engine = self._slopes_engine
+        compiled = engine.compile_seconds
+        parts = [
+            engine.evaluate(
+                points[start : start + engine.batch],
+                self.simulation_key,
+                first + start,
+                temperature[start : start + engine.batch],
+            )
+            for start in range(0, len(points), engine.batch)
+        ]
+        self.compile_seconds += engine.compile_seconds - compiled
+        if len(parts) == 1:
+            return parts[0]
+        # Messages and Boolean verdicts are those of black boxes, which have no slopes.
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     def warm(self, table: "pd.DataFrame") -> None:
         """Let the search learn from the rows of an earlier table."""
@@ -180,6 +221,12 @@ class Rounds:
         columns |= {"violated": violated, "status": STATUS_NAMES[evaluation.status]}
         if evaluation.gradient is not None:
             columns["gradient_finite"] = np.all(np.isfinite(evaluation.gradient), axis=1)
+        if self._slopes_engine is not None:
+            slopes, count = evaluation.slopes, len(rho)
+            columns["differentiated"] = np.full(count, slopes is not None)
+            columns["gradient_finite"] = (
+                np.ones(count, bool) if slopes is None else np.all(np.isfinite(slopes), axis=(1, 2))
+            )
         if evaluation.messages is not None:
             columns["message"] = np.array(evaluation.messages, dtype=object)
         return columns

@@ -20,7 +20,15 @@ if TYPE_CHECKING:
 
 STREAM = "rows.arrows"
 FINISHED = "table.parquet"
-RESERVED = ("row", "rho", "violated", "status", "message", "gradient_finite")
+RESERVED = (
+    "row",
+    "rho",
+    "violated",
+    "status",
+    "message",
+    "gradient_finite",
+    "differentiated",
+)
 
 
 class ErrorTable:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.features import Domain, FeatureSpace
+from verifai_jax.mtl.clauses import ABSENT, CLAUSES
 from verifai_jax.search import Cube, Evaluated, Search
 from verifai_jax.systems.blackbox import plain_leaves
 from verifai_jax.trace import Status, Trace
@@ -115,7 +116,7 @@ def check_search(
                 tau = search.temperature(asked)
                 assert tau.shape == (), f"temperature must be a scalar; got shape {tau.shape}"
                 assert bool(tau > 0), f"temperature must be positive; got {tau}"
-            told = _evaluate(u, search.wants_gradient)
+            told = _evaluate(u, search, asked, cube)
             if spoil is not None:
                 told = _spoiled(told, odd, spoil)
             state = tell(asked, cube, told)
@@ -142,14 +143,14 @@ def check_search(
     # What a constraint does: some rows are those of the second proposals, some stay refused.
     first, asked = ask(state, cube, batch)
     second, asked = ask(asked, cube, batch)
-    mixed = _evaluate(jnp.where(odd[:, None], second, first), search.wants_gradient)
-    refused = mixed._replace(counted=jnp.asarray(np.arange(batch) % 4 != 0))
+    mixed = _evaluate(jnp.where(odd[:, None], second, first), search, asked, cube)
+    refused = mixed._replace(counted=mixed.counted & (np.arange(batch) % 4 != 0))
     after = tell(asked, cube, refused)
     _same_type(asked, after)
 
     earlier = jax.random.uniform(jax.random.key(seed + 1), (batch, cube.dim), jnp.float32)
-    table = _evaluate(earlier, search.wants_gradient)
-    warmed = warm(state, cube, table._replace(gradient=None))
+    rho = _evaluate(earlier, search, asked, cube).rho
+    warmed = warm(state, cube, Evaluated(earlier, rho, jnp.ones(batch, bool)))
     _same_type(state, warmed, "warm")
     for beginning in (after, warmed):
         for points in run(beginning, 0, 2)[1]:
@@ -166,7 +167,7 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
         state, parts = search.init(jax.random.key(1), cube, batch), []
         while sum(map(len, parts)) < points:
             u, state = search.ask(state, cube, batch)
-            state = search.tell(state, cube, _evaluate(u, search.wants_gradient))
+            state = search.tell(state, cube, _evaluate(u, search, state, cube))
             parts.append(np.asarray(u))
         seen.append(np.concatenate(parts)[:points])
     for other in seen[1:]:
@@ -291,19 +292,41 @@ def _status(trace: Trace) -> str:
     return Status(0 if trace.status is None else int(trace.status)).name
 
 
-def _evaluate(u: Any, gradient: bool) -> Evaluated:
-    """A bowl with its bottom, and failures, off the middle."""
+def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Evaluated:
+    """A bowl with its bottom, and failures, off the middle, told as the search wants it."""
     offset = u - 0.3
-    rho = jnp.sum(offset**2, axis=1) - 0.01
-    return Evaluated(u, rho, jnp.ones(len(u), bool), 2 * offset if gradient else None)
+    rho, slope = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
+    told = Evaluated(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    if not search.wants_clauses:
+        return told
+    plan = search.plan(asked, cube, len(u))
+    assert plan.temperature.shape == (len(u),), (
+        f"the plan must have a temperature for each row; got shape {plan.temperature.shape}"
+    )
+    assert 1 <= int(plan.rows) <= len(u), (
+        f"the plan must be for 1 to {len(u)} rows; got {plan.rows}"
+    )
+    clauses = jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho)
+    slopes = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(slope)
+    return told._replace(
+        counted=jnp.arange(len(u)) < plan.rows,
+        clauses=clauses,
+        slopes=jnp.where(plan.slopes, slopes, 0.0),
+    )
 
 
 def _spoiled(told: Evaluated, rows: Any, value: float) -> Evaluated:
-    gradient = told.gradient
-    if gradient is not None:
-        gradient = jnp.where(rows[:, None], value, gradient)
+    def spoil(leaf: Any) -> Any:
+        if leaf is None:
+            return None
+        return jnp.where(rows.reshape(-1, *(1,) * (leaf.ndim - 1)), value, leaf)
+
     return told._replace(
-        rho=jnp.where(rows, value, told.rho), counted=jnp.asarray(~rows), gradient=gradient
+        rho=spoil(told.rho),
+        counted=told.counted & ~rows,
+        gradient=spoil(told.gradient),
+        clauses=spoil(told.clauses),
+        slopes=spoil(told.slopes),
     )
 
 

@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.devices import enable_compile_cache
 from verifai_jax.engine import Engine, in_precision, simulation_key
 from verifai_jax.errors import suggests_options
-from verifai_jax.options import check_options, check_search, usual_batch
+from verifai_jax.lockstep import lockstep
+from verifai_jax.options import check_options, check_search, usable, usual_batch
 from verifai_jax.problem import Problem
 from verifai_jax.proposals import cube_of
 from verifai_jax.run import run_keys
@@ -40,6 +41,7 @@ class Trials:
     - `seeds`: `[seeds]`; `rho`: `[seeds, simulations]`, the least formula's robustness, NaN where a
       simulation has no verdict.
     - `batch`: simulations a round.
+    - `differentiated`: `[seeds, simulations]`, which had slopes taken; None where none or all had.
     """
 
     name: str
@@ -47,6 +49,15 @@ class Trials:
     seeds: Int[np.ndarray, " seeds"]
     batch: int
     rho: Float[np.ndarray, "seeds simulations"]
+    differentiated: Bool[np.ndarray, "seeds simulations"] | None = None
+
+    def cost(self, slopes: float = 2.0) -> Float[np.ndarray, " seeds"]:
+        """Like `first_failure`, with each differentiated simulation counted as so many."""
+        first = self.first_failure
+        if self.differentiated is None:
+            return first
+        before = np.arange(self.rho.shape[1]) < first[:, None]
+        return first + (slopes - 1) * np.sum(self.differentiated & before, axis=1)
 
     @property
     def first_failure(self) -> Float[np.ndarray, " seeds"]:
@@ -82,7 +93,7 @@ class Trials:
 @suggests_options
 def repeat(
     problem: Problem,
-    search: str | Search = "cross_entropy",
+    search: str | Search = "portfolio",
     budget: int = 1000,
     *,
     batch: int | None = None,
@@ -98,7 +109,8 @@ def repeat(
     - `budget`: simulations of each seed, rounded up to whole batches.
     - `batch`, `precision`, `backend`: as in `falsify`.
     - `seeds`: which, or how many from 0 on.
-    - `stop_early`: end once every seed has found a failure.
+    - `stop_early`: end once every seed has found a failure. Seeds of a search that plans its
+      rounds (`portfolio`, `gradient`) each end with their own first failure.
 
     A robustness of exactly zero is no failure here, whatever the comparator says.
 
@@ -126,7 +138,14 @@ def repeat(
             )
     in_precision(precision)
     traced.check()
+    search, _ = usable(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
+    if search.wants_clauses:
+        with in_precision(precision):
+            rho, differentiated = lockstep(
+                traced, search, every, budget, batch, precision, stop_early
+            )
+        return Trials(problem.name, repr(search), every, batch, rho, differentiated)
     rounds = -(-budget // batch)
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
     with in_precision(precision):
@@ -175,9 +194,9 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
             keys = jax.vmap(partial(simulation_key, key))(rows)
             temperature: Any = search.temperature(state) if search.wants_gradient else 1.0
             simulate = jax.vmap(engine.told_row, in_axes=(0, 0, None))
-            rho, status, gradient = simulate(u, keys, jnp.float32(temperature))
-            told = Evaluated(u, rho.astype(jnp.float32), status == Status.OK, gradient)
-            return search.tell(state, cube, told) if search.learns else state, rho
+            row = simulate(u, keys, jnp.float32(temperature))
+            told = Evaluated(u, row.rho.astype(jnp.float32), row.status == Status.OK, row.gradient)
+            return search.tell(state, cube, told) if search.learns else state, row.rho
 
         state, rho = jax.lax.scan(step, state, jnp.arange(rounds, dtype=jnp.int32))
         return state, rho.ravel()

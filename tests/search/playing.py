@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.landscapes import LANDSCAPES
+from verifai_jax.mtl.clauses import ABSENT, CLAUSES
 from verifai_jax.search import Evaluated
 
 SEEDS = 25
@@ -19,6 +20,20 @@ FLAT = ("ball", "ridge", "saddles", "corner", "ripples", "needle")
 MIXED = ("mixed",)
 WIDE = ("few_of_many", "all_of_many")
 ROUNDS = {FLAT: 75, MIXED: 50, WIDE: 22}
+
+
+def tell_of(search, state, cube, u, rho, slope):
+    """What a search is told of points of one clause."""
+    told = Evaluated(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    if not search.wants_clauses:
+        return told
+    plan = search.plan(state, cube, len(u))
+    slopes = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
+    return told._replace(
+        counted=jnp.arange(len(u)) < plan.rows,
+        clauses=jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho),
+        slopes=jnp.where(plan.slopes, slopes, 0.0),
+    )
 
 
 @lru_cache
@@ -38,9 +53,9 @@ def play(search, names, batch, rounds, seeds, together=True):
         def step(state, _):
             u, state = search.ask(state, cube, batch)
             value = jax.vmap(rho)(u)
-            gradient = jax.vmap(jax.grad(rho))(u) if search.wants_gradient else None
-            told = Evaluated(u, value, jnp.ones(batch, bool), gradient)
-            return search.tell(state, cube, told), (u, value)
+            told = tell_of(search, state, cube, u, value, jax.vmap(jax.grad(rho))(u))
+            # A row that is not simulated finds nothing.
+            return search.tell(state, cube, told), (u, jnp.where(told.counted, value, jnp.inf))
 
         _, seen = jax.lax.scan(step, search.init(key, cube, batch), None, length=rounds)
         return jax.tree.map(lambda leaf: leaf.reshape(rounds * batch, *leaf.shape[2:]), seen)

@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from playing import tell_of
 
 from verifai_jax.search import (
     CrossEntropy,
     Cube,
-    Evaluated,
     Gradient,
     Halton,
+    Mutation,
     Uniform,
     named,
     names,
@@ -59,7 +60,19 @@ def test_the_key_decides(search):
     assert not np.array_equal(one, two)
 
 
-@pytest.mark.parametrize("search", [CrossEntropy(), Gradient()], ids=repr)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_one_clause_is_taken_to_its_corner_at_once(sign):
+    cube, search, key = Cube((0, 0, 0)), Gradient(), jax.random.key(3)
+    state = search.init(key, cube, 1)
+    u, state = search.ask(state, cube, 1)
+    np.testing.assert_array_equal(u, 0.5)
+    slope = sign * jnp.array([[1.0, 2.0, 3.0]])
+    state = search.tell(state, cube, tell_of(search, state, cube, u, jnp.ones(1), slope))
+    u, state = search.ask(state, cube, 1)
+    np.testing.assert_array_equal(u, 0.5 - 0.5 * sign)
+
+
+@pytest.mark.parametrize("search", [CrossEntropy()], ids=repr)
 def test_active_searches_do_learn(search):
     # With the robustness turned around they go the other way.
     cube, key = Cube((0, 0)), jax.random.key(3)
@@ -71,7 +84,8 @@ def test_active_searches_do_learn(search):
         for _ in range(5):
             u, state = ask(state, cube, 16)
             rho = 3 + sign * jnp.sum(u, axis=1)
-            state = tell(state, cube, Evaluated(u, rho, rho > 0, jnp.full_like(u, sign)))
+            told = tell_of(search, state, cube, u, rho, jnp.full_like(u, sign))
+            state = tell(state, cube, told)
         return float(jnp.mean(u))
 
     assert late(1.0) < 0.35
@@ -91,17 +105,12 @@ def test_useless_batches_leave_a_search_alive(search, spoil):
     for _ in range(3):
         u, state = ask(state, cube, 8)
         assert np.all(np.isfinite(u))
-        assert len(np.unique(np.asarray(u[:, 0]))) == 8
-        state = tell(
-            state,
-            cube,
-            Evaluated(
-                u,
-                jnp.full(8, jnp.nan) if spoil == "uncounted" else jnp.ones(8),
-                jnp.full(8, spoil != "uncounted"),
-                jnp.full((8, 3), jnp.nan),
-            ),
-        )
+        planned = int(search.plan(state, cube, 8).rows) if search.wants_clauses else 8
+        assert len(np.unique(np.asarray(u[:planned, 0]))) == planned
+        rho = jnp.full(8, jnp.nan) if spoil == "uncounted" else jnp.ones(8)
+        told = tell_of(search, state, cube, u, rho, jnp.full((8, 3), jnp.nan))
+        counted = told.counted & (spoil != "uncounted")
+        state = tell(state, cube, told._replace(counted=counted))
 
 
 class TestNames:
@@ -115,7 +124,7 @@ class TestNames:
         ("name", "options", "message"),
         [
             ("halten", {}, "unknown search 'halten'; did you mean 'halton'"),
-            ("gradient", {"learning": 1}, "'learning'; did you mean 'learning_rate'"),
+            ("gradient", {"descent": 1}, "'descent'; did you mean 'descents'"),
             ("uniform", {"elite": 1}, "option of search uniform 'elite'.*There is no"),
         ],
     )
@@ -133,10 +142,13 @@ class TestNames:
             (lambda: CrossEntropy(focus=1.5), r"focus must be in \[0, 1\]; got 1.5"),
             (lambda: CrossEntropy(exploration=0), r"exploration must be in \(0, 1\]; got 0"),
             (lambda: CrossEntropy(widening=0), "widening must be positive and finite; got 0"),
-            (lambda: Gradient(learning_rate=-0.1), r"learning_rate must be in \(0, 1\]; got -0.1"),
-            (lambda: Gradient(cold=0), "cold must be positive and finite; got 0"),
-            (lambda: Gradient(hot=float("nan")), "hot must be positive and finite; got nan"),
-            (lambda: Gradient(cooling=0), "cooling must be an integer of at least 1; got 0"),
+            (lambda: Gradient(shrinks=-0.1), r"shrinks must be in \(0, 1\]; got -0.1"),
+            (lambda: Gradient(shrinks=1), "shrinks must be less than 1; got 1"),
+            (lambda: Gradient(coldest=0), "coldest must be positive and finite; got 0"),
+            (lambda: Gradient(temperatures=(0.1, float("nan"))), "temperatures must be positive"),
+            (lambda: Gradient(temperatures=()), "temperatures must have at least one entry"),
+            (lambda: Gradient(descents=0), "descents must be an integer of at least 1; got 0"),
+            (lambda: Mutation(kept=3), "kept must be an integer of at least 6; got 3"),
             (lambda: Cube((0, -1)), r"levels must not be negative; got \(0, -1\)"),
         ],
     )

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from playing import tell_of
 
 from verifai_jax.search import (
     CrossEntropy,
     Cube,
-    Evaluated,
     Gradient,
     Halton,
     Split,
@@ -52,17 +52,21 @@ def test_parts_learn_from_their_own_coordinates():
     search = Split({"x": Gradient()}, Uniform())
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)
     state = search.init(jax.random.key(1), CUBE, 16)
-    for _ in range(5):
+    for slopes in (True, False):
         u, state = ask(state, CUBE, 16)
+        plan = search.plan(state, CUBE, 16)
+        assert bool(plan.slopes) == slopes
         gradient = jnp.zeros_like(u).at[:, 0].set(1.0).at[:, 2].set(-1.0)
-        state = tell(state, CUBE, Evaluated(u, 1 + u[:, 0], u[:, 0] >= 0, gradient))
-    assert float(jnp.mean(u[:, 0])) < 0.3
+        told = tell_of(search, state, CUBE, u, 1 + u[:, 0], gradient)
+        state = tell(state, CUBE, told)
+    # The largest box of each descent, and another part as ever.
+    np.testing.assert_array_equal(u[: search.parts[0][1].at_once(16), 0], 0.0)
     assert 0.2 < float(jnp.mean(u[:, 2])) < 0.8
 
 
 def test_what_the_whole_is():
-    assert split({"x": "gradient"}).wants_gradient
-    assert not split({"x": "halton"}).wants_gradient
+    assert split({"x": "gradient"}).wants_clauses
+    assert not split({"x": "halton"}).wants_clauses
     assert split({"x": "uniform"}).samples_prior
     assert not split({"x": "halton"}).samples_prior
     assert split({"x": "cross_entropy"}).learns
@@ -71,7 +75,7 @@ def test_what_the_whole_is():
 
 
 @pytest.mark.parametrize(
-    "search", [Split({"x": Gradient(decay=0.5)}, CrossEntropy(elite=0.2)), Halton(scramble=True)]
+    "search", [Split({"x": Gradient(shrinks=0.5)}, CrossEntropy(elite=0.2)), Halton(scramble=True)]
 )
 def test_json(search):
     assert from_json(to_json(search)) == search

@@ -57,6 +57,10 @@ class Array(Domain):
     def lengths(self) -> tuple[int, ...]:
         return _repeated(self.domain, self.length)
 
+    @property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        return _repeated_signals(self.domain, self.length)
+
     def coordinates(self, name: str) -> tuple[str, ...]:
         return tuple(
             label for item in indexed(name, self.length) for label in self.domain.coordinates(item)
@@ -173,6 +177,11 @@ class VariableArray(Domain):
     def lengths(self) -> tuple[int, ...]:
         inner = _repeated(self.domain, self.most)
         return (0,) * self._varies + tuple(self._varies + i for i in inner)
+
+    @property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        inner = _repeated_signals(self.domain, self.most)
+        return tuple(tuple(self._varies + i for i in signal) for signal in inner)
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         items = indexed(name, self.most)
@@ -295,6 +304,14 @@ def _ends(domain: Any, length: Any) -> tuple[int, int]:
             f"a variable length needs 0 <= least <= most and most >= 1; got {length!r}"
         )
     return least, most
+
+
+def _repeated_signals(domain: Domain, times: int) -> tuple[tuple[int, ...], ...]:
+    return tuple(
+        tuple(item * domain.size + i for i in signal)
+        for item in range(times)
+        for signal in domain.signals
+    )
 
 
 def _repeated(domain: Domain, count: int) -> tuple[int, ...]:

@@ -62,6 +62,14 @@ class Struct(Domain):
             start += domain.size
         return tuple(found)
 
+    @cached_property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        found, start = [], 0
+        for _, domain in self.fields:
+            found += [tuple(start + i for i in signal) for signal in domain.signals]
+            start += domain.size
+        return tuple(found)
+
     def coordinates(self, name: str) -> tuple[str, ...]:
         return tuple(
             label

@@ -98,6 +98,11 @@ class Domain(abc.ABC):
         """Which unit coordinates are lengths of arrays, on which others depend."""
         return ()
 
+    @property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        """The unit coordinates of each function of time, in the order of its control points."""
+        return ()
+
     def coordinates(self, name: str) -> tuple[str, ...]:
         """What each unit coordinate of the feature called `name` is called."""
         return self.columns(name)

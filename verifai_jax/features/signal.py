@@ -61,6 +61,11 @@ class Signal(Domain):
     def levels(self) -> tuple[int, ...]:
         return self.domain.levels * self.knots
 
+    @property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        each = self.domain.size
+        return tuple(tuple(range(i, self.size, each)) for i in range(each))
+
     def from_unit(self, u: Float[Array, " size"]) -> Waveform:
         knots = jax.vmap(self.domain.from_unit)(u.reshape(self.knots, self.domain.size))
         return self._waveform(knots)

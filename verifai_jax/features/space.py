@@ -80,6 +80,11 @@ class FeatureSpace:
         return self.root.lengths
 
     @cached_property
+    def signals(self) -> tuple[tuple[int, ...], ...]:
+        """The coordinates of each function of time, in the order of its control points."""
+        return self.root.signals
+
+    @cached_property
     def coordinates(self) -> tuple[str, ...]:
         """What each coordinate is called, such as `x0`, `cars.length`, `cars[0].x`."""
         return self.root.coordinates("")

@@ -14,6 +14,7 @@ from verifai_jax.search.annealing import Annealing as Annealing
 from verifai_jax.search.bandit import Bandit as Bandit
 from verifai_jax.search.base import Cube as Cube
 from verifai_jax.search.base import Evaluated as Evaluated
+from verifai_jax.search.base import Plan as Plan
 from verifai_jax.search.base import Search as Search
 from verifai_jax.search.bayes import Bayes as Bayes
 from verifai_jax.search.ce_compat import CECompat as CECompat
@@ -24,6 +25,8 @@ from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.grid import Grid as Grid
 from verifai_jax.search.halton import Halton as Halton
 from verifai_jax.search.listed import Listed as Listed
+from verifai_jax.search.mutation import Mutation as Mutation
+from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
@@ -40,7 +43,9 @@ _SEARCHES: dict[str, type[Search]] = {
     "epsilon_greedy": EpsilonGreedy,
     "bayes": Bayes,
     "cmaes": CMAES,
+    "mutation": Mutation,
     "gradient": Gradient,
+    "portfolio": Portfolio,
 }
 
 

@@ -32,7 +32,8 @@ class Cube:
     - `ordered`: whether its cells have an order; all of them when left out.
     - `names`: what it is called, such as `cars[0].x`; nothing when left out.
 
-    and `lengths`: which coordinates are lengths of arrays, on which others depend.
+    and `lengths`: which coordinates are lengths of arrays, on which others depend; `signals`: the
+    coordinates of each function of time, in the order of its control points.
 
     **Raises:** `ValueError` for a negative level, or entries that do not go with the levels.
     """
@@ -42,6 +43,7 @@ class Cube:
     ordered: tuple[bool, ...] = ()
     names: tuple[str, ...] = ()
     lengths: tuple[int, ...] = ()
+    signals: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", tuple(int(level) for level in self.levels))
@@ -97,6 +99,11 @@ class Cube:
             ordered=tuple(self.ordered[i] for i in places),
             names=tuple(self.names[i] for i in places),
             lengths=tuple(j for j, i in enumerate(places) if i in self.lengths),
+            signals=tuple(
+                tuple(places.index(i) for i in signal)
+                for signal in self.signals
+                if set(signal) <= set(places)
+            ),
         )
 
     def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
@@ -128,6 +135,10 @@ class Cube:
         )
 
 
+CLAUSES = 4
+"""Clauses that `Evaluated` tells apart."""
+
+
 class Evaluated(NamedTuple):
     """A batch of points and what came of them.
 
@@ -135,12 +146,17 @@ class Evaluated(NamedTuple):
     - `counted`: False for padding and for simulations without a verdict: such a row must not
       influence the search, whatever its other entries are (NaN included).
     - `gradient`: of the smooth robustness with respect to `u`; only where a search wants it.
+    - `clauses`: values of what has to be broken together, without unit, all negative in a failure;
+      very low where there are fewer than `CLAUSES`. Only for a search that wants clauses.
+    - `slopes`: their derivatives with respect to `u`; zero in rounds that asked for none.
     """
 
     u: Float[Array, "n d"]
     rho: Float[Array, " n"]
     counted: Bool[Array, " n"]
     gradient: Float[Array, "n d"] | None = None
+    clauses: Float[Array, "n clauses"] | None = None
+    slopes: Float[Array, "n clauses d"] | None = None
 
     @property
     def judged(self) -> Bool[Array, " n"]:
@@ -153,6 +169,20 @@ class Evaluated(NamedTuple):
         return jnp.where(self.judged, jnp.maximum(self.rho, 0.0), jnp.inf)
 
 
+class Plan(NamedTuple):
+    """What a search that wants clauses has in mind for the points of its last `ask`.
+
+    - `rows`: how many of them, from the first on, are to be simulated; the others are told as not
+      counted.
+    - `slopes`: whether with the slopes of the clauses, which cost another simulation or two.
+    - `temperature`: of the smooth robustness whose slopes they are, row by row, without unit.
+    """
+
+    rows: Int[Array, ""]
+    slopes: Bool[Array, ""]
+    temperature: Float[Array, " batch"]
+
+
 class Search(abc.ABC):
     """The contract; `verifai_jax.testing.check_search` tests it.
 
@@ -163,6 +193,9 @@ class Search(abc.ABC):
 
     wants_gradient: ClassVar[bool] = False
     """Whether `tell` needs `Evaluated.gradient`."""
+
+    wants_clauses: ClassVar[bool] = False
+    """Whether `tell` needs `Evaluated.clauses` and, in rounds that `plan` says, `slopes`."""
 
     samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""
@@ -195,6 +228,10 @@ class Search(abc.ABC):
     def warm(self, state: Any, cube: Cube, evaluated: Evaluated) -> Any:
         """Learn from points of an earlier table, a batch of them, before the first `ask`."""
         return self.tell(state, cube, evaluated)
+
+    def plan(self, state: Any, cube: Cube, batch: int) -> Plan:
+        """Which rows of the last `ask`, and with what; only where `wants_clauses`."""
+        raise NotImplementedError(f"{type(self).__name__} has no plans")
 
     def temperature(self, state: Any) -> Float[Array, ""]:
         """Of the smooth robustness to differentiate next; only where `wants_gradient`."""

@@ -1,14 +1,22 @@
-"""Gradient descent on the smooth robustness, from many starts at once.
+"""Descent on the slopes of what has to be broken, from many starts.
 
-Each row of the batch is a descent of its own: Adam (Kingma, Ba, 2015, algorithm 1) with large,
-shrinking steps, projected to the cube. Its first steps are the sign of the gradient, which takes
-a descent to a corner in a few simulations. A descent that has failed the system, has converged or
-has no usable gradient starts again at the next low-discrepancy point; one that has stepped onto a
-point without a verdict, or out of the space's constraint, goes halfway back first.
+A system fails where all clauses of a goal are negative at once (`mtl.clauses`). Around a point
+where their values and slopes are known, each clause is taken for linear, and the next point is
+where the greatest of them is least: a corner of the cube or of a box around the point, or where two
+clauses meet. That is sequential linear programming for a minimax problem (Fletcher, Practical
+Methods of Optimization, 1987, section 14.6); for one clause it is a jump along the signs of its
+gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
+does a plain gradient, because all slopes count.
+
+The box is the whole cube at first. It shrinks while points turn out no better, several sizes in one
+batch where there is room, and grows again on success. A corner that nothing points out of is left
+by its weakest coordinates, one at a time, since a small slope says little about the other end of
+the range. After that, or when slopes are zero or not finite, the descent starts again elsewhere.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from itertools import combinations
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +24,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.search.base import (
+    CLAUSES,
     Cube,
     Evaluated,
+    Plan,
     Search,
     check_count,
     check_fraction,
@@ -25,59 +35,72 @@ from verifai_jax.search.base import (
 )
 from verifai_jax.search.halton import halton_points
 
-BETA1, BETA2, EPSILON = 0.5, 0.9, 1e-12
-MOST_RETREATS = 3
+NOTHING = -1e8
+"""Values below are of clauses that a goal does not have."""
+SIZES = 6
+"""Boxes tried at once at most."""
 
 
 class GradientState(NamedTuple):
     key: Key[Array, ""]
-    u: Float[Array, "batch d"]
-    restart: Bool[Array, " batch"]  # rows that take a new start instead of `u`
-    anchor: Float[Array, "batch d"]  # the last point with a verdict
-    retreats: Int[Array, " batch"]  # since then
-    first: Float[Array, "batch d"]  # moments of the gradient
-    second: Float[Array, "batch d"]
-    best: Float[Array, " batch"]  # least robustness since the start
-    step: Int[Array, " batch"]  # since the start
-    stale: Int[Array, " batch"]  # steps without progress
     starts: UInt32[Array, ""]  # how many starts were made
-    round: Int[Array, ""]
-    scale: Float[Array, ""]  # of the robustness; 0 until a batch shows it
+    fresh: Bool[Array, " descents"]  # descents that take a new start
+    known: Bool[Array, " descents"]  # descents that know the slopes at their point
+    point: Float[Array, "descents d"]
+    clauses: Float[Array, "descents clauses"]
+    slopes: Float[Array, "descents clauses d"]
+    radius: Float[Array, " descents"]
+    flips: Int[Array, " descents"]  # coordinates of a corner that were tried the other way
+    temperature: Float[Array, " descents"]
+    offered: Float[Array, " d"]  # a start from elsewhere, for every second descent
+    offers: Bool[Array, ""]
+    useless: Int[Array, ""]  # starts in a row whose slopes said nothing
+    descent: Int[Array, " batch"]  # of the last ask: whose row it is, and in which box
+    box: Float[Array, " batch"]
+    flipped: Bool[Array, " batch"]
+    rows: Int[Array, ""]
+    differentiates: Bool[Array, ""]
 
 
 @dataclass(frozen=True)
 class Gradient(Search):
-    """Multi-start Adam on the smooth robustness; discrete coordinates keep their start's value.
+    """Sequential linear programming on the clauses; discrete coordinates keep their start's value.
 
     **Arguments:**
 
-    - `learning_rate`: length of the first step in each unit coordinate.
-    - `decay`: factor on the step length from step to step.
-    - `least_rate`: step length below which it does not shrink.
-    - `hot`, `cold`: temperature of the smooth robustness at first and at last, in units of the
-      robustness' spread over the first batch.
-    - `cooling`: rounds from `hot` to `cold`, geometrically.
-    - `patience`: steps without progress after which a descent starts again elsewhere.
+    - `descents`: at once, at most; a quarter of the batch if that is less.
+    - `shrinks`: factor on the size of the box when nothing in it was better.
+    - `least_radius`: size of the box below which a descent ends.
+    - `flips`: coordinates of a corner tried the other way before a descent ends.
+    - `temperatures`: of the smooth robustness at first, from start to start in turn, in units of
+      the spread of the predicates; halved with every step.
+    - `coldest`: temperature below which it does not fall.
 
-    **Raises:** `ValueError` for values out of range.
+    **Raises:** `ValueError` for values out of range; `check` for a space without continuous
+    features.
     """
 
-    learning_rate: float = 0.25
-    decay: float = 0.8
-    least_rate: float = 0.01
-    hot: float = 0.3
-    cold: float = 0.02
-    cooling: int = 10
-    patience: int = 4
-    wants_gradient: ClassVar[bool] = True
+    descents: int = 16
+    shrinks: float = 0.4
+    least_radius: float = 0.02
+    flips: int = 3
+    temperatures: tuple[float, ...] = (0.005, 0.05, 0.2)
+    coldest: float = 0.002
+    wants_clauses: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "decay", "least_rate"):
-            check_fraction(name, getattr(self, name))
-        for name in ("hot", "cold"):
-            check_positive(name, getattr(self, name))
-        check_count("cooling", self.cooling)
-        check_count("patience", self.patience)
+        check_count("descents", self.descents)
+        check_fraction("shrinks", self.shrinks)
+        check_fraction("least_radius", self.least_radius)
+        check_count("flips", self.flips, 0)
+        check_positive("coldest", self.coldest)
+        if self.shrinks == 1:
+            raise ValueError("shrinks must be less than 1; got 1")
+        object.__setattr__(self, "temperatures", tuple(self.temperatures))
+        if not self.temperatures:
+            raise ValueError("temperatures must have at least one entry; got none")
+        for temperature in self.temperatures:
+            check_positive("temperatures", temperature)
 
     def check(self, cube: Cube) -> None:
         """Raise `ValueError` unless there is a continuous coordinate to move in."""
@@ -87,105 +110,231 @@ class Gradient(Search):
                 "coordinates of this space are discrete. Use 'cross_entropy'"
             )
 
+    def at_once(self, batch: int) -> int:
+        """How many descents there are in batches of this size."""
+        return max(1, min(self.descents, batch // 4))
+
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GradientState:
-        zeros = jnp.zeros((batch, cube.dim), jnp.float32)
+        n, d = self.at_once(batch), cube.dim
         return GradientState(
             key=key,
-            u=zeros,
-            restart=jnp.ones(batch, bool),
-            anchor=zeros,
-            retreats=jnp.full(batch, MOST_RETREATS, jnp.int32),
-            first=zeros,
-            second=zeros,
-            best=jnp.full(batch, jnp.inf, jnp.float32),
-            step=jnp.zeros(batch, jnp.int32),
-            stale=jnp.zeros(batch, jnp.int32),
             starts=jnp.uint32(0),
-            round=jnp.int32(0),
-            scale=jnp.float32(0),
+            fresh=jnp.ones(n, bool),
+            known=jnp.zeros(n, bool),
+            point=jnp.full((n, d), 0.5, jnp.float32),
+            clauses=jnp.zeros((n, CLAUSES), jnp.float32),
+            slopes=jnp.zeros((n, CLAUSES, d), jnp.float32),
+            radius=jnp.ones(n, jnp.float32),
+            flips=jnp.zeros(n, jnp.int32),
+            temperature=jnp.full(n, self.temperatures[0], jnp.float32),
+            offered=jnp.full(d, 0.5, jnp.float32),
+            offers=jnp.array(False),
+            useless=jnp.int32(0),
+            descent=jnp.zeros(batch, jnp.int32),
+            box=jnp.ones(batch, jnp.float32),
+            flipped=jnp.zeros(batch, bool),
+            rows=jnp.int32(0),
+            differentiates=jnp.array(False),
         )
 
     def ask(
         self, state: GradientState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], GradientState]:
-        index = state.starts + jnp.cumsum(state.restart).astype(jnp.uint32)
-        fresh = halton_points(index, cube.dim, state.key)
-        # Rows stay marked until they are told of: another `ask` gives them another start.
-        u = jnp.where(state.restart[:, None], fresh, state.u)
-        return u, state._replace(u=u, starts=index[-1])
+        if not cube.dim:  # One point is all that there is.
+            return jnp.zeros((batch, 0), jnp.float32), state._replace(rows=jnp.int32(batch))
+        n = self.at_once(batch)
+        # Slopes first, once half of the descents wait for them.
+        known = jnp.sum(state.known)
+        differentiates = 2 * (n - known) >= n
+        starts, begun = self._started(state, cube)
+        state = _either(differentiates, begun, state)
 
-    def warm(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
-        """Start the first descents from the most nearly failing points; failures are found."""
-        usable = evaluated.counted & (evaluated.rho >= 0)
-        rho = jnp.concatenate([jnp.where(usable, evaluated.rho, jnp.inf), state.best])
-        points = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
-        _, nearest = jax.lax.top_k(-rho, len(state.best))
-        best = rho[nearest]
-        return state._replace(u=points[nearest], best=best, restart=jnp.isinf(best))
+        first = jnp.argsort(jnp.where(differentiates, state.known, ~state.known), stable=True)
+        there = jnp.where(differentiates, n - known, jnp.maximum(known, 1))
+        row = jnp.arange(batch)
+        # The largest box of each descent, then the next of each, and so on.
+        descent = first[row % there]
+        size = jnp.where(differentiates, 0, row // there)
+        rows = jnp.where(differentiates, there, jnp.minimum(there * min(SIZES, batch // n), batch))
+        box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
+        solve = jax.vmap(_least, in_axes=(0, 0, 0, 0, None))
+        free = np.array(cube.levels) == 0
+        tried = solve(
+            state.clauses[descent], state.slopes[descent], state.point[descent], box, free
+        )
+        stays = jnp.max(jnp.abs(tried - state.point[descent]), axis=1, initial=0.0) < 1e-6
+        number = state.flips[descent] + size
+        other = jax.vmap(_turned, in_axes=(0, 0, 0, 0, None))(
+            state.clauses[descent], state.slopes[descent], state.point[descent], number, free
+        )
+        tried = jnp.where(stays[:, None], other, tried)
+        u = jnp.where(differentiates, starts[descent], tried)
+        return u, state._replace(
+            descent=descent,
+            box=box,
+            flipped=stays & ~differentiates,
+            rows=rows.astype(jnp.int32),
+            differentiates=differentiates,
+        )
 
-    def temperature(self, state: GradientState) -> Float[Array, ""]:
-        """Geometric from `hot` to `cold`, relative to the spread of the robustness."""
-        progress = jnp.minimum(state.round / self.cooling, 1.0).astype(jnp.float32)
-        scale = jnp.where(state.scale > 0, state.scale, 1.0)
-        return scale * self.hot * (self.cold / self.hot) ** progress
+    def plan(self, state: GradientState, cube: Cube, batch: int) -> Plan:
+        return Plan(state.rows, state.differentiates, state.temperature[state.descent])
 
     def tell(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
-        assert evaluated.gradient is not None, "the gradient search needs gradients"
-        free = np.array(cube.levels) == 0
-        judged = evaluated.judged
-        rho = jnp.where(judged, evaluated.rho, jnp.inf)
-        usable = judged & jnp.all(jnp.isfinite(evaluated.gradient), axis=1)
-        gradient = jnp.where(usable[:, None] & free, evaluated.gradient, 0.0)
-        # Divided by its largest entry, so that squares neither overflow nor vanish.
-        largest = jnp.max(jnp.abs(gradient), axis=1, keepdims=True, initial=0.0)
-        gradient = gradient / jnp.where(largest > 0, largest, 1.0)
+        assert evaluated.clauses is not None, "the gradient search is told of clauses"
+        assert evaluated.slopes is not None
+        if not cube.dim:
+            return state
+        n, batch = len(state.fresh), len(evaluated.rho)
+        mine = jnp.arange(batch) < state.rows
+        judged = evaluated.judged & mine
+        clauses = jnp.where(judged[:, None], evaluated.clauses, 0.0)
+        merit = jnp.where(judged, jnp.max(clauses, axis=1), jnp.inf)
+        owner = (state.descent[None] == jnp.arange(n)[:, None]) & mine[None]
+        # For each descent the best of its rows, the first of equally good ones.
+        scores = jnp.where(owner & judged[None], merit[None], jnp.inf)
+        best = jnp.argmin(scores, axis=1)
+        least = jnp.min(scores, axis=1)
+        failed = jnp.any(owner & (judged & (evaluated.rho < 0))[None], axis=1)
 
-        fresh = state.restart
-        begun = ~fresh[:, None]
-        step = jnp.where(fresh, 0, state.step) + 1
-        first = BETA1 * jnp.where(begun, state.first, 0.0) + (1 - BETA1) * gradient
-        second = BETA2 * jnp.where(begun, state.second, 0.0) + (1 - BETA2) * gradient**2
-        count = step[:, None].astype(jnp.float32)
-        mean = first / (1 - BETA1**count)
-        root = jnp.sqrt(second / (1 - BETA2**count)) + EPSILON
-        rate = jnp.maximum(self.learning_rate * self.decay ** (count - 1), self.least_rate)
-        moved = jnp.clip(evaluated.u - rate * mean / root, 0.0, 1.0)
-        moved = jnp.where(free, moved, evaluated.u)
+        slopes = jnp.where(judged[best][:, None, None], evaluated.slopes[best], 0.0)
+        finite = jnp.all(jnp.isfinite(slopes), axis=(1, 2))
+        slopes = jnp.where(finite[:, None, None], slopes, 0.0)
+        told = finite & jnp.any(slopes != 0, axis=(1, 2)) & jnp.isfinite(least)
+        asked = jnp.any(owner, axis=1)
+        before = jnp.max(state.clauses, axis=1)
 
-        before = jnp.where(fresh, jnp.inf, state.best)
-        better = rho < before - 0.01 * jnp.abs(before)
-        better |= jnp.isinf(before) & jnp.isfinite(rho)
-        stale = jnp.where(better, 0, jnp.where(fresh, 0, state.stale) + 1)
-        stuck = jnp.all(moved == evaluated.u, axis=1)
+        # With slopes: a descent goes on from where they are known, or starts elsewhere.
+        with_slopes = state._replace(
+            point=_rows(told & asked, evaluated.u[best], state.point),
+            clauses=_rows(told & asked, clauses[best], state.clauses),
+            slopes=_rows(told & asked, slopes, state.slopes),
+            known=jnp.where(asked, told & ~failed, state.known),
+            fresh=jnp.where(asked, ~told | failed, state.fresh),
+            radius=jnp.where(asked & state.fresh, 1.0, state.radius),
+            flips=jnp.where(asked, 0, state.flips),
+            useless=jnp.where(
+                jnp.any(told), 0, state.useless + jnp.sum(asked & jnp.isfinite(least) & ~told)
+            ).astype(jnp.int32),
+        )
+        # Without: a better point, whose slopes are asked for next, or a smaller box.
+        better = least < before - 1e-3 * jnp.abs(before)
+        smallest = jnp.min(jnp.where(owner, state.box[None], jnp.inf), axis=1)
+        turned = state.flipped[best] & asked
+        flips = state.flips + jnp.sum(owner, axis=1).astype(jnp.int32)
+        radius = jnp.where(better, jnp.minimum(1.0, 2 * state.box[best]), smallest * self.shrinks)
+        limit = min(self.flips, len(cube.continuous))
+        over = failed | (~better & jnp.where(turned, flips >= limit, radius < self.least_radius))
+        kept = asked & ~over
+        colder = jnp.maximum(0.5 * state.temperature, self.coldest)
+        without = state._replace(
+            point=_rows(kept & better, evaluated.u[best], state.point),
+            clauses=_rows(kept & better, clauses[best], state.clauses),
+            known=jnp.where(asked, ~over & ~better, state.known),
+            fresh=jnp.where(asked, over, state.fresh),
+            radius=jnp.where(kept & (better | ~turned), radius, state.radius),
+            flips=jnp.where(kept, jnp.where(better, 0, jnp.where(turned, flips, 0)), state.flips),
+            temperature=jnp.where(kept & better, colder, state.temperature),
+        )
+        return _either(state.differentiates, with_slopes, without)
 
-        # Without a verdict a descent goes back halfway to where it had one, a few times.
-        back = ~judged & ~fresh & (state.retreats < MOST_RETREATS)
-        halfway = jnp.where(free, (state.anchor + evaluated.u) / 2, evaluated.u)
-        done = ~usable | stuck | (rho < 0) | (stale >= self.patience)
-
-        def unless_back(new: Array, old: Array) -> Array:
-            rows = back if new.ndim == 1 else back[:, None]
-            return jnp.where(rows, old, new)
-
+    def warm(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
+        """Start every second descent from the most nearly failing point; failures are found."""
+        usable = evaluated.judged & (evaluated.rho >= 0)
+        best = jnp.argmin(jnp.where(usable, evaluated.rho, jnp.inf))
+        offers = jnp.any(usable)
         return state._replace(
-            u=unless_back(moved, halfway),
-            restart=done & ~back,
-            anchor=jnp.where(judged[:, None], evaluated.u, state.anchor),
-            retreats=jnp.where(judged, 0, state.retreats + 1).astype(jnp.int32),
-            first=unless_back(first, state.first),
-            second=unless_back(second, state.second),
-            best=jnp.minimum(before, rho),
-            step=unless_back(step, state.step),
-            stale=unless_back(stale, state.stale).astype(jnp.int32),
-            round=state.round + 1,
-            scale=jnp.where(state.scale > 0, state.scale, _spread(rho)),
+            offered=jnp.where(offers, evaluated.u[best], state.offered),
+            offers=state.offers | offers,
+        )
+
+    def _started(
+        self, state: GradientState, cube: Cube
+    ) -> tuple[Float[Array, "descents d"], GradientState]:
+        """Where slopes are wanted: new starts for fresh descents, the middle of the cube first."""
+        number = state.starts + jnp.cumsum(state.fresh).astype(jnp.uint32) - 1
+        points = halton_points(number, cube.dim, state.key)
+        free = np.array(cube.levels) == 0
+        middle = jnp.where(free, 0.5, points)
+        points = jnp.where((number == 0)[:, None], middle, points)
+        offered = state.offers & (number % 2 == 1)
+        points = jnp.where(offered[:, None], state.offered, points)
+        hot = jnp.asarray(self.temperatures, jnp.float32)[number % len(self.temperatures)]
+        starts = jnp.where(state.fresh[:, None], points, state.point)
+        return starts, state._replace(
+            starts=state.starts + jnp.sum(state.fresh).astype(jnp.uint32),
+            temperature=jnp.where(state.fresh, hot, state.temperature),
+            offers=state.offers & ~jnp.any(offered & state.fresh),
         )
 
 
-def _spread(rho: Float[Array, " n"]) -> Float[Array, ""]:
-    """Standard deviation of the finite entries, or where it is zero their mean size."""
-    finite = jnp.isfinite(rho)
-    count = jnp.maximum(jnp.sum(finite), 1)
-    mean = jnp.sum(jnp.where(finite, rho, 0.0)) / count
-    std = jnp.sqrt(jnp.sum(jnp.where(finite, (rho - mean) ** 2, 0.0)) / count)
-    return jnp.where(std > 0, std, jnp.abs(mean)).astype(jnp.float32)
+def _either(first: Bool[Array, ""], one: GradientState, two: GradientState) -> GradientState:
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)
+
+
+def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:
+    return jnp.where(chosen.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+
+def _least(
+    clauses: Float[Array, " clauses"],
+    slopes: Float[Array, "clauses d"],
+    point: Float[Array, " d"],
+    radius: Float[Array, ""],
+    free: Bool[np.ndarray, " d"],
+) -> Float[Array, " d"]:
+    """Where in a box the greatest of linear clauses is least.
+
+    Exact for two clauses; for more the best of all points where one is least or two meet.
+    """
+    low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
+
+    def corner(slope: Float[Array, "*m d"]) -> Float[Array, "*m d"]:
+        found = jnp.where(slope > 0, low, jnp.where(slope < 0, high, point))
+        return jnp.where(free, found, point)
+
+    def linear(points: Float[Array, "*m d"]) -> Float[Array, "*m clauses"]:
+        return clauses + (points - point) @ slopes.T
+
+    pairs = np.array(list(combinations(range(CLAUSES), 2)))
+    one, two = slopes[pairs[:, 0]], slopes[pairs[:, 1]]
+
+    def gap(points: Float[Array, "m d"]) -> Float[Array, " m"]:
+        values = linear(points)
+        rows = np.arange(len(pairs))
+        return values[rows, pairs[:, 0]] - values[rows, pairs[:, 1]]
+
+    def halve(_: Any, weights: tuple[Array, Array]) -> tuple[Array, Array]:
+        # At the least weight on the first clause it is the greater one, at the most the second.
+        least, most = weights
+        middle = (least + most) / 2
+        above = gap(corner(middle[:, None] * one + (1 - middle)[:, None] * two)) > 0
+        return jnp.where(above, middle, least), jnp.where(above, most, middle)
+
+    zero = jnp.zeros(len(pairs), jnp.float32)
+    least, most = jax.lax.fori_loop(0, 24, halve, (zero, zero + 1))
+    a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (least, most))
+    above, below = jnp.maximum(gap(a), 0.0), jnp.maximum(-gap(b), 0.0)
+    share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
+    candidates = jnp.concatenate([corner(slopes), share * a + (1 - share) * b])
+    greatest = jnp.max(linear(candidates), axis=1)
+    # Of clauses that there are not, and of equally good points the first: a corner.
+    there = clauses > NOTHING
+    usable = jnp.concatenate([there, there[pairs[:, 0]] & there[pairs[:, 1]]])
+    return candidates[jnp.argmin(jnp.where(usable, greatest, jnp.inf))]
+
+
+def _turned(
+    clauses: Float[Array, " clauses"],
+    slopes: Float[Array, "clauses d"],
+    point: Float[Array, " d"],
+    number: Int[Array, ""],
+    free: Bool[np.ndarray, " d"],
+) -> Float[Array, " d"]:
+    """The point with its `number`-th weakest coordinate at the other end of its range."""
+    steep = jnp.abs(slopes[jnp.argmax(clauses)])
+    # Coordinates without any slope come last: they seem to have no effect.
+    order = jnp.argsort(jnp.where((steep > 0) & free, steep, jnp.inf))
+    chosen = order[jnp.minimum(number, len(point) - 1)]
+    other = jnp.where(point[chosen] > 0.5, 0.0, 1.0)
+    return point.at[chosen].set(other)

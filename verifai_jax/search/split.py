@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.errors import unknown_name
-from verifai_jax.search.base import Cube, Evaluated, Search
+from verifai_jax.search.base import Cube, Evaluated, Plan, Search
 
 
 @dataclass(frozen=True, init=False)
@@ -31,7 +31,8 @@ class Split(Search):
     - `rest`: the search of all other features.
 
     A composition ends when its first finite part (a grid) does, samples the prior if all parts do,
-    and takes the temperature of its first part that wants gradients.
+    and takes the temperature of its first part that wants gradients, the plan of its first part
+    that has one.
 
     **Raises:** `ValueError` for no parts; `TypeError` for a part that is no search. `check` raises
     `ValueError` for a name that is no feature, a feature in two parts, or a part that cannot work
@@ -59,6 +60,10 @@ class Split(Search):
     @property
     def wants_gradient(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return any(search.wants_gradient for search in self.searches)
+
+    @property
+    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return any(search.wants_clauses for search in self.searches)
 
     @property
     def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -108,16 +113,22 @@ class Split(Search):
                 return search.temperature(its)
         return super().temperature(state)
 
+    def plan(self, state: tuple[Any, ...], cube: Cube, batch: int) -> Plan:
+        """That of the first part that has plans."""
+        for its, (search, _, part) in zip(state, self._shares(cube), strict=True):
+            if search.wants_clauses:
+                return search.plan(its, part, batch)
+        return super().plan(state, cube, batch)
+
     def _told(self, verb: str, state: Any, cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
         states = []
         for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
-            gradient = evaluated.gradient
-            its_own = evaluated._replace(
-                u=evaluated.u[:, places],
-                gradient=gradient[:, places]
-                if gradient is not None and search.wants_gradient
-                else None,
-            )
+            gradient, slopes = evaluated.gradient, evaluated.slopes
+            its_own = Evaluated(evaluated.u[:, places], evaluated.rho, evaluated.counted)
+            if gradient is not None and search.wants_gradient:
+                its_own = its_own._replace(gradient=gradient[:, places])
+            if slopes is not None and search.wants_clauses:
+                its_own = its_own._replace(clauses=evaluated.clauses, slopes=slopes[:, :, places])
             states.append(getattr(search, verb)(its, part, its_own))
         return tuple(states)
 

@@ -1,0 +1,146 @@
+"""What has to be broken, part by part: a formula as goals, each of a few clauses.
+
+    goals = goals_of([formula])
+    goals.values(trace, hard)                           # [goals, CLAUSES]
+    goals.values(trace, smooth(0.05))                   # differentiable, temperature without unit
+
+A formula is broken by breaking one of its goals (the parts of a conjunction), and a goal by
+breaking all of its clauses (the parts of a disjunction). Told apart, a search can lower one clause
+without losing another, where the maximum of both only tells of one. Predicates are divided by how
+much they vary along the trace, so that clauses in miles per hour and in revolutions per minute can
+be compared; that keeps all signs.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.robustness import prepared, robustness
+from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.services import nnf, rebuilt
+from verifai_jax.trace import Trace
+
+CLAUSES = 4
+"""Clauses told apart at most; what a disjunction has beyond is the last one."""
+ABSENT = -1e9
+"""The value of a clause that a goal does not have: broken, whatever happens."""
+GOALS = 16
+"""Goals told apart at most; what a conjunction has beyond is the last one."""
+
+
+@dataclass(frozen=True)
+class Goals:
+    """The goals of formulas, over the margins of their predicates.
+
+    - `leaves`: the predicates; the margin of the i-th is the signal `leaf i`.
+    - `goals`: the clauses of each goal, over these signals.
+    """
+
+    leaves: tuple[Formula, ...]
+    goals: tuple[tuple[Formula, ...], ...]
+
+    @property
+    def most(self) -> int:
+        """Clauses of the goal that has the most."""
+        return max(len(goal) for goal in self.goals)
+
+    def margins(self, trace: Trace, end: End = "hold") -> Trace:
+        """The margins of the predicates over their scale, as the signals of a trace.
+
+        The scale is the standard deviation along the trace, with a share of the mean for a
+        signal that is constant; it is not differentiated.
+        """
+        if not self.leaves:
+            return trace  # Constants alone.
+        signals = {}
+        for i, leaf in enumerate(self.leaves):
+            setting, arrays, _, valid = prepared(leaf, trace, hard, end, None)
+            evaluator = Evaluator(arrays, setting.length, setting.dt, valid=valid)
+            margin = evaluator.value(leaf, 0, setting.length - 1)
+            still = jax.lax.stop_gradient(margin)
+            mean = jnp.mean(still)
+            scale = jnp.sqrt(jnp.var(still) + (0.1 * mean) ** 2)
+            # A trace on the edge of the predicate all along has no scale of its own.
+            signals[_name(i)] = margin / jnp.where(scale > 1e-12, scale, 1.0)
+        return replace(trace, signals=signals, finite=())
+
+    def values(
+        self, trace: Trace, semantics: Semantics = hard, end: End = "hold"
+    ) -> Float[Array, "goals clauses"]:
+        """The robustness of each clause over scaled margins; `ABSENT` where there is none."""
+        scaled = self.margins(trace, end)
+        rows = []
+        for goal in self.goals:
+            found = [robustness(clause, scaled, semantics, end=end) for clause in goal]
+            absent = [jnp.full_like(found[0], ABSENT)] * (self.most - len(goal))
+            rows.append(jnp.stack([*found, *absent]))
+        # A window without samples gives infinities, of which nothing can be learned.
+        return jnp.clip(jnp.stack(rows), ABSENT, -ABSENT)
+
+
+def goals_of(formulas: Iterable[Formula]) -> Goals:
+    """The goals of a conjunction of these formulas."""
+    goals: list[tuple[Formula, ...]] = []
+    for formula in formulas:
+        goals.extend(_few(_parts(part, ast.Or), ast.Or, CLAUSES) for part in _conjuncts(formula))
+    if len(goals) > GOALS:
+        rest = [ast.disjunction(*goal) if len(goal) > 1 else goal[0] for goal in goals[GOALS - 1 :]]
+        goals = [*goals[: GOALS - 1], (ast.conjunction(*rest),)]
+    leaves = tuple(
+        dict.fromkeys(
+            leaf
+            for goal in goals
+            for clause in goal
+            for leaf in clause.subformulas()
+            if isinstance(leaf, ast.Predicate | ast.Atom)
+        )
+    )
+    names: dict[Formula, Formula] = {
+        leaf: ast.Predicate(">", ast.Signal(_name(i)), ast.Number(0.0))
+        for i, leaf in enumerate(leaves)
+    }
+    return Goals(leaves, tuple(tuple(_over(clause, names) for clause in goal) for goal in goals))
+
+
+def _name(i: int) -> str:
+    return f"leaf {i}"
+
+
+def _conjuncts(formula: Formula) -> list[Formula]:
+    return list(_parts(nnf(formula), ast.And))
+
+
+def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formula, ...]:
+    """The parts of a conjunction or disjunction, through the operators that distribute over it."""
+    if isinstance(formula, kind):
+        return tuple(part for each in formula.operands() for part in _parts(each, kind))
+    if isinstance(
+        formula, ast.Always | ast.Historically if kind is ast.And else ast.Eventually | ast.Once
+    ):
+        inner = _parts(formula.operand, kind)
+        if len(inner) > 1:
+            return tuple(rebuilt(formula, (part,)) for part in inner)
+    return (formula,)
+
+
+def _few(
+    parts: tuple[Formula, ...], kind: type[ast.And] | type[ast.Or], most: int
+) -> tuple[Formula, ...]:
+    if len(parts) <= most:
+        return parts
+    return (*parts[: most - 1], kind(parts[most - 1 :]))
+
+
+def _over(formula: Formula, names: dict[Formula, Formula]) -> Formula:
+    """The formula over other leaves."""
+    if formula in names:
+        return names[formula]
+    if isinstance(formula, ast.Constant):
+        return formula
+    return rebuilt(formula, tuple(_over(part, names) for part in formula.operands()))

@@ -1,0 +1,224 @@
+"""Mutations of the best points, large and small: for few simulations and rough landscapes.
+
+Most proposals change one of the best points so far: by a step of any size in a few coordinates, by
+a shift of a stretch of a signal, or by the difference of two other good points (differential
+evolution: Storn, Price, 1997). Steps that leave the cube end on its faces, where failures often
+are. Some proposals explore: with coordinates drawn towards the ends of their range, and signals
+that change seldom, coarse before fine (Fainekos et al., ARCH competition reports: tools that draw
+from the corners and with few control points need the fewest simulations).
+
+Nothing is fitted, so that it works from the first few simulations on, where cross-entropy has yet
+to fill its elite.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt32
+
+from verifai_jax.search.base import (
+    Cube,
+    Evaluated,
+    Search,
+    check_count,
+    check_fraction,
+    standard_normal,
+)
+
+PARENTS = 4
+"""Best points that are mutated; each half as often as the one before."""
+LEAST_STEP, MOST_STEP = 0.02, 0.6
+"""Standard deviations of steps, in unit coordinates; log-uniform between them."""
+MOST_EXPLORATION = 0.9
+EVENLY = 0.1
+"""Share of exploration that samples the prior; it grows where nothing else helps."""
+SELDOM, SWINGING = 0.2, 0.45
+"""Shares of exploration in which signals change seldom, and in which they swing to and fro."""
+TO_AND_FRO = 0.9
+"""Share of control points, in the latter, on the other side of the middle than the one before."""
+
+
+class MutationState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    points: Float[Array, "k d"]  # the best so far, the very best first
+    score: Float[Array, " k"]  # infinite where there is no point yet
+    seen: Int[Array, ""]  # simulations with a verdict since the last beginning
+    stale: Int[Array, ""]  # simulations without progress
+
+
+@dataclass(frozen=True)
+class Mutation(Search):
+    """Mutations of the best points so far, by steps of all sizes, and exploration.
+
+    **Arguments:**
+
+    - `kept`: how many of the best points are kept.
+    - `first`: simulations that explore before anything is mutated.
+    - `exploration`: share of proposals that explore.
+    - `idle`: simulations without progress after which nearly all do.
+    - `difference`: share of mutations by the difference of two good points.
+    - `patience`: simulations without progress after which it begins afresh.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    kept: int = 32
+    first: int = 8
+    exploration: float = 0.2
+    difference: float = 0.4
+    idle: int = 150
+    patience: int = 400
+
+    def __post_init__(self) -> None:
+        check_count("kept", self.kept, 6)
+        check_count("first", self.first)
+        check_fraction("exploration", self.exploration)
+        check_fraction("difference", self.difference, or_zero=True)
+        check_count("idle", self.idle)
+        check_count("patience", self.patience)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> MutationState:
+        return MutationState(
+            key=key,
+            round=jnp.uint32(0),
+            points=jnp.full((self.kept, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(self.kept, jnp.inf, jnp.float32),
+            seen=jnp.int32(0),
+            stale=jnp.int32(0),
+        )
+
+    def ask(
+        self, state: MutationState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], MutationState]:
+        d = cube.dim
+        key = jax.random.fold_in(state.key, state.round)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        random = jax.random.uniform(key, (batch, 16 + 4 * d), jnp.float32)
+        coins, values, cuts, masks, noise = jnp.split(
+            random, [16, 16 + d, 16 + 2 * d, 16 + 3 * d], 1
+        )
+        idle = jnp.minimum(state.stale / self.idle, 1.0)
+        fresh = _explored(cube, coins[:, 0], coins[:, 1], coins[:, 14], idle, values, cuts)
+        changed = self._mutated(state, cube, coins[:, 2:], values, masks, standard_normal(noise))
+        # Where all points are equally good there is nothing to start from.
+        there = jnp.isfinite(state.score)
+        level = jnp.max(jnp.where(there, state.score, -jnp.inf)) <= jnp.min(state.score)
+        # The longer without progress, the more it explores.
+        share = self.exploration + (MOST_EXPLORATION - self.exploration) * idle
+        explores = (state.seen < self.first) | level | (coins[:, 15] < share)
+        u = jnp.where(explores[:, None], fresh, changed)
+        return u, state._replace(round=state.round + 1)
+
+    def tell(self, state: MutationState, cube: Cube, evaluated: Evaluated) -> MutationState:
+        score = evaluated.score
+        # New points come first: of equally good ones the newest are kept.
+        points = jnp.concatenate(
+            [jnp.where(evaluated.judged[:, None], evaluated.u, 0.5), state.points]
+        )
+        scores = jnp.concatenate([score, state.score])
+        _, best = jax.lax.top_k(-scores, self.kept)
+        judged = jnp.sum(evaluated.judged).astype(jnp.int32)
+        progress = scores[best[0]] < 0.999 * state.score[0]
+        stale = jnp.where(progress, 0, state.stale + judged)
+        again = stale >= self.patience
+        return state._replace(
+            points=points[best],
+            score=jnp.where(again, jnp.inf, scores[best]),
+            seen=jnp.where(again, 0, state.seen + judged),
+            stale=jnp.where(again, 0, stale),
+        )
+
+    def _mutated(
+        self,
+        state: MutationState,
+        cube: Cube,
+        coins: Float[Array, "n 14"],
+        values: Float[Array, "n d"],
+        masks: Float[Array, "n d"],
+        normal: Float[Array, "n d"],
+    ) -> Float[Array, "n d"]:
+        d = cube.dim
+        there = jnp.sum(jnp.isfinite(state.score)).astype(jnp.float32)
+        # Rank r with a probability of 2^-(r + 1), among those that there are.
+        rank = jnp.floor(-jnp.log2(jnp.maximum(coins[:, 0], 2.0**-PARENTS)))
+        parent = state.points[jnp.minimum(rank, jnp.maximum(there - 1, 0)).astype(jnp.int32)]
+
+        good = jnp.minimum(there, jnp.maximum(6.0, there / 3))
+        one, two = (state.points[(coins[:, i] * good).astype(jnp.int32)] for i in (1, 2))
+        factor = jnp.array([0.3, 0.6, 1.0])[(coins[:, 3] * 3).astype(jnp.int32)]
+        share = jnp.where(coins[:, 4] < 0.5, 0.3, 0.9)
+        crossed = parent + (masks < share[:, None]) * factor[:, None] * (one - two)
+        differs = (coins[:, 5] < self.difference) & (there >= 6)
+        base = jnp.where(differs[:, None], crossed, parent)
+
+        size = LEAST_STEP * (MOST_STEP / LEAST_STEP) ** coins[:, 6]
+        # One coordinate, two, an eighth or a third of them; at least one.
+        few = np.array([1, 2, max(1, d // 8), max(1, d // 3)], np.float32)
+        count = jnp.asarray(few)[(coins[:, 7] * 4).astype(jnp.int32)]
+        forced = (coins[:, 8] * d).astype(jnp.int32)[:, None] == jnp.arange(d)
+        moves = forced | (masks * d < (count - 1)[:, None])
+        step = size[:, None] * normal * moves
+        if cube.signals:
+            shift = size * normal[:, 0]
+            stretch = _stretch(cube, coins[:, 9], coins[:, 10], coins[:, 11])
+            shifts = coins[:, 12] < 0.5
+            step = jnp.where(shifts[:, None], shift[:, None] * stretch, step)
+            moves = jnp.where(shifts[:, None], stretch > 0, moves)
+        still = differs & (coins[:, 13] < 0.5)
+        moved = jnp.where(still[:, None], base, base + step)
+        if len(cube.discrete):
+            # A choice is another one at random, or that of a good point.
+            moves &= ~still[:, None]
+            chosen = jnp.where(moves, values, jnp.where(differs[:, None], one, parent))
+            moved = jnp.where(np.array(cube.levels) > 0, chosen, moved)
+        return jnp.clip(moved, 0.0, 1.0)
+
+
+def _explored(
+    cube: Cube,
+    way: Float[Array, " n"],
+    change: Float[Array, " n"],
+    even: Float[Array, " n"],
+    idle: Float[Array, ""],
+    values: Float[Array, "n d"],
+    cuts: Float[Array, "n d"],
+) -> Float[Array, "n d"]:
+    """Points towards the ends of the range, of signals that change seldom, always or at random."""
+    # Arcsine distributed: dense at both ends, as the best controls often are.
+    u = jnp.sin(0.5 * np.pi * values) ** 2
+    evenly = even < EVENLY + (MOST_EXPLORATION - EVENLY) * idle
+    u = jnp.where(evenly[:, None] | (np.array(cube.levels) > 0), values, u)
+    for signal in cube.signals:
+        places = np.array(signal)
+        begins = (cuts[:, places] < change[:, None]) | (np.arange(len(places)) == 0)
+        last = jax.lax.cummax(jnp.where(begins, jnp.arange(len(places)), 0), axis=1)
+        held = jnp.take_along_axis(u[:, places], last, axis=1)
+        # To and fro: where a control point is on the side of the one before, it changes sides.
+        side = jnp.cumsum(cuts[:, places] < TO_AND_FRO, axis=1) % 2 == 0
+        high = jnp.maximum(u[:, places], 1 - u[:, places])
+        swinging = jnp.where(side, high, 1 - high)
+        found = jnp.where((way < SELDOM)[:, None], held, u[:, places])
+        found = jnp.where((way > 1 - SWINGING)[:, None], swinging, found)
+        found = jnp.where(evenly[:, None], u[:, places], found)
+        u = u.at[:, places].set(found)
+    return u
+
+
+def _stretch(
+    cube: Cube, which: Float[Array, " n"], start: Float[Array, " n"], length: Float[Array, " n"]
+) -> Float[Array, "n d"]:
+    """One where a random stretch of a random signal is, zero elsewhere."""
+    number = (which * len(cube.signals)).astype(jnp.int32)
+    found = jnp.zeros((len(which), cube.dim), jnp.float32)
+    for i, signal in enumerate(cube.signals):
+        m = len(signal)
+        first = (start * m).astype(jnp.int32)
+        last = first + (length * (m - first)).astype(jnp.int32)
+        place = jnp.arange(m)
+        inside = (place >= first[:, None]) & (place <= last[:, None]) & (number == i)[:, None]
+        found = found.at[:, np.array(signal)].set(inside.astype(jnp.float32))
+    return found

@@ -1,0 +1,217 @@
+"""Several searches that share what they learn, and a budget that goes where it helps.
+
+The members are complementary: slopes of clauses jump to corners and along where clauses meet,
+mutations need few simulations and no slopes, cross-entropy fills the region of failures in large
+batches. Which one helps shows on the way. A bandit gives each a share of the simulations by the
+rate at which its points come among the best so far, discounted, and none less than a little; a
+member whose slopes turn out zero or not finite gets next to nothing at once. Every point is told to
+all, and descents start from the best points of the others as often as from new ones.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from verifai_jax.search.base import Cube, Evaluated, Plan, Search
+from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
+from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
+from verifai_jax.search.mutation import Mutation, MutationState
+
+GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
+PRIOR_GAINS, PRIOR_COSTS = np.array([4.0, 2.0, 0.5]), np.array([4.0, 4.0, 4.0])
+"""What each member is taken to have gained, at what cost, before there is evidence."""
+DISCOUNT = 0.98
+"""Of evidence, for each simulation since."""
+LEAST_SHARE = 0.05
+AMONG = 4
+"""A gain is a point among so many best ones."""
+
+
+class PortfolioState(NamedTuple):
+    key: Key[Array, ""]
+    gradient: GradientState | None
+    mutation: MutationState
+    cross_entropy: CrossEntropyState
+    credit: Float[Array, " members"]  # simulations that each may still spend
+    gains: Float[Array, " members"]
+    costs: Float[Array, " members"]
+    rows: Int[Array, " members"]  # of the last ask, one member after the other
+    slopes: Bool[Array, ""]
+    opening: Bool[Array, ""]  # the first descent is on its way, and costs nothing of its share
+
+
+@dataclass(frozen=True)
+class Portfolio(Search):
+    """Gradient, mutations and cross-entropy together, with the budget by evidence; no tuning.
+
+    **Arguments:**
+
+    - `slopes`: whether to use slopes of the robustness. They are left out by itself where there
+      are none: for black boxes, where all features are discrete, where robustness is constant
+      almost everywhere, as over signals that are whole numbers.
+    """
+
+    slopes: bool = True
+
+    @property
+    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.slopes
+
+    def without_slopes(self) -> "Portfolio":
+        """The same without slopes."""
+        return replace(self, slopes=False)
+
+    def _differentiates(self, cube: Cube) -> bool:
+        return self.slopes and len(cube.continuous) > 0
+
+    def _cross_entropy(self, batch: int) -> CrossEntropy:
+        # In small batches a round says little: patience counts simulations.
+        return CrossEntropy(patience=max(6, 128 // batch))
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
+        keys = jax.random.split(key, 3)
+        gradient = Gradient().init(keys[0], cube, batch) if self._differentiates(cube) else None
+        gains = np.where(np.arange(3) == GRADIENT, gradient is not None, True) * PRIOR_GAINS
+        return PortfolioState(
+            key=key,
+            gradient=gradient,
+            mutation=Mutation().init(keys[1], cube, batch),
+            cross_entropy=self._cross_entropy(batch).init(keys[2], cube, batch),
+            credit=jnp.zeros(3, jnp.float32),
+            gains=jnp.asarray(gains, jnp.float32),
+            costs=jnp.asarray(PRIOR_COSTS, jnp.float32),
+            rows=jnp.zeros(3, jnp.int32),
+            slopes=jnp.array(False),
+            opening=jnp.array(False),
+        )
+
+    def ask(
+        self, state: PortfolioState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], PortfolioState]:
+        mutated, mutation = Mutation().ask(state.mutation, cube, batch)
+        drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
+        state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
+        share = self._shares(state)
+        credit = state.credit + share * batch
+        slopes, descents, points = jnp.array(False), jnp.int32(0), mutated
+        opening = slopes
+        if state.gradient is not None:
+            points, gradient = Gradient().ask(state.gradient, cube, batch)
+            plan = Gradient().plan(gradient, cube, batch)
+            # The first descent goes first, from the middle of the cube to its end.
+            opening = (gradient.starts <= len(gradient.fresh)) & (gradient.useless == 0)
+            opening &= ~(state.gradient.fresh[0] & (state.gradient.starts > 0))
+            turn = opening | (credit[GRADIENT] >= 1)
+            slopes = plan.slopes & turn
+            allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
+            descents = jnp.where(turn, jnp.minimum(plan.rows, allowed), 0)
+            descents = jnp.where(slopes, plan.rows, descents)
+            state = state._replace(
+                gradient=jax.tree.map(
+                    lambda new, old: new if new is old else jnp.where(turn, new, old),
+                    gradient,
+                    state.gradient,
+                )
+            )
+        others = jnp.where(slopes, 0, batch - descents)
+        draws = jnp.minimum(jnp.floor(credit[CROSS_ENTROPY]).astype(jnp.int32), others)
+        draws = jnp.maximum(draws, 0)
+        rows = jnp.stack([descents, others - draws, draws]).astype(jnp.int32)
+        member = self._members(rows, batch)[:, None]
+        u = jnp.where(
+            member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
+        )
+        return u, state._replace(rows=rows, slopes=slopes, opening=opening)
+
+    def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
+        if state.gradient is None:
+            temperature = jnp.ones(batch, jnp.float32)
+        else:
+            temperature = state.gradient.temperature[state.gradient.descent]
+        return Plan(jnp.sum(state.rows), state.slopes, temperature)
+
+    def tell(self, state: PortfolioState, cube: Cube, evaluated: Evaluated) -> PortfolioState:
+        batch = len(evaluated.rho)
+        asked = jnp.arange(batch) < jnp.sum(state.rows)
+        evaluated = evaluated._replace(counted=evaluated.counted & asked)
+        common = self._common(evaluated)
+        member = self._members(state.rows, batch)
+        # A gain is a point among the best, once there are enough of them.
+        limit = state.mutation.score[AMONG - 1]
+        gained = common.judged & jnp.isfinite(limit) & (common.score < limit)
+        is_member = (member[None] == jnp.arange(3)[:, None]) & asked[None]
+        spent = jnp.sum(is_member, axis=1) * jnp.where(state.slopes, 2.0, 1.0)
+        total = jnp.sum(spent)
+        kept = DISCOUNT**total
+        credit = state.credit + self._shares(state) * total - spent
+        credit = jnp.where(state.opening, state.credit, credit)
+        mutation = Mutation().tell(state.mutation, cube, common)
+        # Mutations begin when enough is explored, whatever descents have seen.
+        descended = jnp.sum(common.judged & is_member[GRADIENT]).astype(jnp.int32)
+        state = state._replace(
+            mutation=mutation._replace(seen=jnp.maximum(mutation.seen - descended, 0)),
+            cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
+            gains=kept * state.gains + jnp.sum(is_member & gained[None], axis=1),
+            costs=kept * state.costs + spent,
+            # Nobody saves, or owes, more than a few rounds.
+            credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
+        )
+        if state.gradient is None:
+            return state
+        own = evaluated._replace(counted=evaluated.counted & (member == GRADIENT))
+        told = Gradient().tell(state.gradient, cube, own)
+        turn = state.rows[GRADIENT] > 0
+        told = jax.tree.map(
+            lambda new, old: new if new is old else jnp.where(turn, new, old), told, state.gradient
+        )
+        # One of the best points of all is offered as a start.
+        rank = (state.mutation.round % AMONG).astype(jnp.int32)
+        open_ = (state.mutation.score[rank] > 0) & jnp.isfinite(state.mutation.score[rank])
+        told = told._replace(
+            offered=jnp.where(open_, state.mutation.points[rank], told.offered), offers=open_
+        )
+        return state._replace(gradient=told)
+
+    def warm(self, state: PortfolioState, cube: Cube, evaluated: Evaluated) -> PortfolioState:
+        common = evaluated._replace(gradient=None, clauses=None, slopes=None)
+        batch = len(evaluated.rho)
+        gradient = state.gradient
+        if gradient is not None:
+            gradient = Gradient().warm(gradient, cube, common)
+        return state._replace(
+            gradient=gradient,
+            mutation=Mutation().tell(state.mutation, cube, common),
+            cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
+        )
+
+    def _shares(self, state: PortfolioState) -> Float[Array, " members"]:
+        rate = (state.gains + 0.1 * PRIOR_GAINS) / (state.costs + 0.1 * PRIOR_COSTS)
+        rate = rate.astype(jnp.float32)
+        if state.gradient is None:
+            rate = rate.at[GRADIENT].set(0.0)
+            least = np.array([0.0, LEAST_SHARE, LEAST_SHARE], np.float32)
+        else:
+            dead = state.gradient.useless >= 2
+            rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
+            least = jnp.stack([jnp.where(dead, 0.02, LEAST_SHARE), LEAST_SHARE, LEAST_SHARE])
+        share = rate / jnp.maximum(jnp.sum(rate), 1e-9)
+        share = jnp.maximum(share, least)
+        return (share / jnp.sum(share)).astype(jnp.float32)
+
+    def _members(self, rows: Int[Array, " members"], batch: int) -> Int[Array, " batch"]:
+        row = jnp.arange(batch)
+        return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
+
+    def _common(self, evaluated: Evaluated) -> Evaluated:
+        """What those members are told that know of no clauses."""
+        rho = evaluated.rho
+        if evaluated.clauses is not None:
+            # Where clauses of different units have to be broken together, without unit.
+            several = evaluated.clauses[:, 1] > NOTHING
+            greatest = jnp.max(evaluated.clauses, axis=1)
+            rho = jnp.where(several & jnp.isfinite(greatest), greatest, rho)
+        return Evaluated(evaluated.u, rho, evaluated.counted)
