@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from verifai_jax.estimation import mixture
+from verifai_jax.estimation import fitting, mixture
+from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.splitting import split
 
 
@@ -17,13 +18,13 @@ def failures():
 
 def components(failures):
     z, weight = failures
-    steps = mixture.smooth(z, weight)
+    steps = fitting.smooth(z, weight)
     return {
-        "gaussian": mixture.gaussian(z, weight),
+        "gaussian": fitting.gaussian(z, weight),
         "smooth": steps,
-        "copula": mixture.copula(z, weight, steps),
-        "alike": mixture.alike(z, weight),
-        "shell": mixture.shell(z, weight),
+        "copula": fitting.copula(z, weight, steps),
+        "alike": fitting.alike(z, weight),
+        "shell": fitting.shell(z, weight),
     }
 
 
@@ -33,7 +34,7 @@ def test_density_is_that_of_the_samples(failures, name):
     random = np.random.default_rng(1)
     # With the prior mixed in, the mean of prior over proposal density over a region is its
     # probability under the prior.
-    both = mixture.Mixture((mixture.Prior(3), component), np.array([0.5, 0.5]))
+    both = mixture.Mixture((Prior(3), component), np.array([0.5, 0.5]))
     z, _ = both.sample(random, 200_000)
     for inside, truth in (
         (np.ones(len(z), bool), 1.0),

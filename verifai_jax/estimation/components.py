@@ -1,0 +1,188 @@
+"""Densities over standard normal space that proposals are mixed from, relative to the prior.
+
+component = Gaussian(mean, axes, stds)
+z = component.sample(rng, 1000)
+component.log_ratio(z)                          # its density over the prior's, logarithmic
+"""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Component(Protocol):
+    """A density over normal space."""
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        """Independent points."""
+        ...
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Logarithm of this density over the standard normal one."""
+        ...
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The prior itself: the defensive part."""
+
+    dim: int
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        return rng.standard_normal((n, self.dim))
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        return np.zeros(len(z))
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A normal density: `mean [d]`, and axes `[d, d]` (columns) with their standard deviations."""
+
+    mean: Float[np.ndarray, " d"]
+    axes: Float[np.ndarray, "d d"]
+    stds: Float[np.ndarray, " d"]
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        return self.mean + (rng.standard_normal((n, len(self.mean))) * self.stds) @ self.axes.T
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        white = (z - self.mean) @ self.axes / self.stds
+        return (np.sum(z * z, axis=1) - np.sum(white * white, axis=1)) / 2 - np.sum(
+            np.log(self.stds)
+        )
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Independent coordinates, each the prior times a step function of the coordinate.
+
+    - `edges`: for each coordinate, borders of the steps in normal space, from -inf to inf.
+    - `log_steps`: for each, the logarithm of the density over the prior's; `masses` of the steps.
+    """
+
+    edges: tuple[Float[np.ndarray, " k"], ...]
+    log_steps: tuple[Float[np.ndarray, " k"], ...]
+    masses: tuple[Float[np.ndarray, " k"], ...]
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        z = rng.standard_normal((n, len(self.edges)))
+        for i, (edges, mass) in enumerate(zip(self.edges, self.masses, strict=True)):
+            if len(mass) > 1:
+                step = rng.choice(len(mass), n, p=mass)
+                z[:, i] = _between(edges[step], edges[step + 1], rng.random(n))
+        return z
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        total = np.zeros(len(z))
+        for i, (edges, log) in enumerate(zip(self.edges, self.log_steps, strict=True)):
+            if len(log) > 1:
+                total += log[np.searchsorted(edges[1:-1], z[:, i], side="right")]
+        return total
+
+
+@dataclass(frozen=True)
+class Copula:
+    """Coordinates with these marginals, dependent as those of a normal vector.
+
+    - `axes`, `stds`: of its correlation matrix: eigenvectors `[d, d]` and roots of eigenvalues.
+    """
+
+    marginals: Marginals
+    axes: Float[np.ndarray, "d d"]
+    stds: Float[np.ndarray, " d"]
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        from scipy.special import ndtr, ndtri
+
+        v = (rng.standard_normal((n, len(self.stds))) * self.stds) @ self.axes.T
+        z = v.copy()
+        for i, (edges, mass) in enumerate(
+            zip(self.marginals.edges, self.marginals.masses, strict=True)
+        ):
+            if len(mass) > 1:
+                rank, total = ndtr(v[:, i]), np.append(0, np.cumsum(mass))
+                step = np.clip(np.searchsorted(total, rank, side="right") - 1, 0, len(mass) - 1)
+                within = (rank - total[step]) / mass[step]
+                z[:, i] = _between(edges[step], edges[step + 1], within)
+            else:
+                z[:, i] = ndtri(ndtr(v[:, i]))
+        return z
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        v = rank_scores(self.marginals, z)
+        white = v @ self.axes / self.stds
+        dependence = (np.sum(v * v, axis=1) - np.sum(white * white, axis=1)) / 2
+        return self.marginals.log_ratio(z) + dependence - np.sum(np.log(self.stds))
+
+
+def rank_scores(marginals: Marginals, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """Each coordinate as the standard normal number of the same rank."""
+    from scipy.special import ndtr, ndtri
+
+    v = z.copy()
+    for i, (edges, mass) in enumerate(zip(marginals.edges, marginals.masses, strict=True)):
+        if len(mass) > 1:
+            borders = ndtr(edges)
+            step = np.searchsorted(edges[1:-1], z[:, i], side="right")
+            within = (ndtr(z[:, i]) - borders[step]) / (borders[step + 1] - borders[step])
+            rank = np.append(0, np.cumsum(mass))[step] + within * mass[step]
+            v[:, i] = ndtri(np.clip(rank, 1e-12, 1 - 1e-12))
+    return v
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Every direction alike; the distance from the origin is the prior's times a step function.
+
+    - `edges`: borders of the steps, in normal scores of the distance.
+    """
+
+    dim: int
+    steps: Marginals
+
+    def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        from scipy.special import gammainccinv, gammaincinv, ndtr
+
+        score = self.steps.sample(rng, n)[:, 0]
+        half = self.dim / 2
+        square = np.where(
+            score > 0, gammainccinv(half, ndtr(-score)), gammaincinv(half, ndtr(score))
+        )
+        direction = rng.standard_normal((n, self.dim))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return direction * np.sqrt(2 * square)[:, None]
+
+    def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        return self.steps.log_ratio(radial_score(z)[:, None])
+
+
+def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """The distance from the origin as a standard normal number: its quantile among the prior's."""
+    from scipy.special import gammainc, gammaincc, ndtri
+
+    half, square = z.shape[1] / 2, np.sum(z * z, axis=1) / 2
+    above = gammaincc(half, square)
+    outer = -ndtri(np.maximum(above, 1e-300))
+    return np.where(above < 0.5, outer, ndtri(np.maximum(gammainc(half, square), 1e-300)))
+
+
+def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarray:
+    """Standard normal numbers between two borders, exact in both tails."""
+    from scipy.special import ndtr, ndtri
+
+    mirrored = low > 0
+    a, b = np.where(mirrored, -high, low), np.where(mirrored, -low, high)
+    rank = np.where(mirrored, 1 - uniform, uniform)  # It must still grow with the result.
+    z = ndtri(np.clip(ndtr(a) + rank * (ndtr(b) - ndtr(a)), 1e-300, 1 - 1e-16))
+    return np.where(mirrored, -z, z)
+
+
+def ratios(components: Any, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n k"]:
+    """Logarithm of each component's density over the prior's; cut where it would overflow."""
+    if not len(z):
+        return np.zeros((0, len(components)))
+    columns = [np.clip(component.log_ratio(z), -700, 700) for component in components]
+    return np.stack(columns, axis=1)

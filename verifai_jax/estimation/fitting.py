@@ -1,0 +1,248 @@
+"""Components fitted to weighted failures, each in its own way.
+
+    gaussian(z, weight); smooth(z, weight); copula(z, weight, steps); shell(z, weight)
+
+The weights are of sum one. `worth` says how much less the points are worth than as many independent
+ones: what is believed of them beyond the prior is what so few can show.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.estimation.components import (
+    Copula,
+    Gaussian,
+    Marginals,
+    Shell,
+    radial_score,
+    rank_scores,
+    ratios,
+)
+
+SWEEPS = 12
+"""Of expectation maximisation, at most."""
+KERNELS = 400
+"""Points that a kernel density is made from, at most,"""
+CELLS = 48
+"""and steps that it is kept in."""
+
+
+def size_of(weight: Float[np.ndarray, " n"]) -> float:
+    """How many equally weighted points these are worth."""
+    return float(weight.sum() ** 2 / np.sum(weight * weight)) if len(weight) else 0.0
+
+
+def gaussian(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Gaussian:
+    """Mean and covariance, of which only what exceeds the noise of so few points is believed.
+
+    Eigenvalues within the range that those of white noise have (Marchenko and Pastur, 1967) are
+    replaced by their mean.
+    """
+    d = z.shape[1]
+    size = max(size_of(weight) * worth, 1.0)
+    mean = weight @ z
+    centred = z - mean
+    values, axes = np.linalg.eigh((centred * weight[:, None]).T @ centred)
+    ratio = d / max(size - 1, 1)
+    level, inside = 1.0, np.ones(d, bool)
+    for _ in range(20):
+        low, high = level * max(0.0, 1 - np.sqrt(ratio)) ** 2, level * (1 + np.sqrt(ratio)) ** 2
+        # With few coordinates the range is no range: then about three standard errors.
+        low, high = low * (1 - 2 / np.sqrt(size)), high * (1 + 2 / np.sqrt(size))
+        inside = (values >= low) & (values <= high)
+        if not inside.any():
+            break
+        new = float(values[inside].mean())
+        if abs(new - level) < 1e-6:
+            break
+        level = new
+    if ratio >= 1:
+        values, inside = np.full(d, float(values.mean())), np.ones(d, bool)
+        level = float(values.mean())
+    values = np.where(inside, level, values) if inside.any() else values
+    return Gaussian(mean, axes, np.sqrt(np.clip(values, 1e-8, 25.0)))
+
+
+def mixture_of_gaussians(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    modes: int,
+    rng: np.random.Generator,
+    worth: float = 1.0,
+) -> tuple[list[float], list[Gaussian], Float[np.ndarray, "n modes"]]:
+    """Expectation maximisation from spread-out centres, with the covariances of `gaussian`."""
+    n = len(z)
+    centre = z[rng.choice(n, p=weight)]
+    distance = np.sum((z - centre) ** 2, axis=1)
+    centres = [centre]
+    for _ in range(1, modes):
+        chance = weight * distance
+        if chance.sum() <= 0:
+            break
+        centres.append(z[rng.choice(n, p=chance / chance.sum())])
+        distance = np.minimum(distance, np.sum((z - centres[-1]) ** 2, axis=1))
+    gaps = np.stack([np.sum((z - c) ** 2, axis=1) for c in centres], axis=1)
+    member = np.eye(len(centres))[gaps.argmin(axis=1)] * weight[:, None]
+    shares, found = [1.0], []
+    for sweep in range(SWEEPS if modes > 1 else 1):
+        kept = member.sum(axis=0) > 1e-9
+        member = member[:, kept]
+        shares = list(member.sum(axis=0) / member.sum())
+        found = [gaussian(z, column / column.sum(), worth) for column in member.T]
+        if modes == 1 or sweep == SWEEPS - 1:
+            break
+        logs = ratios(found, z) + np.log(shares)
+        logs -= logs.max(axis=1, keepdims=True)
+        new = np.exp(logs)
+        new *= (weight / new.sum(axis=1))[:, None]
+        moved = np.abs(new - member).sum()
+        member = new
+        if moved < 0.01:
+            break
+    return shares, found, member
+
+
+_INNER = np.array([1e-6, 1e-5, 1e-4, 5e-4, 1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.04, 0.07])
+
+
+def _borders() -> list[Float[np.ndarray, " k"]]:
+    """Borders of steps to choose from, as probabilities: even ones, and ones fine at both ends."""
+    even = [np.linspace(0, 1, k + 1) for k in (2, 4, 8, 16, 32)]
+    middle = np.linspace(0.1, 0.9, 9)
+    tails = np.concatenate([[0], _INNER, middle, 1 - _INNER[::-1], [1]])
+    coarse = np.concatenate([[0, 1e-4, 2e-3, 0.02], [0.1, 0.3, 0.5, 0.7, 0.9]])
+    coarse = np.concatenate([coarse, [0.98, 0.998, 1 - 1e-4, 1]])
+    return [*even, coarse, tails]
+
+
+_BORDERS = _borders()
+_FINEST = np.unique(np.concatenate(_BORDERS))
+_AMONG = [np.searchsorted(_FINEST, border) for border in _BORDERS]
+
+
+def copula(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    steps: Marginals,
+    worth: float = 1.0,
+) -> Copula | None:
+    """These marginals with the correlations that are no noise; None where there are none."""
+    d, size = z.shape[1], size_of(weight) * worth
+    v = rank_scores(steps, z)
+    centred = v - weight @ v
+    cross = (centred * weight[:, None]).T @ centred
+    spread = np.sqrt(np.maximum(np.diag(cross), 1e-12))
+    correlation = cross / np.outer(spread, spread)
+    noise = 2.5 / np.sqrt(size)
+    kept = np.where(np.abs(correlation) > noise, correlation * (1 - 1 / max(size, 2)), 0.0)
+    np.fill_diagonal(kept, 1.0)
+    if np.count_nonzero(kept) == d:
+        return None
+    values, axes = np.linalg.eigh(kept)
+    values = np.clip(values, 0.02, None)
+    return Copula(steps, axes, np.sqrt(values))
+
+
+def smooth(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    wider: float = 1.0,
+    worth: float = 1.0,
+) -> Marginals:
+    """The density of each coordinate by kernels, reflected at the ends, in fine steps.
+
+    - `wider`: than Silverman's rule (Density estimation, 1986, equation 3.31) has the kernels.
+    """
+    from scipy.special import ndtr, ndtri
+
+    size = size_of(weight) * worth
+    if len(z) > KERNELS:
+        # Equally many points in each part of the weight: the same density with less work.
+        places = (np.arange(KERNELS) + 0.5) / KERNELS
+        rows = np.searchsorted(np.cumsum(weight), places * weight.sum())
+        z, weight = z[np.minimum(rows, len(z) - 1)], np.full(KERNELS, 1 / KERNELS)
+    edges, logs, masses = [], [], []
+    for column in ndtr(z).T:
+        order = np.argsort(column)
+        total = np.cumsum(weight[order])
+        quarter, three = np.interp([0.25, 0.75], total, column[order])
+        middle = weight @ column
+        std = float(np.sqrt(weight @ (column - middle) ** 2))
+        width = max(0.9 * min(std, (three - quarter) / 1.34 + 1e-9) * size**-0.2, 1e-9) * wider
+        low, high = max(0.0, column.min() - 3 * width), min(1.0, column.max() + 3 * width)
+        border = np.unique(np.concatenate([[0.0], np.linspace(low, high, CELLS + 1), [1.0]]))
+        mass = np.zeros(len(border) - 1)
+        for mirror in (column, -column, 2 - column):
+            mass += weight @ np.diff(ndtr((border[None] - mirror[:, None]) / width), axis=1)
+        prior = np.diff(border)
+        mass = (mass * size + 2 * prior) / (mass.sum() * size + 2)
+        if size * float(mass @ np.log(mass / prior)) < 4.0:
+            border, prior, mass = np.array([0.0, 1.0]), np.ones(1), np.ones(1)
+        edges.append(ndtri(border))
+        logs.append(np.log(mass / prior))
+        masses.append(mass / mass.sum())
+    return Marginals(tuple(edges), tuple(logs), tuple(masses))
+
+
+def alike(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Marginals:
+    """One step function for all coordinates, from all of them together."""
+    from scipy.special import ndtr
+
+    d = z.shape[1]
+    found = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, size_of(weight) * worth * d)
+    return Marginals(*((part,) * d for part in found))
+
+
+def _steps(
+    u: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Borders, logarithmic heights and masses, with the borders that Akaike's criterion prefers."""
+    from scipy.special import ndtri
+
+    best = 0.0
+    chosen = (np.array([-np.inf, np.inf]), np.zeros(1), np.ones(1))
+    # Counted once, in the finest borders, of which the others are sums.
+    place = np.clip(np.searchsorted(_FINEST, u, side="right") - 1, 0, len(_FINEST) - 2)
+    fine = np.append(0, np.cumsum(np.bincount(place, weight, len(_FINEST) - 1)))
+    for border, among in zip(_BORDERS, _AMONG, strict=True):
+        k = len(border) - 1
+        if k > size:
+            continue
+        width, share = np.diff(border), np.diff(fine[among])
+        # Two points spread as the prior is, so that no step is empty.
+        mass = (share * size + 2 * width) / (size + 2)
+        gain = size * float(share @ np.log(mass / width)) - 1.5 * (k - 1)
+        if gain > best:
+            best = gain
+            chosen = (ndtri(border), np.log(mass / width), mass / mass.sum())
+    return chosen
+
+
+def shell(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Shell:
+    """Shells of the distances that these points have, in steps narrow in probability."""
+    from scipy.special import ndtr
+
+    score = radial_score(z)
+    size = size_of(weight) * worth
+    order = np.argsort(score)
+    total = np.cumsum(weight[order])
+    steps = int(np.clip(size // 20, 2, 12))
+    inner = np.unique(np.interp(np.arange(1, steps) / steps, total, score[order]))
+    low, high = score.min() - 0.05, score.max() + 0.3
+    edges = np.unique(np.concatenate([[-np.inf, low], inner, [high, np.inf]]))
+    place = np.clip(np.searchsorted(edges, score, side="right") - 1, 0, len(edges) - 2)
+    below, above = edges[:-1], edges[1:]
+    width = np.where(below > 0, ndtr(-below) - ndtr(-above), ndtr(above) - ndtr(below))
+    width = np.maximum(width, 1e-300)
+    mass = (np.bincount(place, weight, len(width)) * size + 0.5) / (size + 0.5 * len(width))
+    # Outside of all that was seen the prior's own density is enough.
+    mass[0], mass[-1] = min(mass[0], width[0]), min(mass[-1], max(width[-1], 0.01))
+    mass = mass / mass.sum()
+    steps_of = Marginals((edges,), (np.log(mass / width),), (mass,))
+    return Shell(z.shape[1], steps_of)
