@@ -41,7 +41,7 @@ def problem_of(name, d, rho, nominal=None, black_box=False, space=None):
 
 def two_modes(u):
     """A large ball far away, a small one near."""
-    far = jnp.linalg.norm(u - 0.85 + 1e-9) - 0.28 * math.sqrt(len(u))
+    far = jnp.linalg.norm(u - 0.85 + 1e-9) - 0.2 * math.sqrt(len(u))
     near = jnp.linalg.norm(u - jnp.array([0.2, *[0.5] * (len(u) - 1)]) + 1e-9) - 0.1
     return jnp.minimum(far, near)
 
