@@ -44,14 +44,15 @@ def row_of(run: Run, row: Any) -> tuple[int, Any]:
     number = int(number)
     if not 0 <= number < run.simulations:
         raise IndexError(f"row {number} is not in the table of {run.simulations} simulations")
-    if number not in failing.index:
-        entry = run.table.all.iloc[number]
+    entry = run.table.all.iloc[number]
+    # A row that was not confirmed is none that the run claims; it may be asked for all the same.
+    if number not in failing.index and not bool(entry.get("violated", False)):
         some = ", ".join(map(str, failing.index[:5]))
         raise ValueError(
             f"row {number} is no counterexample: status {entry['status']}, robustness "
             f"{entry['rho']:.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
         )
-    return number, failing.loc[number]
+    return number, entry
 
 
 def other_failures(run: Run, nominal: Nominal, number: int, most: int) -> Float[np.ndarray, "n d"]:
