@@ -71,8 +71,8 @@ class Diverse(Search):
     search: Search
     radius: float = 0.25
     least_radius: float = 0.01
-    shrink: float = 0.75
-    patience: int = 6
+    shrink: float = 0.8
+    patience: int = 8
     capacity: int = 256
 
     def __post_init__(self) -> None:
@@ -172,9 +172,7 @@ class Diverse(Search):
         raised = self._raised(state, cube, u, jnp.where(judged, evaluated.rho, jnp.inf))
         nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
         progress = found | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
-        # A round of failures that are all known counts twice: it is not on its way to others.
-        known = jnp.any(judged & (evaluated.rho < 0)).astype(jnp.int32)
-        idle = jnp.where(progress, 0, state.idle + 1 + known).astype(jnp.int32)
+        idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
         tired = idle >= self.patience
         smaller = jnp.maximum(self.shrink * state.radius, self.least_radius)
         state = state._replace(
