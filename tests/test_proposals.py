@@ -42,7 +42,8 @@ def test_every_search(name):
     points = play(proposals, 8, search.wants_gradient)
     features = jax.vmap(SPACE.unflatten)(jnp.asarray(points))
     assert np.all(jax.vmap(below)(features))
-    assert len(points) >= 64
+    # Rounds with slopes are of few rows.
+    assert len(points) >= (16 if search.wants_clauses else 64)
     assert proposals.accepted == len(points) <= proposals.asked
     again = play(Proposals(search, SPACE, 16, KEY), 8, search.wants_gradient)
     np.testing.assert_array_equal(points, again)

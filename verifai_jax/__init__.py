@@ -5,7 +5,14 @@ __version__ = "0.1.0"
 from verifai_jax import analysis as analysis
 from verifai_jax import mtl as mtl
 from verifai_jax import search as search
+from verifai_jax.counterexample import Confirmation as Confirmation
+from verifai_jax.counterexample import Confirmations as Confirmations
+from verifai_jax.counterexample import confirm as confirm
+from verifai_jax.counterexample import explain as explain
+from verifai_jax.counterexample import shrink as shrink
 from verifai_jax.devices import claim_cores as _claim_cores
+from verifai_jax.estimation import Estimate as Estimate
+from verifai_jax.estimation import estimate as estimate
 from verifai_jax.falsify import RunError as RunError
 from verifai_jax.falsify import falsify as falsify
 from verifai_jax.falsify import resume as resume
@@ -55,6 +62,10 @@ from verifai_jax.rulebook import Rulebook as Rulebook
 from verifai_jax.run import Replay as Replay
 from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load
+from verifai_jax.synthesis import Repair as Repair
+from verifai_jax.synthesis import Synthesis as Synthesis
+from verifai_jax.synthesis import repair as repair
+from verifai_jax.synthesis import synthesize as synthesize
 from verifai_jax.systems import blackbox as blackbox
 from verifai_jax.systems import brax as brax
 from verifai_jax.systems import gymnasium as gymnasium

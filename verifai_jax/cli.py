@@ -12,6 +12,12 @@ from typing import Any
 import click
 
 from verifai_jax import __version__
+from verifai_jax.commands.confirm import confirm
+from verifai_jax.commands.estimate import estimate
+from verifai_jax.commands.explain import explain
+from verifai_jax.commands.repair import repair
+from verifai_jax.commands.shrink import shrink
+from verifai_jax.commands.synthesize import synthesize
 from verifai_jax.errors import MissingExtra
 
 
@@ -49,7 +55,7 @@ def main(traceback: bool) -> None:
 
 @main.command()
 @click.argument("target", required=False)
-@click.option("--search", help="Name of the search  [default: cross_entropy]")
+@click.option("--search", help="Name of the search  [default: portfolio]")
 @click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 @click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
 @click.option("--batch", type=int, help="Simulations a round  [default: by search]")
@@ -63,6 +69,13 @@ def main(traceback: bool) -> None:
 @click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
 @click.option("--precision", type=click.Choice(["float32", "float64"]), help="[default: float32]")
 @click.option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
+@click.option(
+    "--confirm/--no-confirm",
+    "confirm_found",
+    default=True,
+    help="Claim only what closer replays confirm  [default: confirm]",
+)
+@click.option("--diverse", is_flag=True, help="Look for failures of different kinds.")
 @click.option("--out", type=click.Path(path_type=Path), help="Run folder [runs/NAME-1, -2, ...].")
 @click.option("--pictures/--no-pictures", default=True, help="Draw pictures into the run folder.")
 def falsify(
@@ -81,6 +94,8 @@ def falsify(
     resume: Path | None,
     precision: str | None,
     backend: str | None,
+    confirm_found: bool,
+    diverse: bool,
     out: Path | None,
     pictures: bool,
 ) -> None:
@@ -109,7 +124,7 @@ def falsify(
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     else:
-        chosen = named(search or "cross_entropy", **_options(options))
+        chosen = named(search or "portfolio", **_options(options))
         problem = _only(load_target(target), only)
         run = run_falsify(
             problem,
@@ -121,6 +136,8 @@ def falsify(
             folder=out or _next_folder(problem.name),
             precision=precision or "float32",
             backend=backend,
+            confirm=confirm_found,
+            diverse=diverse,
             target=target,
             **ends,
         )
@@ -134,6 +151,10 @@ def falsify(
             click.echo(f"  picture      {path}")
     if run.simulations and len(run.table.failed) < run.simulations:
         click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
+
+
+for _command in (confirm, estimate, explain, repair, shrink, synthesize):
+    main.add_command(_command)
 
 
 @main.command(name="list")

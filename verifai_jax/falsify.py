@@ -67,6 +67,8 @@ def falsify(
     folder: str | Path | None = None,
     precision: str = "float32",
     backend: str | None = None,
+    confirm: bool = True,
+    diverse: bool = False,
     progress: bool | None = None,
     target: str | None = None,
 ) -> Run:
@@ -91,6 +93,11 @@ def falsify(
     - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
     - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
       can use when left out, as measured here. Name it for the same table on every machine.
+    - `confirm`: replay what violates the property in double precision and at a half and a quarter
+      of the step, and claim only what still does (`vj.confirm` says more of a row). The others
+      stay in the table, as `unconfirmed`.
+    - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
+      failures that are far from each other (`search.Diverse`).
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
 
@@ -117,9 +124,11 @@ def falsify(
     check_gradient(problem, search)
     problem.check()
     search, notes = usable(problem, search)
+    if diverse:
+        search = searches.Diverse(search)
     place = new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
-    rounds = Rounds(problem, search, batch, seed, table, precision, place)
+    rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)
 
     def prepare() -> None:
         if earlier is not None:
@@ -162,7 +171,7 @@ def simulate(
     return falsify(
         problem, searches.Listed(points), len(points),
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
-        progress=progress,
+        confirm=False, progress=progress,
     )  # fmt: skip
 
 
@@ -231,7 +240,9 @@ def resume(
     problem.check()
     with writing(run.folder):
         table = run.table.resumed(rows, run.folder)
-    rounds = Rounds(problem, search, run.batch, run.seed, table, run.precision, run.folder)
+    rounds = Rounds(
+        problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm
+    )
 
     def prepare() -> None:
         if snapshot:
@@ -258,7 +269,7 @@ class _Ends(NamedTuple):
 
     def reached(self, rounds: Rounds) -> str | None:
         """What ends the run after this round, if anything does."""
-        if self.stop_after is not None and rounds.found >= self.stop_after:
+        if self.stop_after is not None and rounds.distinct >= self.stop_after:
             return "stop_after"
         if self.stop_when is not None and self.stop_when.done(rounds.found, rounds.judged):
             return "stop_when"
@@ -308,6 +319,7 @@ def _play(
             snapshot=rounds.snapshot,
             precision=rounds.precision,
             backend=choice.backend,
+            confirm=rounds.confirms,
             notes=(*chosen, *told, *rounds.notes),
         )
 

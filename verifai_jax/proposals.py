@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.features import FeatureSpace
-from verifai_jax.search import Cube, Evaluated, Plan, Search
+from verifai_jax.search import Cube, Diverse, Evaluated, Plan, Search
 from verifai_jax.search.base import CLAUSES
 
 TRIES = 32
@@ -83,6 +83,11 @@ class Proposals:
     def exhausted(self) -> bool:
         """Whether a finite search has no further point."""
         return self.total is not None and self.asked >= self.total and not len(self._queue)
+
+    @property
+    def distinct(self) -> int:
+        """Failures far from each other that a search for diverse ones has found."""
+        return int(Diverse.count(self._state))
 
     @property
     def slopes(self) -> bool:
@@ -222,8 +227,8 @@ class Proposals:
         self._plan = None
         planned = len(points)
         if self.search.wants_clauses:
-            self._plan = self._program.plan(self._state)
-            planned = int(self._plan.rows)
+            plan: Plan = self._program.plan(self._state)
+            self._plan, planned = plan, int(plan.rows)
         self.asked += planned
         wanted = np.arange(len(points)) < planned
         accepted = self._accepted_rows(points) & wanted

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
+from verifai_jax.confirmation import Confirmer
 from verifai_jax.engine import Evaluation, engine_for
 from verifai_jax.evaluator import violated
 from verifai_jax.host import HostEngine
@@ -20,9 +21,9 @@ from verifai_jax.problem import Problem
 from verifai_jax.proposals import Proposals, units
 from verifai_jax.rulebook import Objective
 from verifai_jax.run import run_keys
-from verifai_jax.search import Search
+from verifai_jax.search import Diverse, Search
 from verifai_jax.snapshot import write_snapshot
-from verifai_jax.table import ErrorTable
+from verifai_jax.table import NOT_CLAIMED, ErrorTable
 from verifai_jax.trace import Status
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ class Rounds:
         table: ErrorTable,
         precision: str = "float32",
         folder: Path | None = None,
+        confirm: bool = False,
     ) -> None:
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
         self.precision, self.folder = precision, folder
@@ -73,6 +75,7 @@ class Rounds:
         self.best = float("nan")
         self.compile_seconds = 0.0
         self.snapshot: dict[str, Any] = {}
+        self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
         self._saved = time.perf_counter()
@@ -82,6 +85,18 @@ class Rounds:
         self.engine.compile()
         self._proposals = Proposals(self.search, self.problem.space, self.batch, self.search_key)
         self._keep()
+
+    @property
+    def confirms(self) -> bool:
+        """Whether only what closer replays confirm is claimed."""
+        return self._confirmer is not None
+
+    @property
+    def distinct(self) -> int:
+        """Counterexamples found, of a search for diverse ones those far from each other."""
+        if isinstance(self.search, Diverse):
+            return self._proposals.distinct
+        return self.found
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -113,9 +128,18 @@ class Rounds:
         violated = self._violated(evaluation, points, first)
         rho = np.min(evaluation.rho, axis=1)
         proper = evaluation.status == Status.OK
+        columns = self._columns(evaluation, rho, violated)
         told = rho
         if self._objective is not None:
             told = self._objective(evaluation.rho, evaluation.rho < 0)
+        claimed = violated
+        if self._confirmer is not None:
+            verdict, held = self._confirmed(self._confirmer, columns, first)
+            columns["verdict"] = verdict
+            claimed = violated & ~np.isin(verdict, NOT_CLAIMED)
+            # A search that took them for failures would stay with them.
+            told = np.where(violated & ~claimed, held, told)
+            evaluation = _raised(evaluation, violated & ~claimed)
         gradient = evaluation.gradient
         self._proposals.tell(
             told.astype(np.float32),  # Searches compute in float32, whatever the simulations do.
@@ -124,11 +148,35 @@ class Rounds:
             None if evaluation.clauses is None else evaluation.clauses.astype(np.float32),
             None if evaluation.slopes is None else evaluation.slopes.astype(np.float32),
         )
-        self.table.append(self._columns(evaluation, rho, violated))
-        self.found += int(np.sum(violated))
+        self.table.append(columns)
+        self.found += int(np.sum(claimed))
         self.judged += int(np.sum(proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
         self._keep()
+
+    def _confirmed(
+        self, confirmer: Confirmer, columns: dict[str, Any], first: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The verdict of each row, empty where nothing is violated, and what speaks against it.
+
+        That is the greatest robustness of the replays, and no less than next to nothing.
+        """
+        rows = np.flatnonzero(columns["violated"])
+        verdict = np.full(len(columns["rho"]), "", object)
+        held = np.full(len(verdict), np.nan)
+        if not len(rows):
+            return verdict, held
+        if self.problem.black_box and not hasattr(self.problem.system, "refined"):
+            # Simulating it again is all that could be done, and may take as long as the run.
+            verdict[rows] = "unchecked"
+            return verdict, held
+        own = {name: column[rows] for name, column in columns.items()}
+        checked = confirmer(own, first + rows)
+        verdict[rows] = checked.verdict
+        if checked.rho:
+            greatest = np.nanmax(np.stack([*checked.rho.values(), own["rho"]]), axis=0)
+            held[rows] = np.maximum(greatest, 1e-6)
+        return verdict, held
 
     def _evaluated(self, points: Any, first: int) -> Evaluation:
         temperature = self._proposals.temperature
@@ -183,12 +231,18 @@ class Rounds:
             # Only now: rows of the table that the snapshot does not know are simulated again.
             self._journal.settle(int(self.snapshot.get("rows", 0)))
 
+    def _restore_confirmer(self, snapshot: Mapping[str, Any]) -> None:
+        if self._confirmer is not None and "confirmer" in snapshot:
+            examined, band = snapshot["confirmer"]
+            self._confirmer.examined, self._confirmer.band = int(examined), float(band)
+
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on where `snapshot` was taken; the table must hold its rows already.
 
         **Raises:** `ValueError` for a snapshot of another search, space or batch size.
         """
         self._proposals.restore(snapshot)
+        self._restore_confirmer(snapshot)
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: snapshot[f"objective.{name}"] for name in names}
@@ -206,6 +260,9 @@ class Rounds:
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }
+        if self._confirmer is not None:
+            seen = self._confirmer
+            self.snapshot["confirmer"] = np.array([seen.examined, seen.band], np.float64)
 
     def _violated(self, evaluation: Evaluation, points: Any, first: int) -> np.ndarray:
         compiled = getattr(self.engine, "compile_seconds", 0.0)
@@ -230,3 +287,11 @@ class Rounds:
         if evaluation.messages is not None:
             columns["message"] = np.array(evaluation.messages, dtype=object)
         return columns
+
+
+def _raised(evaluation: Evaluation, rows: np.ndarray) -> Evaluation:
+    """The same with clauses that are not broken in these rows."""
+    if evaluation.clauses is None or not rows.any():
+        return evaluation
+    lift = np.where(rows, 1e-6 - np.max(evaluation.clauses, axis=1), 0.0)
+    return evaluation._replace(clauses=evaluation.clauses + lift[:, None])

@@ -93,7 +93,8 @@ class Run:
     user's own; `acceptance`: share of
     proposed points that the constraint of the space let through, None without one; `snapshot`: what
     `resume` goes on from; `precision` of the simulations; `backend` that simulated, None for a
-    system that has one only; `notes` on what was decided by itself, for people.
+    system that has one only; `notes` on what was decided by itself, for people; `confirm`: whether
+    what violates the property was looked at closely before it was claimed.
     """
 
     name: str
@@ -118,6 +119,7 @@ class Run:
     precision: str = "float32"
     backend: str | None = None
     notes: Sequence[str] = ()
+    confirm: bool = False
 
     @property
     def simulations(self) -> int:
@@ -126,12 +128,14 @@ class Run:
 
     @property
     def best(self) -> "pd.Series":
-        """The row with the least robustness among those that ended properly.
+        """The row with the least robustness among the counterexamples, or among all that ended.
 
         **Raises:** `ValueError` when no simulation ended properly.
         """
         table = self.table.all
         proper = table.loc[table["status"] == "ok"]
+        if len(claimed := self.table.counterexamples):
+            return claimed.loc[claimed["rho"].idxmin()]
         if not len(proper):
             raise ValueError(
                 f"run of {self.name!r} has no simulation with a verdict: "
@@ -148,7 +152,9 @@ class Run:
         the feature space and at least one of them has a verdict: an active search may refute, it
         never certifies. Simulations without a verdict do not count.
         """
-        failures, safe = len(self.table.counterexamples), len(self.table.safe)
+        # The rate is that of the system as simulated: what is not confirmed counts as a failure.
+        failures = len(self.table.counterexamples) + len(self.table.unconfirmed)
+        safe = len(self.table.safe)
         if not self.prior or failures + safe == 0:
             return None
         if self.stopped in ("stop_after", "stop_when"):
@@ -306,6 +312,7 @@ _ADDED = (
     "precision",
     "backend",
     "notes",
+    "confirm",
 )
 
 
@@ -357,6 +364,8 @@ def _summary(run: Run) -> str:
     lines = [f"{run.name}: {failures} of {run.simulations} simulations violate the property"]
     for name, text in run.formulas.items():
         lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
+    if verdicts := _verdicts(run):
+        lines.append(f"  confirmed    {verdicts}")
     rate = run.failure_rate
     if rate is not None:
         lines.append(f"  failure rate {rate}")
@@ -365,7 +374,7 @@ def _summary(run: Run) -> str:
             "  failure rate not given: this search goes where failures are; "
             "use search='uniform' for a rate"
         )
-    if failures + len(run.table.safe):
+    if failures + len(run.table.safe) + len(run.table.unconfirmed):
         best = run.best
         where = told({name: best[name] for name in run.table.features})
         lines.append(
@@ -392,6 +401,26 @@ def _summary(run: Run) -> str:
     )
     lines.append(f"  search       {run.search}, seed {run.seed}")
     return "\n".join(lines)
+
+
+def _verdicts(run: Run) -> str:
+    """What closer looks said of the rows that violate the property."""
+    table = run.table.all
+    if "verdict" not in table:
+        return ""
+    counts = table.loc[table["violated"], "verdict"].value_counts().to_dict()
+    parts = [
+        f"{counts[verdict]} {words}"
+        for verdict, words in (
+            ("confirmed", "in double precision and at a quarter of the step"),
+            ("unexamined", "so far from zero that no replay was needed"),
+            ("unchecked", "could not be replayed more finely"),
+            ("fragile", "fragile and not claimed: closer replays disagree"),
+            ("refuted", "refuted and not claimed: closer replays hold"),
+        )
+        if verdict in counts
+    ]
+    return "; ".join(parts)
 
 
 def told(features: Mapping[str, Any]) -> str:

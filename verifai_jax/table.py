@@ -1,7 +1,8 @@
 """The error table: one row a simulation, written to disk while it grows.
 
     table.all               every simulation: features, rho, violated, status
-    table.counterexamples   rows that ended properly and broke the property
+    table.counterexamples   rows that ended properly and broke the property, confirmed if asked
+    table.unconfirmed       rows that broke it, and not when looked at closely
     table.safe              rows that ended properly and kept it
 
 On disk a growing table is an Arrow stream, to which each batch is appended; a process that dies
@@ -28,7 +29,10 @@ RESERVED = (
     "message",
     "gradient_finite",
     "differentiated",
+    "verdict",
 )
+NOT_CLAIMED = ("fragile", "refuted")
+"""Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 
 
 class ErrorTable:
@@ -100,9 +104,23 @@ class ErrorTable:
 
     @property
     def counterexamples(self) -> "pd.DataFrame":
-        """Rows that ended properly and violate the property."""
+        """Rows that ended properly and violate the property, also when looked at closely.
+
+        That is without those whose column `verdict` says `fragile` or `refuted`.
+        """
+        return self._violating(claimed=True)
+
+    @property
+    def unconfirmed(self) -> "pd.DataFrame":
+        """Rows that violate the property as simulated, and not surely when looked at closely."""
+        return self._violating(claimed=False)
+
+    def _violating(self, claimed: bool) -> "pd.DataFrame":
         table = self.all
-        return table.loc[(table["status"] == "ok") & table["violated"]]
+        chosen = (table["status"] == "ok") & table["violated"]
+        if "verdict" in table:
+            return table.loc[chosen & (table["verdict"].isin(NOT_CLAIMED) != claimed)]
+        return table.loc[chosen if claimed else chosen & False]
 
     @property
     def safe(self) -> "pd.DataFrame":

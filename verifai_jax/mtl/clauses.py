@@ -23,7 +23,7 @@ from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.robustness import prepared, robustness
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.services import nnf, rebuilt
+from verifai_jax.mtl.services import expressions, nnf, rebuilt
 from verifai_jax.trace import Trace
 
 CLAUSES = 4
@@ -53,8 +53,8 @@ class Goals:
     def margins(self, trace: Trace, end: End = "hold") -> Trace:
         """The margins of the predicates over their scale, as the signals of a trace.
 
-        The scale is the standard deviation along the trace, with a share of the mean for a
-        signal that is constant; it is not differentiated.
+        The scale is the standard deviation along the trace, with a share of the size of what the
+        predicate compares, for signals that are constant; it is not differentiated.
         """
         if not self.leaves:
             return trace  # Constants alone.
@@ -63,9 +63,12 @@ class Goals:
             setting, arrays, _, valid = prepared(leaf, trace, hard, end, None)
             evaluator = Evaluator(arrays, setting.length, setting.dt, valid=valid)
             margin = evaluator.value(leaf, 0, setting.length - 1)
-            still = jax.lax.stop_gradient(margin)
-            mean = jnp.mean(still)
-            scale = jnp.sqrt(jnp.var(still) + (0.1 * mean) ** 2)
+            size = sum(
+                jnp.mean(jnp.abs(jnp.asarray(evaluator.expression(side, 0, setting.length - 1))))
+                for side in expressions(leaf)
+            )
+            scale = jnp.sqrt(jnp.var(margin) + (0.1 * size) ** 2)
+            scale = jax.lax.stop_gradient(scale)
             # A trace on the edge of the predicate all along has no scale of its own.
             signals[_name(i)] = margin / jnp.where(scale > 1e-12, scale, 1.0)
         return replace(trace, signals=signals, finite=())
@@ -90,7 +93,7 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
     for formula in formulas:
         goals.extend(_few(_parts(part, ast.Or), ast.Or, CLAUSES) for part in _conjuncts(formula))
     if len(goals) > GOALS:
-        rest = [ast.disjunction(*goal) if len(goal) > 1 else goal[0] for goal in goals[GOALS - 1 :]]
+        rest = [ast.Or(goal) if len(goal) > 1 else next(iter(goal)) for goal in goals[GOALS - 1 :]]
         goals = [*goals[: GOALS - 1], (ast.conjunction(*rest),)]
     leaves = tuple(
         dict.fromkeys(

@@ -20,6 +20,8 @@ from verifai_jax.search.bayes import Bayes as Bayes
 from verifai_jax.search.ce_compat import CECompat as CECompat
 from verifai_jax.search.cmaes import CMAES as CMAES
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
+from verifai_jax.search.diverse import Diverse as Diverse
+from verifai_jax.search.diverse import distinct as distinct
 from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
 from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.grid import Grid as Grid
@@ -82,6 +84,12 @@ def to_json(search: Search) -> dict[str, Any] | None:
         rest = to_json(search.rest)
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
+    if isinstance(search, Diverse):
+        inner = to_json(search.search)
+        if inner is None:
+            return None
+        own = {f.name: getattr(search, f.name) for f in fields(search) if f.name != "search"}
+        return {"diverse": inner, "options": own}
     for name, kind in _SEARCHES.items():
         if type(search) is kind:
             options = {field.name: getattr(search, field.name) for field in fields(search)}  # pyright: ignore[reportArgumentType]
@@ -98,6 +106,8 @@ def from_json(data: Mapping[str, Any]) -> Search:
         return Split(
             {name: from_json(part) for name, part in data["split"]}, from_json(data["rest"])
         )
+    if "diverse" in data:
+        return Diverse(from_json(data["diverse"]), **data.get("options", {}))
     if not isinstance(data.get("options"), Mapping):
         raise ValueError(f"this describes no search: {data!r}")
     options = {

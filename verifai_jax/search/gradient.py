@@ -52,8 +52,8 @@ class GradientState(NamedTuple):
     radius: Float[Array, " descents"]
     flips: Int[Array, " descents"]  # coordinates of a corner that were tried the other way
     temperature: Float[Array, " descents"]
-    offered: Float[Array, " d"]  # a start from elsewhere, for every second descent
-    offers: Bool[Array, ""]
+    offered: Float[Array, "descents d"]  # starts from elsewhere
+    near: Float[Array, " descents"]  # their robustness; infinite where there is none
     useless: Int[Array, ""]  # starts in a row whose slopes said nothing
     descent: Int[Array, " batch"]  # of the last ask: whose row it is, and in which box
     box: Float[Array, " batch"]
@@ -127,8 +127,8 @@ class Gradient(Search):
             radius=jnp.ones(n, jnp.float32),
             flips=jnp.zeros(n, jnp.int32),
             temperature=jnp.full(n, self.temperatures[0], jnp.float32),
-            offered=jnp.full(d, 0.5, jnp.float32),
-            offers=jnp.array(False),
+            offered=jnp.full((n, d), 0.5, jnp.float32),
+            near=jnp.full(n, jnp.inf, jnp.float32),
             useless=jnp.int32(0),
             descent=jnp.zeros(batch, jnp.int32),
             box=jnp.ones(batch, jnp.float32),
@@ -188,7 +188,10 @@ class Gradient(Search):
         n, batch = len(state.fresh), len(evaluated.rho)
         mine = jnp.arange(batch) < state.rows
         judged = evaluated.judged & mine
-        clauses = jnp.where(judged[:, None], evaluated.clauses, 0.0)
+        # A single clause is the robustness itself, whose scale does not change from trace to trace.
+        several = evaluated.clauses[:, 1] > NOTHING
+        first = jnp.where(several, evaluated.clauses[:, 0], evaluated.rho)
+        clauses = jnp.where(judged[:, None], evaluated.clauses.at[:, 0].set(first), 0.0)
         merit = jnp.where(judged, jnp.max(clauses, axis=1), jnp.inf)
         owner = (state.descent[None] == jnp.arange(n)[:, None]) & mine[None]
         # For each descent the best of its rows, the first of equally good ones.
@@ -218,7 +221,7 @@ class Gradient(Search):
             ).astype(jnp.int32),
         )
         # Without: a better point, whose slopes are asked for next, or a smaller box.
-        better = least < before - 1e-3 * jnp.abs(before)
+        better = least < before - 1e-4 * jnp.abs(before)
         smallest = jnp.min(jnp.where(owner, state.box[None], jnp.inf), axis=1)
         turned = state.flipped[best] & asked
         flips = state.flips + jnp.sum(owner, axis=1).astype(jnp.int32)
@@ -239,14 +242,12 @@ class Gradient(Search):
         return _either(state.differentiates, with_slopes, without)
 
     def warm(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
-        """Start every second descent from the most nearly failing point; failures are found."""
+        """Start the first descents from the most nearly failing points; failures are found."""
         usable = evaluated.judged & (evaluated.rho >= 0)
-        best = jnp.argmin(jnp.where(usable, evaluated.rho, jnp.inf))
-        offers = jnp.any(usable)
-        return state._replace(
-            offered=jnp.where(offers, evaluated.u[best], state.offered),
-            offers=state.offers | offers,
-        )
+        rho = jnp.concatenate([jnp.where(usable, evaluated.rho, jnp.inf), state.near])
+        points = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.offered])
+        _, nearest = jax.lax.top_k(-rho, len(state.near))
+        return state._replace(offered=points[nearest], near=rho[nearest])
 
     def _started(
         self, state: GradientState, cube: Cube
@@ -257,14 +258,13 @@ class Gradient(Search):
         free = np.array(cube.levels) == 0
         middle = jnp.where(free, 0.5, points)
         points = jnp.where((number == 0)[:, None], middle, points)
-        offered = state.offers & (number % 2 == 1)
-        points = jnp.where(offered[:, None], state.offered, points)
+        points = jnp.where(jnp.isfinite(state.near)[:, None], state.offered, points)
         hot = jnp.asarray(self.temperatures, jnp.float32)[number % len(self.temperatures)]
         starts = jnp.where(state.fresh[:, None], points, state.point)
         return starts, state._replace(
             starts=state.starts + jnp.sum(state.fresh).astype(jnp.uint32),
             temperature=jnp.where(state.fresh, hot, state.temperature),
-            offers=state.offers & ~jnp.any(offered & state.fresh),
+            near=jnp.where(state.fresh, jnp.inf, state.near),
         )
 
 

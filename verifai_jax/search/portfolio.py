@@ -142,7 +142,8 @@ class Portfolio(Search):
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them.
         limit = state.mutation.score[AMONG - 1]
-        gained = common.judged & jnp.isfinite(limit) & (common.score < limit)
+        gained = jnp.isfinite(limit) & ((common.score < limit) | (common.score == 0))
+        gained &= common.judged
         is_member = (member[None] == jnp.arange(3)[:, None]) & asked[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.slopes, 2.0, 1.0)
         total = jnp.sum(spent)
@@ -168,12 +169,14 @@ class Portfolio(Search):
         told = jax.tree.map(
             lambda new, old: new if new is old else jnp.where(turn, new, old), told, state.gradient
         )
-        # One of the best points of all is offered as a start.
-        rank = (state.mutation.round % AMONG).astype(jnp.int32)
-        open_ = (state.mutation.score[rank] > 0) & jnp.isfinite(state.mutation.score[rank])
-        told = told._replace(
-            offered=jnp.where(open_, state.mutation.points[rank], told.offered), offers=open_
-        )
+        # Every second start is from one of the best points of all.
+        n = len(told.fresh)
+        ranks = ((state.mutation.round + jnp.arange(n)) % AMONG).astype(jnp.int32)
+        score = state.mutation.score[ranks]
+        offers = told.fresh & (score > 0) & jnp.isfinite(score)
+        offers &= (told.starts + jnp.arange(n)) % 2 == 1
+        near = jnp.where(offers, score, jnp.inf)
+        told = told._replace(offered=state.mutation.points[ranks], near=near)
         return state._replace(gradient=told)
 
     def warm(self, state: PortfolioState, cube: Cube, evaluated: Evaluated) -> PortfolioState:
