@@ -37,6 +37,8 @@ from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
 """Values below are of clauses that a goal does not have."""
+LITTLE = 0.9
+"""A step is little better if it leaves so much of what has to be lost."""
 SIZES = 6
 """Boxes tried at once at most."""
 
@@ -51,6 +53,9 @@ class GradientState(NamedTuple):
     slopes: Float[Array, "descents clauses d"]
     radius: Float[Array, " descents"]
     flips: Int[Array, " descents"]  # coordinates of a corner that were tried the other way
+    number: UInt32[Array, " descents"]  # of the start
+    steps: Int[Array, " descents"]  # points that were better, since the start
+    slow: Int[Array, " descents"]  # and of these, in a row, those that were little better
     temperature: Float[Array, " descents"]
     offered: Float[Array, "descents d"]  # starts from elsewhere
     near: Float[Array, " descents"]  # their robustness; infinite where there is none
@@ -72,6 +77,7 @@ class Gradient(Search):
     - `shrinks`: factor on the size of the box when nothing in it was better.
     - `least_radius`: size of the box below which a descent ends.
     - `flips`: coordinates of a corner tried the other way before a descent ends.
+    - `patience`: steps in a row that are little better after which a descent ends.
     - `temperatures`: of the smooth robustness at first, from start to start in turn, in units of
       the spread of the predicates; halved with every step.
     - `coldest`: temperature below which it does not fall.
@@ -84,8 +90,9 @@ class Gradient(Search):
     shrinks: float = 0.4
     least_radius: float = 0.02
     flips: int = 3
-    temperatures: tuple[float, ...] = (0.005, 0.05, 0.2)
-    coldest: float = 0.002
+    patience: int = 4
+    temperatures: tuple[float, ...] = (0.002, 0.05, 0.2, 0.05)
+    coldest: float = 0.001
     wants_clauses: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -93,6 +100,7 @@ class Gradient(Search):
         check_fraction("shrinks", self.shrinks)
         check_fraction("least_radius", self.least_radius)
         check_count("flips", self.flips, 0)
+        check_count("patience", self.patience)
         check_positive("coldest", self.coldest)
         if self.shrinks == 1:
             raise ValueError("shrinks must be less than 1; got 1")
@@ -126,6 +134,9 @@ class Gradient(Search):
             slopes=jnp.zeros((n, CLAUSES, d), jnp.float32),
             radius=jnp.ones(n, jnp.float32),
             flips=jnp.zeros(n, jnp.int32),
+            number=jnp.zeros(n, jnp.uint32),
+            steps=jnp.zeros(n, jnp.int32),
+            slow=jnp.zeros(n, jnp.int32),
             temperature=jnp.full(n, self.temperatures[0], jnp.float32),
             offered=jnp.full((n, d), 0.5, jnp.float32),
             near=jnp.full(n, jnp.inf, jnp.float32),
@@ -208,14 +219,18 @@ class Gradient(Search):
         before = jnp.max(state.clauses, axis=1)
 
         # With slopes: a descent goes on from where they are known, or starts elsewhere.
+        # Of descents that may be given up early every second one begins with a smaller box.
+        begin = jnp.where((state.number % 3 > 0) & (state.number % 2 == 1), self.shrinks, 1.0)
         with_slopes = state._replace(
             point=_rows(told & asked, evaluated.u[best], state.point),
             clauses=_rows(told & asked, clauses[best], state.clauses),
             slopes=_rows(told & asked, slopes, state.slopes),
             known=jnp.where(asked, told & ~failed, state.known),
             fresh=jnp.where(asked, ~told | failed, state.fresh),
-            radius=jnp.where(asked & state.fresh, 1.0, state.radius),
+            radius=jnp.where(asked & state.fresh, begin, state.radius),
             flips=jnp.where(asked, 0, state.flips),
+            steps=jnp.where(asked & state.fresh, 0, state.steps),
+            slow=jnp.where(asked & state.fresh, 0, state.slow),
             useless=jnp.where(
                 jnp.any(told), 0, state.useless + jnp.sum(asked & jnp.isfinite(least) & ~told)
             ).astype(jnp.int32),
@@ -227,7 +242,13 @@ class Gradient(Search):
         flips = state.flips + jnp.sum(owner, axis=1).astype(jnp.int32)
         radius = jnp.where(better, jnp.minimum(1.0, 2 * state.box[best]), smallest * self.shrinks)
         limit = min(self.flips, len(cube.continuous))
-        over = failed | (~better & jnp.where(turned, flips >= limit, radius < self.least_radius))
+        # Two of three descents are given up early: the first jumps of many are worth more.
+        early = (state.number % 3 > 0) & (state.steps == 0)
+        least_radius = jnp.where(early, 0.5 * self.shrinks**2, self.least_radius)
+        least_radius = jnp.where(early & (state.number % 2 == 0), 0.5 * self.shrinks, least_radius)
+        over = failed | (~better & jnp.where(turned, flips >= limit, radius < least_radius))
+        slow = jnp.where(least > LITTLE * before, state.slow + 1, 0)
+        over |= better & (slow >= self.patience)
         kept = asked & ~over
         colder = jnp.maximum(0.5 * state.temperature, self.coldest)
         without = state._replace(
@@ -238,6 +259,8 @@ class Gradient(Search):
             radius=jnp.where(kept & (better | ~turned), radius, state.radius),
             flips=jnp.where(kept, jnp.where(better, 0, jnp.where(turned, flips, 0)), state.flips),
             temperature=jnp.where(kept & better, colder, state.temperature),
+            steps=jnp.where(asked & better, state.steps + 1, state.steps),
+            slow=jnp.where(asked & better, slow, state.slow).astype(jnp.int32),
         )
         return _either(state.differentiates, with_slopes, without)
 
@@ -264,6 +287,7 @@ class Gradient(Search):
         return starts, state._replace(
             starts=state.starts + jnp.sum(state.fresh).astype(jnp.uint32),
             temperature=jnp.where(state.fresh, hot, state.temperature),
+            number=jnp.where(state.fresh, number, state.number),
             near=jnp.where(state.fresh, jnp.inf, state.near),
         )
 

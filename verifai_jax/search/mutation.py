@@ -35,7 +35,7 @@ LEAST_STEP, MOST_STEP = 0.02, 0.6
 MOST_EXPLORATION = 0.9
 EVENLY = 0.1
 """Share of exploration that samples the prior; it grows where nothing else helps."""
-SELDOM, SWINGING = 0.2, 0.45
+SELDOM, SWINGING = 0.35, 0.35
 """Shares of exploration in which signals change seldom, and in which they swing to and fro."""
 TO_AND_FRO = 0.9
 """Share of control points, in the latter, on the other side of the middle than the one before."""
@@ -67,8 +67,8 @@ class Mutation(Search):
     """
 
     kept: int = 32
-    first: int = 8
-    exploration: float = 0.2
+    first: int = 12
+    exploration: float = 0.3
     difference: float = 0.4
     idle: int = 150
     patience: int = 400
@@ -175,7 +175,9 @@ class Mutation(Search):
             moves &= ~still[:, None]
             chosen = jnp.where(moves, values, jnp.where(differs[:, None], one, parent))
             moved = jnp.where(np.array(cube.levels) > 0, chosen, moved)
-        return jnp.clip(moved, 0.0, 1.0)
+        # Half of the steps out of the cube end on its faces, half turn back at them.
+        inside = 1 - jnp.abs(1 - jnp.abs(moved))
+        return jnp.clip(jnp.where((coins[:, 11] < 0.5)[:, None], inside, moved), 0.0, 1.0)
 
 
 def _explored(

@@ -27,6 +27,8 @@ PRIOR_GAINS, PRIOR_COSTS = np.array([4.0, 2.0, 0.5]), np.array([4.0, 4.0, 4.0])
 DISCOUNT = 0.98
 """Of evidence, for each simulation since."""
 LEAST_SHARE = 0.05
+OPENING = 6
+"""Descents before the budget is shared by evidence."""
 AMONG = 4
 """A gain is a point among so many best ones."""
 
@@ -41,7 +43,7 @@ class PortfolioState(NamedTuple):
     costs: Float[Array, " members"]
     rows: Int[Array, " members"]  # of the last ask, one member after the other
     slopes: Bool[Array, ""]
-    opening: Bool[Array, ""]  # the first descent is on its way, and costs nothing of its share
+    opening: Bool[Array, ""]  # the first descents are on their way, beyond their share
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,9 @@ class Portfolio(Search):
         if state.gradient is not None:
             points, gradient = Gradient().ask(state.gradient, cube, batch)
             plan = Gradient().plan(gradient, cube, batch)
-            # The first descent goes first, from the middle of the cube to its end.
-            opening = (gradient.starts <= len(gradient.fresh)) & (gradient.useless == 0)
-            opening &= ~(state.gradient.fresh[0] & (state.gradient.starts > 0))
+            # Some descents go first, that from the middle of the cube before all.
+            opening = gradient.starts <= max(OPENING, len(gradient.fresh))
+            opening &= gradient.useless == 0
             turn = opening | (credit[GRADIENT] >= 1)
             slopes = plan.slopes & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
@@ -156,8 +158,13 @@ class Portfolio(Search):
         state = state._replace(
             mutation=mutation._replace(seen=jnp.maximum(mutation.seen - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
-            gains=kept * state.gains + jnp.sum(is_member & gained[None], axis=1),
-            costs=kept * state.costs + spent,
+            # What it gains while it goes first says nothing about what it will.
+            gains=jnp.where(
+                state.opening,
+                state.gains,
+                kept * state.gains + jnp.sum(is_member & gained[None], axis=1),
+            ),
+            costs=jnp.where(state.opening, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
             credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
         )
@@ -169,12 +176,12 @@ class Portfolio(Search):
         told = jax.tree.map(
             lambda new, old: new if new is old else jnp.where(turn, new, old), told, state.gradient
         )
-        # Every second start is from one of the best points of all.
+        # Every fourth start is from one of the best points of all.
         n = len(told.fresh)
         ranks = ((state.mutation.round + jnp.arange(n)) % AMONG).astype(jnp.int32)
         score = state.mutation.score[ranks]
         offers = told.fresh & (score > 0) & jnp.isfinite(score)
-        offers &= (told.starts + jnp.arange(n)) % 2 == 1
+        offers &= (told.starts + jnp.arange(n)) % 4 == 3
         near = jnp.where(offers, score, jnp.inf)
         told = told._replace(offered=state.mutation.points[ranks], near=near)
         return state._replace(gradient=told)
