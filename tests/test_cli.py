@@ -65,6 +65,8 @@ def test_options_of_a_search(call, tmp_path):
     output = call(
         "falsify",
         "specs/ramp.py:ramp",
+        "--search",
+        "cross_entropy",
         "--set",
         "elite=0.3",
         "--budget",
@@ -134,7 +136,7 @@ def test_list(call):
         (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
         (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
         (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
-        (["falsify", "specs/ramp.py:ramp", "--set", "elit=1"], "did you mean 'elite"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "slope=1"], "did you mean 'slopes"),
         (["falsify", "specs/ramp.py:ramp", "--set", "elite"], "--set needs NAME=VALUE"),
         (
             ["falsify", "specs/ramp.py:ramp", "--budget", "0"],

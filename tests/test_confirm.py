@@ -36,7 +36,9 @@ def oscillator(bound=1.5):
 
 @pytest.fixture(scope="module")
 def circles():
-    return vj.falsify(oscillator(), "uniform", 256, batch=256, seed=0, progress=False)
+    return vj.falsify(
+        oscillator(), "uniform", 256, batch=256, seed=0, progress=False, confirm=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +139,13 @@ def test_chaos_is_fragile():
         return x
 
     run = vj.falsify(
-        plain(doubled, "always x <= 0.9"), "uniform", 1024, batch=1024, seed=0, progress=False
+        plain(doubled, "always x <= 0.9"),
+        "uniform",
+        1024,
+        batch=1024,
+        seed=0,
+        progress=False,
+        confirm=False,
     )
     found = confirm(run)
     assert len(found) > 100
@@ -229,7 +237,7 @@ def test_at_zero_the_boolean_semantics_decide():
 
 def test_random_systems_keep_their_numbers_and_their_precision():
     noisy = plain(lambda f, key: f["x"] + 0.1 * jax.random.normal(key))
-    run = vj.falsify(noisy, "uniform", 64, batch=64, seed=3, progress=False)
+    run = vj.falsify(noisy, "uniform", 64, batch=64, seed=3, progress=False, confirm=False)
     found = confirm(run)
     np.testing.assert_allclose(found.frame["rho.again"], found.frame["rho"], rtol=1e-5, atol=1e-7)
     assert "not checked in float64: in it the system would draw other random numbers" in found.notes
@@ -241,7 +249,13 @@ def test_random_systems_keep_their_numbers_and_their_precision():
 
 def test_a_run_in_double_precision_without_a_finer_step_is_unchecked():
     run = vj.falsify(
-        plain(lambda f, key: f["x"]), "uniform", 32, batch=32, precision="float64", progress=False
+        plain(lambda f, key: f["x"]),
+        "uniform",
+        32,
+        batch=32,
+        precision="float64",
+        progress=False,
+        confirm=False,
     )
     found = confirm(run)
     assert found.counts == {"unchecked": len(found)}
@@ -269,7 +283,7 @@ def test_a_black_box_is_simulated_again():
     )
     answers = iter([1.0, 0.0, 1.0, 0.0, *[0.0] * 9])
     moody = boxed(lambda f: Trace({"x": np.full(4, next(answers))}, dt=0.1))
-    run = vj.falsify(moody, "uniform", 4, batch=4, progress=False)
+    run = vj.falsify(moody, "uniform", 4, batch=4, progress=False, confirm=False)
     assert confirm(run).counts == {"fragile": 2}
 
 
@@ -327,7 +341,7 @@ def test_features_are_those_of_the_table():
 
 def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
-    run = vj.falsify(smooth, "uniform", 1024, batch=1024, seed=1, progress=False)
+    run = vj.falsify(smooth, "uniform", 1024, batch=1024, seed=1, progress=False, confirm=False)
     failing = run.table.counterexamples
     columns = {name: failing[name].to_numpy() for name in failing.columns}
     confirmer = Confirmer(smooth, most=100)
@@ -408,7 +422,7 @@ def test_errors_say_what_to_do(circles, tmp_path):
 
 
 def test_a_run_without_failures():
-    calm = vj.falsify(oscillator(5.0), "uniform", 16, batch=16, progress=False)
+    calm = vj.falsify(oscillator(5.0), "uniform", 16, batch=16, progress=False, confirm=False)
     assert str(confirm(calm)) == "circle: no counterexample to confirm"
     assert len(confirm(calm).confirmed) == 0
 
@@ -456,7 +470,7 @@ def independent(run, numbers, factors):
 def test_automatic_transmission_is_believed():
     from specs.arch import automatic_transmission as at
 
-    run = vj.falsify(at.at2, "uniform", 256, batch=256, seed=1, progress=False)
+    run = vj.falsify(at.at2, "uniform", 256, batch=256, seed=1, progress=False, confirm=False)
     found = confirm(run)
     assert found.counts.keys() == {"confirmed"}
     assert found.notes == ()
@@ -470,7 +484,7 @@ def test_automatic_transmission_is_believed():
 def test_a_chaotic_loop_is_not_believed_and_what_is_holds_up():
     from specs.arch import neural_network_controller as nn
 
-    run = vj.falsify(nn.nn, "uniform", 20_480, batch=1024, seed=1, progress=False)
+    run = vj.falsify(nn.nn, "uniform", 20_480, batch=1024, seed=1, progress=False, confirm=False)
     found = confirm(run)
     assert len(found) > 50
     assert len(found.confirmed) < len(found) / 4
@@ -486,7 +500,13 @@ def test_mujoco_on_both_engines(backend):
     from specs import mujoco_cartpole
 
     run = vj.falsify(
-        mujoco_cartpole.balance, "uniform", 256, batch=256, backend=backend, progress=False
+        mujoco_cartpole.balance,
+        "uniform",
+        256,
+        batch=256,
+        backend=backend,
+        progress=False,
+        confirm=False,
     )
     other = "mjx" if backend == "native" else "native"
     row = int(run.best.name)

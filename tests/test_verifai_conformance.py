@@ -88,7 +88,7 @@ class TestFalsifier:
     PROBLEM = vj.Problem("shift", {"x": vj.Box(0, 1)}, shifted, "x > 0.5")
 
     def test_tables_and_interval(self):
-        table = vj.falsify(self.PROBLEM, "halton", 8, batch=8).table
+        table = vj.falsify(self.PROBLEM, "halton", 8, batch=8, confirm=False).table
         failing, safe = (t[["x", "rho"]].to_numpy() for t in (table.counterexamples, table.safe))
         np.testing.assert_allclose(
             failing, [[0.5, 0], [0.25, -0.25], [0.125, -0.375], [0.375, -0.125], [0.0625, -0.4375]]
@@ -98,7 +98,7 @@ class TestFalsifier:
         np.testing.assert_allclose((rate.low, rate.high), (0.24486321636655, 0.91476658586264))
 
     def test_stops_simulating_at_the_wanted_number(self):
-        run = vj.falsify(self.PROBLEM, "halton", 8, batch=1, stop_after=2)
+        run = vj.falsify(self.PROBLEM, "halton", 8, batch=1, stop_after=2, confirm=False)
         assert (run.simulations, len(run.table.counterexamples), len(run.table.safe)) == (2, 2, 0)
 
     def test_a_margin_of_zero_counts_where_the_comparator_says_so(self):

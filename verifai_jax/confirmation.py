@@ -141,6 +141,17 @@ class Confirmer:
             self.band = max(self.band, float(np.max(parts[-1][1].band)))
         return self._together(parts, order, run)
 
+    @property
+    def finer(self) -> bool:
+        """Whether there is more to do for a black box than to simulate it once more.
+
+        What JAX traces can always be looked at in double precision.
+        """
+        if not self.problem.black_box or self.other is not None:
+            return True
+        replays = HostReplays(self.problem, self.precision, run_keys(self.seed)[1])
+        return replays.refiner.why_not(FINER.values()) is None
+
     def far(self, rho: float) -> bool:
         """Whether a robustness is so far from zero that no replay will have another sign.
 

@@ -114,7 +114,8 @@ def falsify(
     check_rule(search, stop_when)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
-    usual = usual_batch(search, budget, stop_after)
+    # Far from what is found already takes rounds, more than many at once.
+    usual = min(16, budget) if diverse else usual_batch(search, budget, stop_after)
     batch = min(usual if batch is None else batch, budget)
     choice = resolved(
         problem, gradient=needs_slopes(search), batch=batch, budget=budget, precision=precision,
@@ -125,7 +126,7 @@ def falsify(
     problem.check()
     search, notes = usable(problem, search)
     if diverse:
-        search = searches.Diverse(search)
+        search = searches.Diverse(search, capacity=max(256, stop_after or 0))
     place = new_folder(folder)
     table = ErrorTable(tuple(problem.space.columns), place)
     rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)

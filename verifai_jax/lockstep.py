@@ -34,9 +34,14 @@ def lockstep(
     batch: int,
     precision: str,
     stop_early: bool,
-) -> tuple[Float[np.ndarray, "seeds simulations"], Bool[np.ndarray, "seeds simulations"]]:
-    """Robustness of each seed's simulations, and which were differentiated; NaN where none were.
+) -> tuple[
+    Float[np.ndarray, "seeds simulations"],
+    Bool[np.ndarray, "seeds simulations"],
+    Float[np.ndarray, "seeds d"],
+]:
+    """Robustness of each seed's simulations, which were differentiated, and the first failures.
 
+    NaN where there was no simulation, or no failure.
     A seed that has found a failure makes no further simulation if `stop_early`.
     """
     cube, n = cube_of(problem.space), len(seeds)
@@ -51,6 +56,7 @@ def lockstep(
     found: list[list[float]] = [[] for _ in range(n)]
     flags: list[list[bool]] = [[] for _ in range(n)]
     failed = np.zeros(n, bool)
+    points = np.full((n, cube.dim), np.nan, np.float32)
     while True:
         u, plan, state = ask(state)
         u, rows, slopes, temperature = map(
@@ -85,7 +91,9 @@ def lockstep(
         for seed in range(n):
             found[seed].extend(told.rho[seed, : rows[seed]].tolist())
             flags[seed].extend([bool(slopes[seed])] * int(rows[seed]))
-            failed[seed] |= bool(np.any(np.asarray(told.rho[seed, : rows[seed]]) < 0))
+            below = np.flatnonzero(np.asarray(told.rho[seed, : rows[seed]]) < 0)
+            if len(below) and not failed[seed]:
+                failed[seed], points[seed] = True, u[seed, below[0]]
         state = tell(state, told)
     longest = max(map(len, found))
     rho = np.full((n, longest), np.nan, np.float32)
@@ -93,7 +101,7 @@ def lockstep(
     for seed in range(n):
         rho[seed, : len(found[seed])] = found[seed]
         differentiated[seed, : len(flags[seed])] = flags[seed]
-    return rho, differentiated
+    return rho, differentiated, points
 
 
 def _search_program(problem: Problem, search: Search, batch: int) -> Any:

@@ -166,8 +166,8 @@ class Rounds:
         held = np.full(len(verdict), np.nan)
         if not len(rows):
             return verdict, held
-        if self.problem.black_box and not hasattr(self.problem.system, "refined"):
-            # Simulating it again is all that could be done, and may take as long as the run.
+        if not confirmer.finer:
+            # To simulate it again may take as long as the run, and would say little.
             verdict[rows] = "unchecked"
             return verdict, held
         own = {name: column[rows] for name, column in columns.items()}

@@ -42,6 +42,8 @@ class Trials:
       simulation has no verdict.
     - `batch`: simulations a round.
     - `differentiated`: `[seeds, simulations]`, which had slopes taken; None where none or all had.
+    - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
+      one; None for searches that do not plan their rounds.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Trials:
     batch: int
     rho: Float[np.ndarray, "seeds simulations"]
     differentiated: Bool[np.ndarray, "seeds simulations"] | None = None
+    failures: Float[np.ndarray, "seeds d"] | None = None
 
     def cost(self, slopes: float = 2.0) -> Float[np.ndarray, " seeds"]:
         """Like `first_failure`, with each differentiated simulation counted as so many."""
@@ -142,10 +145,8 @@ def repeat(
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     if search.wants_clauses:
         with in_precision(precision):
-            rho, differentiated = lockstep(
-                traced, search, every, budget, batch, precision, stop_early
-            )
-        return Trials(problem.name, repr(search), every, batch, rho, differentiated)
+            found = lockstep(traced, search, every, budget, batch, precision, stop_early)
+        return Trials(problem.name, repr(search), every, batch, *found)
     rounds = -(-budget // batch)
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
     with in_precision(precision):

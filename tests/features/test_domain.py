@@ -160,6 +160,8 @@ scalars = st.one_of(st.integers(-1000, 1000), st.floats(-1e3, 1e3, width=32), st
 def test_choices_round_trip(choices, data):
     numbers = [np.float32(choice) for choice in choices if not isinstance(choice, str)]
     assume(len(set(numbers)) == len(numbers))  # 1 and 1.0 are one choice
+    # Compiled programs take numbers too small to be normal for zero.
+    assume(all(n == 0 or abs(n) > 1e-37 for n in numbers))
     domain = Categorical(*choices)
     place = data.draw(st.integers(0, len(choices) - 1))
     value = domain.from_unit(jnp.float32([(place + 0.5) / len(choices)]))

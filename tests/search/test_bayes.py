@@ -24,6 +24,7 @@ def jitted(search):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [FLAT, ("mixed",), ("few_of_many",)], ids="-".join)
 def test_beats_uniform(names):
     values = play(SMALL, names, 8, 11, 9, together=False)[1]
@@ -81,6 +82,7 @@ def test_a_space_of_few_points_is_searched_through():
     assert int(state.seen) == 32
 
 
+@pytest.mark.slow
 def test_huge_values_do_not_hide_the_others():
     # The process sees a bowl whether or not a far part of it is enormous.
     def rho(u):
@@ -108,6 +110,7 @@ def test_what_is_kept():
     assert set(times.tolist()) == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_explores_for_ever_and_more_when_it_leads_nowhere():
     cube, search = Cube((0, 0)), Bayes(capacity=32, candidates=32)
     ask, _ = jitted(search)
@@ -119,6 +122,7 @@ def test_explores_for_ever_and_more_when_it_leads_nowhere():
         assert abs(int(state.explored) / 200 - share) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 48])
 @pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
 def test_small_and_large_batches(search, batch):
@@ -132,6 +136,7 @@ def test_small_and_large_batches(search, batch):
     assert np.mean(late[:, ::2]) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
 def test_contract(search):
     cube = Cube((3, 0, 9), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True))

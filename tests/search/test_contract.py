@@ -37,8 +37,23 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("cube", CUBES.values(), ids=CUBES.keys())
-@pytest.mark.parametrize("search", SEARCHES, ids=repr)
+# These take seconds to compile for each cube; a mixed one has all that there is.
+LARGE = ("Bayes", "Portfolio", "CMAES")
+EACH = [
+    pytest.param(
+        search,
+        cube,
+        id=f"{search!r}-{name}",
+        marks=pytest.mark.slow
+        if type(search).__name__ in LARGE and name not in ("empty", "mixed")
+        else (),
+    )
+    for search in SEARCHES
+    for name, cube in CUBES.items()
+]
+
+
+@pytest.mark.parametrize(("search", "cube"), EACH)
 def test_contract(search, cube):
     refused = REFUSED.get((type(search).__name__, cube))
     if refused is not None:

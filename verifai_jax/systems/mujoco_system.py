@@ -45,8 +45,8 @@ class MuJoCo:
     lanes: ClassVar[int] = 128
     loop: Loop
     backend: str = "auto"
-    # Of the native backend; the same at every step of the physics.
-    programs: dict[Any, Any] = field(default_factory=dict, repr=False)
+    # Of the native backend; another loop has its own, but the same at every step of the physics.
+    programs: dict[Any, Any] = field(default_factory=dict, repr=False, init=False)
 
     @property
     def duration(self) -> float:
@@ -96,7 +96,9 @@ class MuJoCo:
         """
         if not (self.traced_factor and isinstance(factor, jax.Array)):
             check_factor(factor)
-        return replace(self, loop=replace(self.loop, finer=self.loop.finer * factor))
+        finer = replace(self, loop=replace(self.loop, finer=self.loop.finer * factor))
+        object.__setattr__(finer, "programs", self.programs)
+        return finer
 
     @property
     def black_box(self) -> bool:

@@ -1,0 +1,114 @@
+"""The falsification benchmarks of the ARCH competition: how often, and in how many simulations.
+
+    python benchmarks/arch.py                           # instance 2, all requirements: 20 minutes
+    python benchmarks/arch.py at1 at6b --searches portfolio gradient
+    python benchmarks/arch.py --instance 1
+
+For each requirement and search, from 50 seeds, one simulation a round: the falsification rate FR,
+and the mean number of simulations S of the seeds that falsify, where a simulation whose slopes were
+taken counts as one and as two; the median of the latter. `claimed`: how many of the first failures
+found are confirmed by replays in double precision, at half and at a quarter of the step
+(`vj.confirm`), which is what `falsify` claims. Next to them the best published FR and mean S
+(ARCH-COMP reports 2020 to 2024; other models' solvers, other seeds).
+"""
+
+import argparse
+import importlib
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+import verifai_jax as vj
+
+MODELS = (
+    "automatic_transmission",
+    "chasing_cars",
+    "neural_network_controller",
+    "f16",
+    "pacemaker",
+)
+PUBLISHED = {
+    "at1": "50/50 2.3",
+    "at2": "50/50 9.2",
+    "at51": "8.7",
+    "at52": "4.0",
+    "at53": "2.8",
+    "at6a": "50/50 42.9",
+    "at6b": "10/10 600",
+    "at6c": "10/10 898",
+    "cc1": "8.8",
+    "cc2": "4.7",
+    "cc3": "23.4",
+    "cc4": "32/50 125",
+    "cc5": "2.0",
+    "nn": "10/10 48",
+    "f16a": "21",
+}
+BUDGETS = {"cc4": 1500, "pm": 300}
+INSTANCE_2 = (*PUBLISHED, "at54", "at6abc", "pm")
+
+
+def requirements() -> dict[str, vj.Problem]:
+    """Every requirement by name."""
+    modules = [importlib.import_module(f"specs.arch.{model}") for model in MODELS]
+    return {
+        name: problem
+        for module in modules
+        for name, problem in vars(module).items()
+        if isinstance(problem, vj.Problem)
+    }
+
+
+def claimed(problem: vj.Problem, trials: vj.Trials) -> str:
+    """How many of the first failures are confirmed."""
+    if trials.failures is None or not trials.falsified:
+        return "-"
+    points = trials.failures[np.isfinite(trials.first_failure)]
+    features = jax.vmap(problem.space.unflatten)(jnp.asarray(points))
+    rows = pd.DataFrame(problem.space.rows(features))
+    found = vj.confirm(vj.simulate(problem, rows, batch=64, progress=False))
+    return f"{found.counts.get('confirmed', 0)}/{len(points)}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--searches", nargs="+", default=["portfolio", "cross_entropy", "uniform"])
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--budget", type=int)
+    parser.add_argument("--instance", type=int, choices=[1, 2], default=2)
+    chosen = parser.parse_args()
+    problems = requirements()
+    names = chosen.names or [
+        name if chosen.instance == 2 else f"{name}_instance1"
+        for name in INSTANCE_2
+        if chosen.instance == 2 or not name.startswith("f16")
+    ]
+    print("| requirement | search | FR | S, slopes as 1 | as 2 | median | claimed | published |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name in names:
+        problem = problems[name]
+        for search in chosen.searches:
+            began = time.perf_counter()
+            budget = chosen.budget or BUDGETS.get(name.removesuffix("_instance1"), 300)
+            trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds)
+            cost = trials.cost()
+            found = cost[np.isfinite(cost)]
+            told = ["-"] * 3
+            if len(found):
+                told = [f"{trials.mean_simulations:.1f}", f"{found.mean():.1f}"]
+                told.append(f"{np.median(found):.0f}")
+            sure = claimed(problem, trials)
+            best = PUBLISHED.get(name, "") if search == "portfolio" else ""
+            rate = f"{trials.falsified}/{chosen.seeds}"
+            line = " | ".join([name, search, rate, *told, sure, best])
+            print(f"| {line} |", flush=True)
+            # For whoever waits; not part of the table.
+            print(f"<!-- {time.perf_counter() - began:.0f} s -->", flush=True)
+
+
+if __name__ == "__main__":
+    main()
