@@ -35,7 +35,14 @@ def play(proposals, rounds, gradient):
     return np.concatenate(seen)
 
 
-@pytest.mark.parametrize("name", [name for name in names() if name != "grid"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("bayes", "cmaes") else ())
+        for name in names()
+        if name != "grid"
+    ],
+)
 def test_every_search(name):
     search = named(name)
     proposals = Proposals(search, SPACE, 16, KEY)

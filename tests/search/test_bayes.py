@@ -32,11 +32,13 @@ def test_beats_uniform(names):
         assert gain(name, value) > 5, name
 
 
+@pytest.mark.slow
 def test_expected_improvement_beats_uniform():
     (value,) = play(IMPROVEMENT, ("ball",), 8, 11, 9, together=False)[1]
     assert gain("ball", value) > 5
 
 
+@pytest.mark.slow
 def test_goes_on_failing():
     u, value = play(SMALL, FLAT, 8, 11, 9, together=False)
     late = value[0, :, -40:] < 0

@@ -79,12 +79,12 @@ def test_a_maximum_of_clauses_does_not_stall_a_descent():
     share = float(jnp.mean(jnp.max(jax.vmap(ridge)(u), axis=1) < 0))
     assert 1e-5 < share < 2e-2
     costs = [
-        played(Gradient(), lambda u: jnp.max(ridge(u)), ridge, cube, 200, seed) for seed in range(5)
+        played(Gradient(), lambda u: jnp.max(ridge(u)), ridge, cube, 200, seed) for seed in (0, 1)
     ]
     assert max(costs) < 30 < 0.5 / share
 
 
-@pytest.mark.parametrize("slope", [0.0, np.nan])
+@pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.slow), np.nan])
 def test_the_portfolio_leaves_slopes_that_say_nothing(slope):
     cube, search = Cube((0, 0, 0)), Portfolio()
     ask = jax.jit(search.ask, static_argnums=(1, 2))

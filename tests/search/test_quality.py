@@ -36,7 +36,13 @@ GAIN = {
 }
 # Ripples point a descent into the next of many hollows, and choices have no slope.
 POINTLESS = {(Gradient, "ripples"), (Gradient, "mixed"), (Gradient, "needle")}
-EACH = pytest.mark.parametrize("search", GAIN, ids=lambda search: type(search).__name__)
+# A program of all members takes long to compile.
+LARGE = (Portfolio, CMAES)
+EACH = pytest.mark.parametrize(
+    "search",
+    [pytest.param(s, marks=pytest.mark.slow if isinstance(s, LARGE) else ()) for s in GAIN],
+    ids=lambda search: type(search).__name__,
+)
 
 
 @pytest.mark.parametrize("name", LANDSCAPES)
