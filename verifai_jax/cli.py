@@ -5,13 +5,14 @@ verifai-jax replay runs/balance-1 417
 verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
 
 from verifai_jax import __version__
+from verifai_jax.commands.asked import only as varied_only
+from verifai_jax.commands.asked import pairs, plain_values, recorded_run, recorded_target
 from verifai_jax.commands.confirm import confirm
 from verifai_jax.commands.estimate import estimate
 from verifai_jax.commands.explain import explain
@@ -119,13 +120,13 @@ def falsify(
         for option, value in fixed.items():
             if value is not None:
                 raise click.UsageError(f"{option} is fixed in the run that --resume goes on with")
-        problem = _only(load_target(target or _recorded_target(resume)), only)
+        problem = varied_only(load_target(target or recorded_target(resume)), only)
         run = run_resume(resume, problem, budget=budget, **ends)
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     else:
-        chosen = named(search or "portfolio", **_options(options))
-        problem = _only(load_target(target), only)
+        chosen = named(search or "portfolio", **plain_values("--set", options))
+        problem = varied_only(load_target(target), only)
         run = run_falsify(
             problem,
             chosen,
@@ -206,10 +207,8 @@ def replay(
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in FOLDER again, and draw it."""
     from verifai_jax.report import draw_replay
-    from verifai_jax.run import load
-    from verifai_jax.targets import load_target
 
-    run = load(folder, load_target(target or _recorded_target(folder)))
+    run = recorded_run(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
     if precision is None:
         assert run.problem is not None
@@ -238,10 +237,7 @@ def replay(
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the report [the run's].")
 def analyze(folder: Path, target: str | None, out: Path | None) -> None:
     """What the table of the run in FOLDER says: rules, importance, kinds of failures, coverage."""
-    from verifai_jax.run import load
-    from verifai_jax.targets import load_target
-
-    run = load(folder, load_target(target or _recorded_target(folder)))
+    run = recorded_run(folder, target)
     found = run.analyze()
     click.echo(str(found))
     click.echo(f"  written      {found.save((out or folder) / 'analysis')}")
@@ -287,8 +283,8 @@ def monitor(
 
     from verifai_jax import mtl
 
-    numbers = {name: _number(name, value) for name, value in _pairs("--const", constants)}
-    parsed = mtl.parse(formula, numbers, dict(_pairs("--define", definitions)))
+    numbers = {name: _number(name, value) for name, value in pairs("--const", constants)}
+    parsed = mtl.parse(formula, numbers, dict(pairs("--define", definitions)))
     trace = mtl.read(recording, time=time, dt=dt, resample_to=period, method=method)
     with jax.enable_x64(True):
         holds = bool(mtl.satisfied(parsed, trace, end, compat))
@@ -315,30 +311,6 @@ def doctor() -> None:
     click.echo(report())
 
 
-def _only(problem: Any, names: str | None) -> Any:
-    return problem if names is None else problem.only(*map(str.strip, names.split(",")))
-
-
-def _options(pairs: tuple[str, ...]) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for name, value in _pairs("--set", pairs):
-        try:
-            options[name] = json.loads(value)
-        except json.JSONDecodeError:
-            options[name] = value
-    return options
-
-
-def _pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    pairs = []
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise click.UsageError(f"{option} needs NAME=VALUE; got {text!r}")
-        pairs.append((name.strip(), value.strip()))
-    return pairs
-
-
 def _number(name: str, value: str) -> float:
     try:
         return float(value)
@@ -351,27 +323,6 @@ def _next_folder(name: str) -> Path:
     while (folder := Path("runs") / f"{name}-{number}").exists():
         number += 1
     return folder
-
-
-def _recorded_target(folder: Path) -> str:
-    """The target in the run's record, if it is a file of the user's own project.
-
-    Loading a target runs its file; a run folder that came from elsewhere must not choose one.
-    """
-    from verifai_jax.run import RECORD
-
-    if not (folder / RECORD).exists():
-        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
-    target = json.loads((folder / RECORD).read_text()).get("target")
-    here = Path.cwd().resolve()
-    if isinstance(target, str) and ".py" in target:
-        file = (here / target.rpartition(":")[0]).resolve()
-        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
-            return target
-    raise ValueError(
-        f"{folder} does not say which problem of this project it is of; "
-        "give it: --problem specs/FILE.py:NAME"
-    )
 
 
 def _is_number(value: Any) -> bool:

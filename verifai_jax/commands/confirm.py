@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.commands.asked import recorded_run
+
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
@@ -15,13 +17,10 @@ def confirm(
     folder: Path, row: int | None, target: str | None, simulator: str | None, fail: bool
 ) -> None:
     """Replay the counterexamples of the run in FOLDER, or its ROW, at a finer step."""
-    from verifai_jax.cli import _recorded_target
     from verifai_jax.counterexample.confirm import Confirmation
     from verifai_jax.counterexample.confirm import confirm as confirm_run
-    from verifai_jax.run import load
-    from verifai_jax.targets import load_target
 
-    run = load(folder, load_target(target or _recorded_target(folder)))
+    run = recorded_run(folder, target)
     found = confirm_run(run, row, simulator=simulator)
     click.echo(str(found))
     sure = (

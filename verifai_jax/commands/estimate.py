@@ -2,6 +2,8 @@
 
 import click
 
+from verifai_jax.commands.asked import only as varied_only
+
 
 @click.command()
 @click.argument("target")
@@ -34,11 +36,8 @@ def estimate(
     from verifai_jax.estimation import estimate as run
     from verifai_jax.targets import load_target
 
-    problem = load_target(target)
-    if only is not None:
-        problem = problem.only(*map(str.strip, only.split(",")))
     found = run(
-        problem,
+        varied_only(load_target(target), only),
         method,
         budget,
         batch=batch,

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.commands.asked import recorded_run
+
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
@@ -18,11 +20,8 @@ def explain(
     import textwrap
 
     from verifai_jax import counterexample
-    from verifai_jax.cli import _recorded_target
-    from verifai_jax.run import load
-    from verifai_jax.targets import load_target
 
-    run = load(folder, load_target(target or _recorded_target(folder)))
+    run = recorded_run(folder, target)
     why = counterexample.explain(run, row)
     click.echo(textwrap.fill(str(why), 88, break_on_hyphens=False))
     if pictures:

@@ -1,10 +1,11 @@
 """`verifai-jax repair specs/tuning.py:gains --parameters k_x,k_theta`."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import click
+
+from verifai_jax.commands.asked import CHOOSING, plain_values
 
 
 @click.command()
@@ -21,13 +22,7 @@ import click
 )
 @click.option("--run", "folder", type=click.Path(path_type=Path), help="Run with counterexamples.")
 @click.option("--budget", type=int, default=20_000, show_default=True, help="Simulations at most.")
-@click.option("--margin", type=float, default=0.0, show_default=True, help="Robustness wanted.")
-@click.option("--search", default="cross_entropy", show_default=True, help="Attacks the choice.")
-@click.option("--held-out", type=int, default=2000, show_default=True, help="Fresh environments.")
-@click.option("--gradient/--no-gradient", default=None, help="[default: where there are gradients]")
-@click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
-@click.option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
+@CHOOSING
 @click.option("--out", type=click.Path(path_type=Path), help="PNG file for a picture.")
 def repair(
     target: str,
@@ -35,14 +30,8 @@ def repair(
     values: tuple[str, ...],
     folder: Path | None,
     budget: int,
-    margin: float,
-    search: str,
-    held_out: int,
-    gradient: bool | None,
-    seed: int,
-    max_seconds: float | None,
-    backend: str | None,
     out: Path | None,
+    **choosing: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
     from verifai_jax.run import load
@@ -54,26 +43,10 @@ def repair(
         problem if folder is None else load(folder, problem),
         parameters,
         budget,
-        nominal=dict(map(_value, values)) or None,
-        margin=margin,
-        search=search,
-        held_out=held_out,
-        gradient=gradient,
-        seed=seed,
-        max_seconds=max_seconds,
-        backend=backend,
+        nominal=plain_values("--nominal", values) or None,
+        **choosing,
     )
     click.echo(str(found))
     if out is not None:
         found.plot(out)
         click.echo(f"  picture      {out}")
-
-
-def _value(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
-        raise click.UsageError(f"--nominal needs NAME=VALUE; got {text!r}")
-    try:
-        return name.strip(), json.loads(value)
-    except json.JSONDecodeError:
-        return name.strip(), value.strip()

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import click
 
+from verifai_jax.commands.asked import recorded_run
+
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
@@ -39,11 +41,8 @@ def shrink(
 ) -> None:
     """Make a ROW (by default the worst) of the run in FOLDER small: few features, near nominal."""
     from verifai_jax import counterexample
-    from verifai_jax.cli import _recorded_target
-    from verifai_jax.run import load
-    from verifai_jax.targets import load_target
 
-    run = load(folder, load_target(target or _recorded_target(folder)))
+    run = recorded_run(folder, target)
     small = counterexample.shrink(run, row, by=by, budget=budget, seed=seed, others=others)
     click.echo(str(small))
     if pictures:
