@@ -118,7 +118,7 @@ ALLOWED = {
         "table",
         "trace",
     },
-    "rl": {"errors", "systems", "trace"},
+    "rl": {"devices", "errors", "systems", "trace"},
     "counterexample": {
         "backends",
         "confirmation",

@@ -7,7 +7,7 @@ import pytest
 
 from envs.cartpole import CartPoleTask
 from verifai_jax.rl import PPO, Continuous, Discrete, Task, evaluate, train
-from verifai_jax.rl.ppo import Seen, _watch, init, update
+from verifai_jax.rl.ppo import Seen, _watch
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ def test_same_seed_same_policy_and_other_values_reuse_the_program():
     other = train(Recall(), SMALL, seed=2, steps=8_000)
     assert np.any(other.policy.layers[0][0] != first.policy.layers[0][0])
 
-    from verifai_jax.rl.train import _train
+    from verifai_jax.rl.trainings import _reach
 
-    before = _train._cache_size()
+    before = _reach._cache_size()
     faster = PPO(
         learning_rate=2e-2,
         clip=0.3,
@@ -96,7 +96,7 @@ def test_same_seed_same_policy_and_other_values_reuse_the_program():
         horizon=16,
     )
     changed = train(Recall(), faster, seed=1, steps=8_000)
-    assert _train._cache_size() == before
+    assert _reach._cache_size() == before
     assert np.any(changed.policy.layers[0][0] != first.policy.layers[0][0])
 
 
@@ -107,8 +107,8 @@ def test_tasks_are_recognised_by_their_members():
 
 def test_episodes_are_cut_off_and_counted():
     ppo = PPO(hidden=(4,), value_hidden=(4,), environments=2, horizon=7, minibatches=1)
-    training = init(ppo, Aim(time_limit=3), jax.random.key(0), updates=2)
-    training, progress = jax.jit(update, static_argnums=1)(ppo, Aim(time_limit=3), training)
+    training = ppo.init(Aim(time_limit=3), jax.random.key(0), updates=2)
+    training, progress = jax.jit(PPO.step, static_argnums=1)(ppo, Aim(time_limit=3), training)
     # 7 steps hold 2 episodes of 3 and one step of a third, in each of 2 environments.
     assert int(progress.episodes) == 4
     np.testing.assert_array_equal(training.episodes.age, [1, 1])

@@ -1,5 +1,7 @@
 """Training of the policies whose closed loops are then tested."""
 
+from verifai_jax.rl.algorithm import Algorithm as Algorithm
+from verifai_jax.rl.algorithm import Progress as Progress
 from verifai_jax.rl.policy import Policy as Policy
 from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
 from verifai_jax.rl.policy import load_policy as load_policy
@@ -9,6 +11,9 @@ from verifai_jax.rl.ppo import PPO as PPO
 from verifai_jax.rl.task import Continuous as Continuous
 from verifai_jax.rl.task import Discrete as Discrete
 from verifai_jax.rl.task import Task as Task
+from verifai_jax.rl.train import Snapshot as Snapshot
 from verifai_jax.rl.train import Trained as Trained
 from verifai_jax.rl.train import evaluate as evaluate
 from verifai_jax.rl.train import train as train
+from verifai_jax.rl.trainings import Configuration as Configuration
+from verifai_jax.rl.trainings import Trainings as Trainings

@@ -1,31 +1,23 @@
 """Proximal policy optimisation: experience of many environments, a few clipped passes over it.
 
     ppo = PPO(learning_rate=1e-3, hidden=(32, 32))
-    training = init(ppo, task, key, updates=200)
-    training, progress = update(ppo, task, training)
+    training = ppo.init(task, key, updates=200)
+    training, progress = ppo.step(task, training)
 
-Source: Schulman et al., Proximal policy optimization algorithms (2017). Hyper-parameters that
-change no shape are leaves of a pytree, so one compiled program serves all their values.
+Source: Schulman et al., Proximal policy optimization algorithms (2017).
 """
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.rl.advantage import Ends, advantages
+from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
 from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
 from verifai_jax.rl.task import Action, Continuous, Discrete, Task
-
-Number = Float[Array, ""] | float
-
-
-def _shape(default: Any) -> Any:
-    """A field that decides shapes or structure: static under `jit`."""
-    return dataclasses.field(default=default, metadata={"static": True})
 
 
 @jax.tree_util.register_dataclass
@@ -44,6 +36,8 @@ class PPO:
     - `normalise`: observations by their running mean and deviation.
     """
 
+    actions: ClassVar[tuple[type, ...]] = (Discrete, Continuous)
+
     learning_rate: Number = 2.5e-4
     discount: Number = 0.99
     gae_lambda: Number = 0.95
@@ -51,14 +45,14 @@ class PPO:
     entropy: Number = 0.01
     value_weight: Number = 0.5
     max_gradient: Number = 0.5
-    environments: int = _shape(8)
-    horizon: int = _shape(128)
-    epochs: int = _shape(4)
-    minibatches: int = _shape(4)
-    hidden: tuple[int, ...] = _shape((64, 64))
-    value_hidden: tuple[int, ...] = _shape((64, 64))
-    normalise: bool = _shape(False)
-    anneal: bool = _shape(True)
+    environments: int = shape(8)
+    horizon: int = shape(128)
+    epochs: int = shape(4)
+    minibatches: int = shape(4)
+    hidden: tuple[int, ...] = shape((64, 64))
+    value_hidden: tuple[int, ...] = shape((64, 64))
+    normalise: bool = shape(False)
+    anneal: bool = shape(True)
 
     @property
     def steps_per_update(self) -> int:
@@ -70,29 +64,62 @@ class PPO:
 
         **Raises:** `ValueError`, naming the hyper-parameter and its value.
         """
-        for name in ("learning_rate", "clip", "max_gradient"):
-            _require(float(getattr(self, name)) > 0, name, "positive", getattr(self, name))
-        for name in ("discount", "gae_lambda"):
-            value = getattr(self, name)
-            _require(0 <= float(value) <= 1, name, "between 0 and 1", value)
-        for name in ("entropy", "value_weight"):
-            _require(float(getattr(self, name)) >= 0, name, "at least 0", getattr(self, name))
-        for name in ("environments", "horizon", "epochs", "minibatches"):
-            _require(getattr(self, name) >= 1, name, "at least 1", getattr(self, name))
-        _require(
-            self.steps_per_update % self.minibatches == 0,
-            "minibatches",
-            f"a divisor of environments * horizon = {self.steps_per_update}",
-            self.minibatches,
+        positive = ("learning_rate", "clip", "max_gradient")
+        check_values(self, positive, lambda value: float(value) > 0, "positive")
+        fractions = ("discount", "gae_lambda")
+        check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
+        weights = ("entropy", "value_weight")
+        check_values(self, weights, lambda value: float(value) >= 0, "at least 0")
+        counts = ("environments", "horizon", "epochs", "minibatches")
+        check_values(self, counts, lambda value: value >= 1, "at least 1")
+        steps = self.steps_per_update
+        wanted = f"a divisor of environments * horizon = {steps}"
+        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
+        widths = ("hidden", "value_hidden")
+        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "Training":
+        """The state before the first of `updates` updates."""
+        policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
+        state = jax.vmap(task.reset)(jax.random.split(reset_key, self.environments))
+        size = jax.eval_shape(jax.vmap(task.observe), state).shape[-1]
+        discrete = isinstance(task.action, Discrete)
+        outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
+        weights = Weights(
+            # A nearly uniform first policy, and a critic that starts at unit scale.
+            policy=new_layers(policy_key, (size, *self.hidden, outputs), gain=0.01),
+            critic=new_layers(critic_key, (size, *self.value_hidden, 1), gain=1.0),
+            log_std=None if discrete else jnp.zeros(outputs),
         )
-        for name in ("hidden", "value_hidden"):
-            widths = getattr(self, name)
-            _require(all(w >= 1 for w in widths), name, "positive widths", widths)
+        return Training(
+            weights=weights,
+            moments=_optimizer(self).init(weights),
+            seen=Seen(jnp.zeros(()), jnp.zeros(size), jnp.ones(size)),
+            episodes=Episodes(
+                state, jnp.zeros(self.environments, jnp.int32), jnp.zeros(self.environments)
+            ),
+            key=key,
+            done=jnp.int32(0),
+            updates=jnp.int32(updates),
+        )
 
+    def step(self, task: Task, state: "Training") -> tuple["Training", Progress]:
+        """Collect `horizon` steps of each environment and learn from them."""
+        collect_key, learn_key, key = jax.random.split(state.key, 3)
+        episodes, experience = _collect(self, task, state, collect_key)
+        seen = _watch(state.seen, experience.observation) if self.normalise else state.seen
+        weights, moments = _learn(self, task, state, experience, learn_key)
+        over = experience.ends.terminated | experience.ends.truncated
+        count = jnp.sum(over)
+        total = jnp.sum(jnp.where(over, experience.finished_return, 0.0))
+        progress = Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)
+        after = Training(weights, moments, seen, episodes, key, state.done + 1, state.updates)
+        return after, progress
 
-def _require(holds: bool, name: str, wanted: str, got: Any) -> None:
-    if not holds:
-        raise ValueError(f"PPO's {name} must be {wanted}; got {got}")
+    def policy(self, task: Task, state: "Training") -> Policy:
+        """The policy as learnt so far, without exploration."""
+        mean, scale = _normaliser(state.seen) if self.normalise else (None, None)
+        return Policy(state.weights.policy, mean, scale, state.weights.log_std, task.action)
 
 
 @jax.tree_util.register_dataclass
@@ -133,13 +160,6 @@ class Training(NamedTuple):
     updates: Int[Array, ""]
 
 
-class Progress(NamedTuple):
-    """Of one update: mean return of the episodes that ended in it (NaN: none), and their number."""
-
-    mean_return: Float[Array, ""]
-    episodes: Int[Array, ""]
-
-
 class Experience(NamedTuple):
     """One step of one environment."""
 
@@ -150,52 +170,6 @@ class Experience(NamedTuple):
     next_observation: Float[Array, " k"]
     ends: Ends
     finished_return: Float[Array, ""]
-
-
-def init(ppo: PPO, task: Task, key: Key[Array, ""], updates: int) -> Training:
-    """The state before the first of `updates` updates."""
-    policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
-    state = jax.vmap(task.reset)(jax.random.split(reset_key, ppo.environments))
-    size = jax.eval_shape(jax.vmap(task.observe), state).shape[-1]
-    discrete = isinstance(task.action, Discrete)
-    outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
-    weights = Weights(
-        # A nearly uniform first policy, and a critic that starts at unit scale.
-        policy=new_layers(policy_key, (size, *ppo.hidden, outputs), gain=0.01),
-        critic=new_layers(critic_key, (size, *ppo.value_hidden, 1), gain=1.0),
-        log_std=None if discrete else jnp.zeros(outputs),
-    )
-    return Training(
-        weights=weights,
-        moments=_optimizer(ppo).init(weights),
-        seen=Seen(jnp.zeros(()), jnp.zeros(size), jnp.ones(size)),
-        episodes=Episodes(
-            state, jnp.zeros(ppo.environments, jnp.int32), jnp.zeros(ppo.environments)
-        ),
-        key=key,
-        done=jnp.int32(0),
-        updates=jnp.int32(updates),
-    )
-
-
-def update(ppo: PPO, task: Task, training: Training) -> tuple[Training, Progress]:
-    """Collect `horizon` steps of each environment and learn from them."""
-    collect_key, learn_key, key = jax.random.split(training.key, 3)
-    episodes, experience = _collect(ppo, task, training, collect_key)
-    seen = _watch(training.seen, experience.observation) if ppo.normalise else training.seen
-    weights, moments = _learn(ppo, task, training, experience, learn_key)
-    over = experience.ends.terminated | experience.ends.truncated
-    count = jnp.sum(over)
-    total = jnp.sum(jnp.where(over, experience.finished_return, 0.0))
-    progress = Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)
-    done = training.done + 1
-    return Training(weights, moments, seen, episodes, key, done, training.updates), progress
-
-
-def policy_of(ppo: PPO, task: Task, training: Training) -> Policy:
-    """The policy as learnt so far."""
-    mean, scale = _normaliser(training.seen) if ppo.normalise else (None, None)
-    return Policy(training.weights.policy, mean, scale, training.weights.log_std, task.action)
 
 
 def _collect(
@@ -264,7 +238,7 @@ def _learn(
     )
     batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
     optimizer = _optimizer(ppo)
-    left = 1.0 - training.done / training.updates if ppo.anneal else 1.0
+    left = 1.0 - training.done * (1.0 / training.updates) if ppo.anneal else 1.0
     rate = ppo.learning_rate * left
 
     def minibatch(carry: Any, rows: Int[Array, " rows"]) -> Any:

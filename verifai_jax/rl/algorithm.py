@@ -1,0 +1,91 @@
+"""What a training algorithm is: hyper-parameters with pure functions `init / step / policy`.
+
+    algorithm = PPO(learning_rate=1e-3, hidden=(32, 32))
+    state = algorithm.init(task, key, updates=200)
+    state, progress = algorithm.step(task, state)
+    policy = algorithm.policy(task, state)
+
+An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no
+shape are its leaves, so one compiled program serves all their values; those that do are static
+fields (`shape`), and each combination of them is compiled once.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, Int, Key
+
+from verifai_jax.rl.policy import Policy
+from verifai_jax.rl.task import Task
+
+Number = Float[Array, ""] | float
+
+
+class Progress(NamedTuple):
+    """Of one update: mean return of the episodes that ended in it (NaN: none), and their number."""
+
+    mean_return: Float[Array, ""]
+    episodes: Int[Array, ""]
+
+
+@runtime_checkable
+class Algorithm(Protocol):
+    """A training algorithm with its hyper-parameters. The state is any pytree of arrays.
+
+    - `actions`: the kinds of action it can learn, of `Discrete` and `Continuous`.
+    - `steps_per_update`: environment steps that one `step` takes.
+    """
+
+    actions: ClassVar[tuple[type, ...]]
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of one update."""
+        ...
+
+    def check(self) -> None:
+        """Refuse hyper-parameters that cannot train, by a `ValueError` that names one."""
+        ...
+
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> Any:
+        """The state before the first of `updates` updates."""
+        ...
+
+    def step(self, task: Task, state: Any) -> tuple[Any, Progress]:
+        """One update: some steps of the environments, and what is learnt from them."""
+        ...
+
+    def policy(self, task: Task, state: Any) -> Policy:
+        """The policy as learnt so far, without exploration."""
+        ...
+
+
+def shape(default: Any) -> Any:
+    """A field that decides shapes or structure: static under `jit`."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+def check_values(
+    algorithm: object, names: Iterable[str], holds: Callable[[Any], bool], wanted: str
+) -> None:
+    """Refuse the first of the named hyper-parameters for which `holds` is false.
+
+    **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
+    """
+    for name in names:
+        if not holds(value := getattr(algorithm, name)):
+            raise ValueError(f"{type(algorithm).__name__}'s {name} must be {wanted}; got {value}")
+
+
+def check_fit(algorithm: Algorithm, task: Task) -> None:
+    """Refuse a task whose kind of action the algorithm cannot learn.
+
+    **Raises:** `ValueError`, naming the algorithm, the task and the kinds that fit.
+    """
+    if not isinstance(task.action, algorithm.actions):
+        kinds = " or ".join(kind.__name__.lower() for kind in algorithm.actions)
+        raise ValueError(
+            f"{type(algorithm).__name__} learns {kinds} actions; "
+            f"{type(task).__name__} has {task.action}"
+        )
