@@ -1,8 +1,11 @@
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from verifai_jax.errors import UnknownNameError
 from verifai_jax.rl import (
     Continuous,
     Discrete,
@@ -45,10 +48,45 @@ def test_continuous_actions_stay_in_their_range():
     assert expected.min() == -1.0
 
 
+def test_relu_between_the_layers():
+    policy = Policy(LAYERS, None, None, None, Discrete(2), activation="relu")
+    (w0, b0), (w1, b1) = [(np.asarray(w), np.asarray(b)) for w, b in LAYERS]
+    expected = np.maximum(np.asarray(SEEN) @ w0 + b0, 0.0) @ w1 + b1
+    np.testing.assert_allclose(policy(SEEN), expected, rtol=1e-6)
+    np.testing.assert_allclose(written_out(LAYERS, list(SEEN), "relu"), expected, rtol=1e-6)
+
+
+def test_squashed_outputs():
+    policy = Policy(LAYERS, None, None, None, Continuous(-1.0, 3.0, size=2), squash=True)
+    np.testing.assert_allclose(policy(SEEN), np.tanh(by_hand(SEEN)), rtol=1e-6)
+    np.testing.assert_allclose(policy.act(SEEN), 1 + 2 * np.tanh(by_hand(SEEN)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_units_without_weights_change_nothing(activation):
+    (w0, b0), (w1, b1) = LAYERS
+    wider = (
+        (jnp.pad(w0, ((0, 0), (0, 3))), jnp.pad(b0, (0, 3))),
+        (jnp.pad(w1, ((0, 3), (0, 0))), b1),
+    )
+    narrow, wide = (
+        Policy(layers, None, None, None, Discrete(2), activation) for layers in (LAYERS, wider)
+    )
+    np.testing.assert_array_equal(wide(SEEN), narrow(SEEN))
+
+
+def test_what_a_policy_cannot_be():
+    with pytest.raises(UnknownNameError, match="unknown activation 'relo'; did you mean 'relu'"):
+        Policy(LAYERS, None, None, None, Discrete(2), activation="relo")
+    with pytest.raises(ValueError, match=r"only continuous actions.*Discrete\(n=2\)"):
+        Policy(LAYERS, None, None, None, Discrete(2), squash=True)
+
+
 @pytest.mark.parametrize(
     "policy",
     [
         Policy(LAYERS, None, None, None, Discrete(2)),
+        Policy(LAYERS, None, None, None, Continuous(-1.0, 3.0, size=2), "relu", squash=True),
         Policy(LAYERS, jnp.ones(2), jnp.ones(2) * 2, jnp.zeros(2), Continuous(-1.0, 3.0, size=2)),
     ],
 )
@@ -61,6 +99,19 @@ def test_file_gives_back_what_went_in(tmp_path, policy):
     for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(policy), strict=True):
         np.testing.assert_array_equal(a, b)
     assert policy_notes(path) == {"seed": 3, "task": "hold"}
+
+
+def test_files_of_before_activations_still_load(tmp_path):
+    about = {"action": {"kind": "discrete", "n": 2}, "notes": {}}
+    arrays = {
+        f"{name}{i}": part
+        for i, pair in enumerate(LAYERS)
+        for name, part in zip(("weight", "bias"), pair, strict=True)
+    }
+    np.savez(tmp_path / "old.npz", about=np.array(json.dumps(about)), **arrays)
+    old = load_policy(tmp_path / "old.npz")
+    assert (old.activation, old.squash) == ("tanh", False)
+    np.testing.assert_allclose(old(SEEN), by_hand(SEEN), rtol=1e-6)
 
 
 def test_files_of_another_kind_are_refused(tmp_path):
@@ -78,6 +129,11 @@ def test_files_of_another_kind_are_refused(tmp_path):
     np.savez(code, about=np.array({"action": print}, dtype=object))
     with pytest.raises(PolicyFileError, match=r"code\.npz holds no policy"):
         load_policy(code)
+    newer = tmp_path / "newer.npz"
+    about = {"action": {"kind": "discrete", "n": 2}, "activation": "swish"}
+    np.savez(newer, about=np.array(json.dumps(about)), weight0=np.eye(2), bias0=np.zeros(2))
+    with pytest.raises(PolicyFileError, match=r"newer\.npz holds no policy: unknown activation"):
+        load_policy(newer)
     torn = tmp_path / "torn.npz"
     layers = (LAYERS[0], (jnp.zeros((3, 2)), jnp.zeros(2)))
     save_policy(Policy(layers, None, None, None, Discrete(2)), torn)

@@ -11,7 +11,7 @@ The file holds numbers and text, never code.
 import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from verifai_jax.errors import check_names
 from verifai_jax.rl.task import Action, Continuous, Discrete
 
 Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
 
 _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
     "discrete": Discrete,
@@ -38,11 +41,17 @@ class PolicyFileError(ValueError):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A tanh network, what it sees, and what its outputs mean.
+    """A network, what it sees, and what its outputs mean.
 
     - `layers`: weights `[inputs, outputs]` and biases `[outputs]`, first layer first.
     - `mean`, `scale`: `[k]`; the network sees `(observation - mean) / scale`. None: as it is.
-    - `log_std`: `[size]`, of the Gaussian that explores; None for discrete actions.
+    - `log_std`: `[size]`, of the Gaussian that explores; None for discrete actions, and where the
+      deviation depends on the observation.
+    - `activation`: between the layers, of `ACTIVATIONS`. All are 0 at 0, so that units whose
+      weights are 0 change nothing.
+    - `squash`: the outputs of a continuous policy go through tanh; otherwise they are clipped.
+
+    **Raises:** `UnknownNameError` for another activation; `ValueError` for squashed logits.
     """
 
     layers: Layers
@@ -50,34 +59,47 @@ class Policy:
     scale: Float[Array, " k"] | None
     log_std: Float[Array, " size"] | None
     action: Action = dataclasses.field(metadata={"static": True})
+    activation: str = dataclasses.field(default="tanh", metadata={"static": True})
+    squash: bool = dataclasses.field(default=False, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        check_names("activation", [self.activation], ACTIVATIONS)
+        if self.squash and isinstance(self.action, Discrete):
+            raise ValueError(f"only continuous actions can be squashed; got {self.action}")
 
     def __call__(self, observation: Float[Array, " k"]) -> Float[Array, " outputs"]:
-        """Logits of the `n` actions, or the mean action in units of half its range."""
+        """Logits or values of the `n` actions, or the mean action in units of half its range."""
         if self.mean is not None and self.scale is not None:
             observation = (observation - self.mean) / self.scale
-        return network(self.layers, observation)
+        outputs = network(self.layers, observation, self.activation)
+        return jnp.tanh(outputs) if self.squash else outputs
 
     def act(self, observation: Float[Array, " k"]) -> Int[Array, ""] | Float[Array, " size"]:
         """The likeliest action: an index, or a vector within its range."""
         return likeliest(self.action, self(observation))
 
 
-def network(layers: Layers, x: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-    """A multilayer perceptron with tanh between its layers."""
+def network(
+    layers: Layers, x: Float[Array, "*batch inputs"], activation: str = "tanh"
+) -> Float[Array, "*batch outputs"]:
+    """A multilayer perceptron with the activation between its layers."""
+    between = ACTIVATIONS[activation]
     for weight, bias in layers[:-1]:
-        x = jnp.tanh(x @ weight + bias)
+        x = between(x @ weight + bias)
     weight, bias = layers[-1]
     return x @ weight + bias
 
 
-def written_out(layers: Layers, inputs: Sequence[Float[Array, ""]]) -> list[Float[Array, ""]]:
+def written_out(
+    layers: Layers, inputs: Sequence[Float[Array, ""]], activation: str = "tanh"
+) -> list[Float[Array, ""]]:
     """The same network number by number, for a few hundred weights that are known constants.
 
     Under `vmap` each number is a row of lanes and all of them fuse into straight-line vector code:
     in a rollout of hundreds of lanes 1.5 times as fast as small matrix products, at more compile
     time. Not for weights that are themselves being traced.
     """
-    values = list(inputs)
+    values, between = list(inputs), ACTIVATIONS[activation]
     for i, (weight, bias) in enumerate(layers):
         columns = np.asarray(weight).T.tolist()
         sums = []
@@ -86,7 +108,7 @@ def written_out(layers: Layers, inputs: Sequence[Float[Array, ""]]) -> list[Floa
             for w, value in zip(column, values, strict=True):
                 total = total + w * value
             sums.append(total)
-        values = sums if i == len(layers) - 1 else [jnp.tanh(total) for total in sums]
+        values = sums if i == len(layers) - 1 else [between(total) for total in sums]
     return values
 
 
@@ -120,7 +142,12 @@ def in_range(action: Continuous, unit: Float[Array, " size"]) -> Float[Array, " 
 def save_policy(policy: Policy, path: str | Path, **notes: Any) -> None:
     """Write a policy as a compressed `.npz` of float32 arrays, with `notes` (JSON) beside them."""
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
-    about = {"action": {"kind": kind, **dataclasses.asdict(policy.action)}, "notes": notes}
+    about = {
+        "action": {"kind": kind, **dataclasses.asdict(policy.action)},
+        "activation": policy.activation,
+        "squash": policy.squash,
+        "notes": notes,
+    }
     arrays: dict[str, Any] = {"about": np.array(json.dumps(about))}
     for i, (weight, bias) in enumerate(policy.layers):
         arrays[f"weight{i}"], arrays[f"bias{i}"] = np.float32(weight), np.float32(bias)
@@ -148,13 +175,15 @@ def load_policy(path: str | Path) -> Policy:
         chained = all(a[1] == b[0] for a, b in itertools.pairwise(shapes))
         if not layers or not chained:
             raise KeyError(f"layers of shapes {shapes}")
+        optional = {
+            name: jnp.asarray(arrays[name]) if name in arrays else None
+            for name in ("mean", "scale", "log_std")
+        }
+        # Files of before these two were fields have tanh networks that are not squashed.
+        how = {name: about[name] for name in ("activation", "squash") if name in about}
+        return Policy(layers=layers, action=kind, **optional, **how)
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyFileError(f"{path} holds no policy: {error}") from error
-    optional = {
-        name: jnp.asarray(arrays[name]) if name in arrays else None
-        for name in ("mean", "scale", "log_std")
-    }
-    return Policy(layers=layers, action=kind, **optional)
 
 
 def policy_notes(path: str | Path) -> dict[str, Any]:
