@@ -23,11 +23,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
-from verifai_jax.rl.policy import Layers, network, written_out
+from verifai_jax.rl.policy import Layers, written_out
 from verifai_jax.systems import Ode, ode, sin_cos
 from verifai_jax.systems.integrators import euler
 
@@ -145,7 +146,8 @@ def neural(
 ) -> Controller:
     """A trained network with two actions, push left and push right, at the features' `force_mag`.
 
-    - `policy`: a `Policy` or the file of one; the one that is shipped when left out.
+    - `policy`: a `Policy` or the file of one; the one that is shipped when left out. JAX may trace
+      its weights: then one program simulates any policy of the same form.
     - `action`: `"argmax"` pushes with full force in the likelier direction, as CartPole-v1 does.
       `"expected"` applies the mean force of the network's two probabilities, a smooth controller.
     - `straight_through`: give `"argmax"` the derivative of `"expected"`; its own is zero almost
@@ -161,14 +163,15 @@ def neural(
             f"got {policy.layers[0][0].shape[0]} and {policy.action}"
         )
 
-    layers = _preferring(policy)
-    small = sum(weight.size for weight, _ in layers) <= 600
+    small = sum(weight.size for weight, _ in policy.layers) <= 600
+    layers = _preferring(policy) if small and _known(policy) else None
 
     def control(time: Scalar, state: State, features: Features) -> Scalar:
-        if small:
+        if layers is not None:
             (preference,) = written_out(layers, state)
         else:
-            (preference,) = network(layers, jnp.stack(state))
+            left, right = policy(jnp.stack(state))
+            preference = right - left
         largest = feature(features, "force_mag")
         if action == "expected":
             return largest * jnp.tanh(preference / 2)
@@ -187,6 +190,13 @@ def either(*controllers: Controller) -> Controller:
         return jnp.select([features["controller"] == i for i in range(len(forces))], forces)
 
     return control
+
+
+def _known(policy: Policy) -> bool:
+    """Whether its numbers are constants, and what is between its layers is what is written out."""
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(policy))
+    plain = getattr(policy, "activation", "tanh") == "tanh" and not getattr(policy, "squash", False)
+    return plain and not traced
 
 
 def _preferring(policy: Policy) -> Layers:

@@ -12,6 +12,7 @@ length) and 0.1 kg.
 import verifai_jax as vj
 from envs import cartpole
 from envs.cartpole_drawing import draw
+from verifai_jax.rl import Policy
 
 ON_THE_TRACK = "abs(x) <= 2.4"
 UPRIGHT = "abs(theta) <= 0.20944"
@@ -115,3 +116,16 @@ gusts = vj.Problem(
     description="either controller in a gusty wind: safe first, then centred and calm",
     draw=draw,
 )
+
+
+def balance_with(policy: Policy) -> vj.Problem:
+    """`balance` for any policy with two actions; JAX may trace its weights."""
+    return vj.Problem(
+        "balance",
+        paper,
+        cartpole.cartpole(cartpole.neural(policy), duration=4.0, terminate=True),
+        f"always[0, 4] ({ON_THE_TRACK} & {UPRIGHT})",
+        nominal=NOMINAL,
+        description="stay on the track and upright for 4 s, whatever the pole",
+        draw=draw,
+    )

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from envs import cartpole as cp
+from specs.cartpole import balance_with
+from verifai_jax.engine import judge
 from verifai_jax.errors import UnknownNameError
 from verifai_jax.rl import Discrete, Policy, evaluate, load_policy
 from verifai_jax.rl.policy import new_layers
@@ -195,6 +197,31 @@ def test_force_is_that_of_the_policy_small_or_large_normalised_or_not(width):
         assert float(force) == pytest.approx(10 * np.tanh((logits[1] - logits[0]) / 2), rel=1e-4)
         push = cp.neural(policy)(0.0, cp.State(*state), {})
         assert float(push) == (10 if int(policy.act(state)) == 1 else -10)
+
+
+def test_one_program_judges_any_policy_of_a_form():
+    @jax.jit
+    def worst(policy, u):
+        problem = balance_with(policy)
+
+        def one(u):
+            return judge(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
+
+        return jax.vmap(one)(u)
+
+    rng = np.random.default_rng(0)
+    u = rng.uniform(size=(64, 4)).astype(np.float32)
+    shipped = load_policy(cp.POLICY_FILE)
+    rho = np.asarray(worst(shipped, u))
+    wrong = np.asarray(worst(jax.tree.map(lambda leaf: -leaf, shipped), u))
+    assert worst._cache_size() == 1
+    assert np.mean(rho < 0) < 0.1
+    assert np.mean(wrong < 0) > 0.9
+    # As constants, which are written out.
+    problem = balance_with(shipped)
+    row = int(np.argmin(rho))
+    alone = judge(problem, jax.jit(problem.system)(problem.space.unflatten(u[row]), KEY))[0][0]
+    np.testing.assert_allclose(alone, rho[row], atol=1e-4)
 
 
 def test_neural_refuses_what_it_cannot_use():
