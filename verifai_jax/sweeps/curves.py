@@ -1,0 +1,111 @@
+"""Formulas over training itself: the learning curve is a trace whose time is environment steps.
+
+    trace = curve_trace(steps, mean_return)                     # signal `return`
+    judge_curve("eventually[0, 200000] (return >= 90 & always return >= 50)", steps, mean_return)
+
+Bounds of the formula are environment steps from the beginning of the training.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.errors import check_names
+from verifai_jax.mtl import Formula, parse, robustness
+from verifai_jax.mtl.formula import Interval
+from verifai_jax.mtl.recording import resample
+from verifai_jax.mtl.services import rebuilt
+from verifai_jax.trace import Trace
+
+SIGNALS = ("return",)
+"""What a learning curve has: the mean return of the episodes that ended in each update."""
+_SHORTEST = 64
+
+
+def check_curve(formula: Formula | str) -> Formula:
+    """The parsed formula, refused unless it speaks of signals of a learning curve only.
+
+    **Raises:** what the parser does; `UnknownNameError` for another signal, with the nearest;
+    `TypeError` for something that is no formula.
+    """
+    if isinstance(formula, str):
+        formula = parse(formula)
+    if not isinstance(formula, Formula):
+        raise TypeError(f"a curve's formula is MTL text or a Formula; got {formula!r}")
+    check_names("signal of a learning curve", formula.signals(), SIGNALS)
+    return formula
+
+
+def curve_trace(
+    steps: Int[np.ndarray, " updates"], mean_return: Float[np.ndarray, " updates"]
+) -> Trace:
+    """The learning curve as a trace with the signal `return`, from step 0 on.
+
+    - `steps`: environment steps taken by the end of each update.
+    - `mean_return`: of the episodes that ended in each update; NaN where none did.
+
+    An update in which no episode ended keeps the value before it. Until the first episode ends
+    the value is that of the first: those episodes began with the training.
+
+    **Raises:** `ValueError` where no episode ended at all, or for steps that do not increase.
+    """
+    steps, known = np.asarray(steps, np.float64), np.asarray(mean_return, np.float64)
+    if steps.shape != known.shape or steps.ndim != 1:
+        raise ValueError(
+            "steps and mean_return must have one entry an update; "
+            f"got shapes {list(steps.shape)} and {list(known.shape)}"
+        )
+    present = np.isfinite(known)
+    if not present.any():
+        raise ValueError("no episode ended in this training: its learning curve is empty")
+    if steps[0] <= 0 or (np.diff(steps) <= 0).any():
+        raise ValueError(f"steps must be positive and increase; got {steps[:8].tolist()}")
+    last = np.maximum.accumulate(np.where(present, np.arange(len(known)), -1))
+    held = known[np.where(last >= 0, last, int(np.argmax(present)))]
+    signals, times = {"return": np.concatenate([held[:1], held])}, np.concatenate([[0.0], steps])
+    period = float(steps[0])
+    if np.array_equal(times, period * np.arange(len(times))):
+        return Trace(signals, dt=period)
+    return Trace(signals, times=times)
+
+
+def judge_curve(
+    formula: Formula | str,
+    steps: Int[np.ndarray, " updates"],
+    mean_return: Float[np.ndarray, " updates"],
+) -> float:
+    """Robustness of a formula on a learning curve, in units of the return; NaN without a curve.
+
+    - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
+      whole updates. Behind the end of the curve its last value stays.
+    - `steps`, `mean_return`: as in `curve_trace`.
+
+    **Raises:** as `check_curve`.
+    """
+    formula = check_curve(formula)
+    if not np.isfinite(np.asarray(mean_return, np.float64)).any():
+        return float("nan")
+    trace = curve_trace(steps, mean_return)
+    if trace.times is not None:
+        # Updates of different lengths; a value holds until the next update has ended.
+        trace = resample(trace, dt=float(np.diff(np.asarray(trace.times)).min()), method="hold")
+    # One length for many curves: the last value holds anyway, and each length is compiled once.
+    length = max(_SHORTEST, 1 << (trace.length - 1).bit_length())
+    values = np.asarray(trace["return"], np.float32)
+    padded = np.concatenate([values, np.full(length - len(values), values[-1], np.float32)])
+    assert trace.dt is not None
+    return float(robustness(_in_updates(formula, trace.dt), Trace({"return": padded}, dt=1.0)))
+
+
+def _in_updates(formula: Formula, period: float) -> Formula:
+    """The formula on a clock that counts updates; bounds are rounded down to whole ones."""
+    changed = rebuilt(formula, tuple(_in_updates(part, period) for part in formula.operands()))
+    interval = getattr(changed, "interval", None)
+    if interval is None:
+        return changed
+    # What an update brought counts from its end on: nothing changes before the next one ends.
+    start, end = (
+        float(np.floor(bound / period * (1 + 1e-9))) for bound in (interval.start, interval.end)
+    )
+    return replace(changed, interval=Interval(start, end))  # pyright: ignore

@@ -1,0 +1,53 @@
+"""Exact non-dominated sorting: which points no other point outdoes, then which of the rest, ...
+
+    fronts([[0.0, 5.0], [1.0, 1.0], [2.0, 6.0]])      # 0, 0, 1: all objectives are minimised
+
+One point dominates another if it is nowhere worse and somewhere better (Deb et al., A fast and
+elitist multiobjective genetic algorithm: NSGA-II, IEEE Transactions on Evolutionary Computation 6
+(2002), section III.A). Equal points do not dominate each other: they share a front.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_MOST_PAIRS = 2**24
+"""Comparisons made in one go."""
+
+
+def fronts(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
+    """The front of each point: 0 for those that none dominates, 1 once these are gone, and so on.
+
+    - `points`: one row a point, one column an objective, all to be minimised. Infinite entries
+      compare as numbers do.
+
+    A point with a NaN takes no part; its front is -1.
+
+    **Raises:** `ValueError` for points that are no matrix.
+    """
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2:
+        raise ValueError(f"points must have shape [n, objectives]; got {list(points.shape)}")
+    found = np.full(len(points), -1, np.int64)
+    places = np.flatnonzero(~np.isnan(points).any(axis=1))
+    # Equal points share a front: the distinct ones are enough, and there are often few.
+    distinct, which = np.unique(points[places], axis=0, return_inverse=True)
+    found[places] = _of_distinct(distinct)[which.ravel()]
+    return found
+
+
+def _of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
+    """Fronts of points that differ and are sorted by their first objective, then their second."""
+    found = np.full(len(points), -1, np.int64)
+    left, front = np.arange(len(points)), 0
+    while len(left):
+        some = points[left]
+        dominated = np.zeros(len(left), bool)
+        together = max(1, _MOST_PAIRS // max(1, some.size))
+        for begin in range(0, len(left), together):
+            part = some[begin : begin + together]
+            # Distinct points: nowhere worse means somewhere better, but for the point itself.
+            least = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
+            dominated[begin : begin + together] = least > 1
+        found[left[~dominated]] = front
+        left, front = left[dominated], front + 1
+    return found
