@@ -1,0 +1,322 @@
+"""The mountain car of Gymnasium, discrete (v0) and continuous, as a system under test.
+
+    mountain_car(along())                                # 200 steps, pushes the way it rolls
+    mountain_car(neural(policy), continuous=True)        # a trained network, 999 steps
+    mountain_car(lambda time, state, features: 1.0, steps=100)
+
+The car has to swing back and forth to leave its valley. A step counts as one second. Once it is at
+the goal it stays there, so that `eventually[0, 200] position >= 0.5` says that it arrives.
+
+Features, all optional, with Gymnasium's values where missing: `position0` and `velocity0` at the
+start, the `power` of the engine (velocity that full throttle adds in a step: 0.001 in MountainCar,
+0.0015 in MountainCarContinuous), `gravity` (0.0025), `friction` (the part of the velocity that is
+lost in a step, 0), `max_speed` (0.07), and `position_bias` and `velocity_bias`, added to what the
+controller sees. All but those of the start may be a `Signal`.
+
+Source: Moore, Efficient memory-based learning for robot control (1990), chapter 4; the numbers are
+those of Gymnasium 1.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from envs.arch.stepped import Stepped, real, value
+from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
+from verifai_jax.rl.algorithm import Number
+from verifai_jax.systems import sin_cos
+
+Features = Mapping[str, Any]
+Scalar = Float[Array, ""]
+Controller = Callable[[Any, "State", Features], Any]
+
+DT = 1.0  # Gymnasium gives a step no length.
+LEFT, RIGHT = -1.2, 0.6
+MAX_SPEED = 0.07
+GOAL = {"discrete": 0.5, "continuous": 0.45}
+STEPS = {"discrete": 200, "continuous": 999}
+NOMINAL = {
+    "position0": -0.5,
+    "velocity0": 0.0,
+    "power": 0.001,
+    "gravity": 0.0025,
+    "friction": 0.0,
+    "max_speed": MAX_SPEED,
+    "position_bias": 0.0,
+    "velocity_bias": 0.0,
+}
+NOMINAL_CONTINUOUS = {**NOMINAL, "power": 0.0015}
+
+
+class State(NamedTuple):
+    """Where the car is, from -1.2 to 0.6 (the valley's lowest point is -pi/6), and its velocity."""
+
+    position: Scalar
+    velocity: Scalar
+
+
+def moved(
+    state: State,
+    throttle: Scalar,
+    power: Scalar | float,
+    gravity: Scalar | float,
+    friction: Scalar | float = 0.0,
+    max_speed: Scalar | float = MAX_SPEED,
+) -> State:
+    """The state one step later, under a throttle from -1 to 1. The left wall stops the car."""
+    uphill = gravity * sin_cos(3 * state.position)[1]
+    velocity = state.velocity + (throttle * power - uphill) - friction * state.velocity
+    velocity = jnp.clip(velocity, -max_speed, max_speed)
+    position = jnp.clip(state.position + velocity, LEFT, RIGHT)
+    stopped = (position == LEFT) & (velocity < 0)
+    return State(position, jnp.where(stopped, 0.0, velocity))
+
+
+def arrived(state: State, continuous: bool) -> Bool[Array, ""]:
+    """Whether the car is at the goal, not rolling back."""
+    goal = GOAL["continuous" if continuous else "discrete"]
+    return (state.position >= goal) & (state.velocity >= 0)
+
+
+def energy(state: State, gravity: Scalar | float = NOMINAL["gravity"]) -> Scalar:
+    """Mechanical energy: 0 at rest at the bottom, 1 at rest at the height of the right summit."""
+    potential = gravity / 3 * (1 + sin_cos(3 * state.position)[0])
+    return (state.velocity**2 / 2 + potential) / (2 * gravity / 3)
+
+
+def observed(state: State) -> Float[Array, "2"]:
+    """What a network sees: position and velocity, each from about -1 to 1."""
+    middle, half = (LEFT + RIGHT) / 2, (RIGHT - LEFT) / 2
+    return jnp.stack([(state.position - middle) / half, state.velocity / MAX_SPEED])
+
+
+def along() -> Controller:
+    """Full throttle the way the car rolls, to the right from rest: what climbs the hill."""
+    return lambda time, state, features: jnp.where(state.velocity < 0, -1.0, 1.0)
+
+
+def neural(
+    policy: Policy | str | Path, *, raw: bool = False, straight_through: bool = True
+) -> Controller:
+    """A trained network, with 3 actions (left, none, right) or with a throttle from -1 to 1.
+
+    - `policy`: a `Policy` or the file of one. JAX may trace its weights.
+    - `raw`: it sees position and velocity as they are, as Gymnasium's do, not as `observed` does.
+    - `straight_through`: give the choice of an action the derivative of the mean throttle; its own
+      is zero almost everywhere. Source: Bengio, Leonard and Courville (2013), section 4.
+    """
+    policy = policy if isinstance(policy, Policy) else load_policy(policy)
+    fits = policy.action in (Discrete(3), Continuous(-1.0, 1.0))
+    if not fits or policy.layers[0][0].shape[0] != 2:
+        raise ValueError(
+            "a mountain-car policy sees 2 numbers and has 3 discrete actions or one from -1 to 1; "
+            f"got {policy.layers[0][0].shape[0]} and {policy.action}"
+        )
+
+    def control(time: Scalar, state: State, features: Features) -> Scalar:
+        outputs = policy(jnp.stack(state) if raw else observed(state))
+        if isinstance(policy.action, Continuous):
+            return jnp.clip(outputs[0], -1.0, 1.0)
+        throttle = (jnp.argmax(outputs) - 1).astype(outputs.dtype)
+        if not straight_through:
+            return throttle
+        left, _, right = jax.nn.softmax(outputs)
+        mean = right - left
+        return throttle + (mean - jax.lax.stop_gradient(mean))
+
+    return control
+
+
+def mountain_car(
+    controller: Controller | None = None, *, continuous: bool = False, steps: int | None = None
+) -> Stepped:
+    """The closed loop as a system with signals `position`, `velocity` and `throttle`.
+
+    - `controller(time, state, features) -> throttle` from -1 to 1; `along()` when left out. Its
+      state is what the sensors show.
+    - `continuous`: MountainCarContinuous-v0's power and goal (0.45), not MountainCar-v0's (0.5).
+    - `steps`: 200, or 999 of the continuous one, when left out.
+    """
+    decide = along() if controller is None else controller
+
+    def initial(features: Features) -> State:
+        return State(*(jnp.asarray(features[name], real()) for name in ("position0", "velocity0")))
+
+    def throttle(k: Int[Array, ""], state: State, features: Features) -> Scalar:
+        time = k * DT
+        seen = State(
+            state.position + value(features["position_bias"], time),
+            state.velocity + value(features["velocity_bias"], time),
+        )
+        return jnp.clip(jnp.asarray(decide(time, seen, features), real()), -1.0, 1.0)
+
+    def advance(k: Int[Array, ""], state: State, features: Features) -> State:
+        names = ("power", "gravity", "friction", "max_speed")
+        physics = [value(features[name], k * DT) for name in names]
+        after = moved(state, throttle(k, state, features), *physics)
+        there = arrived(state, continuous)
+        return jax.tree.map(lambda old, new: jnp.where(there, old, new), state, after)
+
+    def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Any]:
+        return {**state._asdict(), "throttle": throttle(k, state, features)}
+
+    return Stepped(
+        initial,
+        advance,
+        signals,
+        dt=DT,
+        steps=STEPS["continuous" if continuous else "discrete"] if steps is None else steps,
+        nominal=NOMINAL_CONTINUOUS if continuous else NOMINAL,
+    )
+
+
+class Episode(NamedTuple):
+    """A state, and the physics that this episode has."""
+
+    state: State
+    power: Scalar
+    gravity: Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MountainCarTask:
+    """MountainCar-v0 to train on: reward -1 a step, cut off after 200.
+
+    All zeros but `start_range` are Gymnasium's own task, and what returns are measured on. Floats
+    may be traced.
+
+    - `potential`: weight of the shaping by `energy`: a step also earns `shaping_discount *
+      potential(after) - potential(before)`, with potential 0 at the goal, which changes no best
+      policy if that discount is the algorithm's. Source: Ng, Harada and Russell, Policy invariance
+      under reward transformations (1999), theorem 1.
+    - `start_range`: initial positions are uniform in -0.5 +- this.
+    - `start_speed_range`: initial velocities are uniform in 0 +- this.
+    - `power_range`, `gravity_range`: each episode's is the nominal one times a factor, log-uniform
+      between `1 / (1 + range)` and `1 + range`. 0: no randomisation.
+
+    **Raises:** `ValueError` for a negative weight or range, or a start outside of the valley.
+    """
+
+    potential: Number = 0.0
+    shaping_discount: Number = 0.99
+    start_range: Number = 0.1
+    start_speed_range: Number = 0.0
+    power_range: Number = 0.0
+    gravity_range: Number = 0.0
+    time_limit: int = field(default=STEPS["discrete"], metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def action(self) -> Discrete:
+        """0 accelerates to the left, 2 to the right, 1 not."""
+        return Discrete(3)
+
+    def reset(self, key: Key[Array, ""]) -> Episode:
+        """At rest at the bottom of the valley, as the ranges say."""
+        return _reset(self, key, NOMINAL["power"])
+
+    def step(
+        self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
+    ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
+        """One step."""
+        return _step(self, state, action - 1.0, lambda there: -1.0, continuous=False)
+
+    def observe(self, state: Episode) -> Float[Array, "2"]:
+        """Position and velocity as `observed`."""
+        return observed(state.state)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ContinuousMountainCarTask:
+    """MountainCarContinuous-v0 to train on: 100 at the goal, less 0.1 throttle^2, 999 steps.
+
+    The fields are those of `MountainCarTask`.
+    """
+
+    potential: Number = 0.0
+    shaping_discount: Number = 0.99
+    start_range: Number = 0.1
+    start_speed_range: Number = 0.0
+    power_range: Number = 0.0
+    gravity_range: Number = 0.0
+    time_limit: int = field(default=STEPS["continuous"], metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def action(self) -> Continuous:
+        """The throttle."""
+        return Continuous(-1.0, 1.0)
+
+    def reset(self, key: Key[Array, ""]) -> Episode:
+        """At rest at the bottom of the valley, as the ranges say."""
+        return _reset(self, key, NOMINAL_CONTINUOUS["power"])
+
+    def step(
+        self, key: Key[Array, ""], state: Episode, action: Float[Array, "1"]
+    ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
+        """One step."""
+        throttle = jnp.clip(action[0], -1.0, 1.0)
+
+        def reward(there: Bool[Array, ""]) -> Scalar:
+            return jnp.where(there, 100.0, 0.0) - 0.1 * action[0] ** 2
+
+        return _step(self, state, throttle, reward, continuous=True)
+
+    def observe(self, state: Episode) -> Float[Array, "2"]:
+        """Position and velocity as `observed`."""
+        return observed(state.state)
+
+
+Either = MountainCarTask | ContinuousMountainCarTask
+
+
+def _check(task: Either) -> None:
+    farthest = {"start_range": -0.5 - LEFT, "start_speed_range": MAX_SPEED, "shaping_discount": 1.0}
+    for name in task.__dataclass_fields__:
+        number, most = getattr(task, name), farthest.get(name, math.inf)
+        # JAX puts other things into a pytree's place too.
+        if isinstance(number, int | float) and not 0 <= number <= most:
+            wanted = "at least 0" if most == math.inf else f"between 0 and {most:g}"
+            raise ValueError(f"{type(task).__name__}'s {name} must be {wanted}; got {number}")
+
+
+def _reset(task: Either, key: Key[Array, ""], power: float) -> Episode:
+    position, velocity, engine, pull = jax.random.uniform(key, (4,), minval=-1.0, maxval=1.0)
+    return Episode(
+        State(-0.5 + task.start_range * position, task.start_speed_range * velocity),
+        power * jnp.exp(engine * jnp.log1p(task.power_range)),
+        NOMINAL["gravity"] * jnp.exp(pull * jnp.log1p(task.gravity_range)),
+    )
+
+
+def _step(
+    task: Either,
+    episode: Episode,
+    throttle: Scalar,
+    reward: Callable[[Bool[Array, ""]], Any],
+    continuous: bool,
+) -> tuple[Episode, Scalar, Bool[Array, ""]]:
+    after = moved(episode.state, throttle, episode.power, episode.gravity)
+    there = arrived(after, continuous)
+    # Shaped by the nominal energy: what the reward says does not depend on the episode's physics.
+    potential = partial(_potential, task)
+    gain = task.shaping_discount * jnp.where(there, 0.0, potential(after))
+    shaped = reward(there) + (gain - potential(episode.state))
+    return episode._replace(state=after), shaped, there
+
+
+def _potential(task: Either, state: State) -> Scalar:
+    return task.potential * (energy(state) - 1)

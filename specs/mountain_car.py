@@ -1,0 +1,70 @@
+"""What a controller of the mountain car must keep, in which valleys.
+
+    verifai-jax falsify specs/mountain_car.py:climb
+    verifai-jax falsify specs/mountain_car.py:climb_continuous --search cross_entropy
+
+The car starts anywhere on the left of the valley's slopes, slow or fast, with an engine and a
+gravity that differ from those the controller was made for. A step of the car counts as a second.
+"""
+
+import verifai_jax as vj
+from envs.mountain_car import Controller, mountain_car, neural
+from envs.mountain_car_drawing import draw
+from verifai_jax.rl import Continuous, Policy
+
+NOMINAL = {"position0": -0.5, "velocity0": 0.0, "gravity": 0.0025, "velocity_bias": 0.0}
+starts = {"position0": vj.Box(-1.0, 0.2), "velocity0": vj.Box(-0.03, 0.03)}
+
+discrete = vj.FeatureSpace(
+    {
+        **starts,
+        "power": vj.Box(0.0009, 0.0012),
+        "gravity": vj.Box(0.0023, 0.0027),
+        "velocity_bias": vj.Box(-0.005, 0.005),
+    }
+)
+continuous = vj.FeatureSpace(
+    {
+        **starts,
+        "power": vj.Box(0.0012, 0.0018),
+        "gravity": vj.Box(0.0022, 0.0028),
+        "velocity_bias": vj.Box(-0.005, 0.005),
+    }
+)
+
+
+def _discrete(controller: Controller | None = None) -> vj.Problem:
+    return vj.Problem(
+        "climb",
+        discrete,
+        mountain_car(controller),
+        "eventually[0, 200] position >= 0.5",
+        nominal={**NOMINAL, "power": 0.001},
+        description="reach the flag within 200 s, whatever the start, the engine and the gravity",
+        draw=draw,
+    )
+
+
+def _continuous(controller: Controller | None = None) -> vj.Problem:
+    return vj.Problem(
+        "climb_continuous",
+        continuous,
+        mountain_car(controller, continuous=True, steps=300),
+        "eventually[0, 300] position >= 0.45",
+        nominal={**NOMINAL, "power": 0.0015},
+        description="reach the flag within 300 s with a throttle that is continuous",
+        draw=draw,
+    )
+
+
+climb = _discrete()
+climb_continuous = _continuous()
+
+
+def climb_with(policy: Policy) -> vj.Problem:
+    """The climb under a policy: `climb_continuous` or `climb`, as its actions are.
+
+    JAX may trace its weights.
+    """
+    make = _continuous if isinstance(policy.action, Continuous) else _discrete
+    return make(neural(policy))
