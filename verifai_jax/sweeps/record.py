@@ -1,7 +1,4 @@
-"""What a sweep leaves behind, as plain data: the driver writes it, `Sweep` shows it.
-
-    record.columns["failure_rate"], record.policies[3], record.curves[(0, 1)].mean_return
-"""
+"""What a sweep leaves behind, as plain data: the driver writes it, `Sweep` shows it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
