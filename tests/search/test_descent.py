@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -29,6 +29,7 @@ def exact(clauses, slopes, point, radius):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 3))
+@example(3614, 3)
 def test_least_against_a_linear_program(seed, count):
     rng = np.random.default_rng(seed)
     clauses = np.full(K, ABSENT)

@@ -309,7 +309,8 @@ def _least(
 ) -> Float[Array, " d"]:
     """Where in a box the greatest of linear clauses is least.
 
-    Exact for two clauses; for more the best of all points where one is least or two meet.
+    Exact for two clauses; for more the best of all points where one is least or two meet, or part
+    of the way there where they lie higher than the point itself.
     """
     low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
 
@@ -345,7 +346,13 @@ def _least(
     # Of clauses that there are not, and of equally good points the first: a corner.
     there = clauses > NOTHING
     usable = jnp.concatenate([there, there[pairs[:, 0]] & there[pairs[:, 1]]])
-    return candidates[jnp.argmin(jnp.where(usable, greatest, jnp.inf))]
+    greatest = jnp.where(usable, greatest, jnp.inf)
+    # Three clauses can be higher at all of these points; the greatest of them is convex.
+    parts = point + np.array([0.5, 0.25, 0.0])[:, None, None] * (candidates - point)
+    partly = jnp.where(usable, jnp.max(linear(parts), axis=2), jnp.inf).ravel()
+    whole = jnp.min(greatest) <= jnp.max(clauses)
+    nearer = parts.reshape(-1, len(point))[jnp.argmin(partly)]
+    return jnp.where(whole, candidates[jnp.argmin(greatest)], nearer)
 
 
 def _turned(
