@@ -1,0 +1,307 @@
+"""Which hyper-parameters matter for safety and for return, from the table of a sweep alone.
+
+    found = sweep.importance()
+    found.table                  loss of the score when one is shuffled, and shares of the variance
+    found.trusted("failure_rate")
+    found.unsafe, found.safe     principal components of the unsafe and of the safe ones
+
+A forest learns the failure rate and the return from the hyper-parameters, as coordinates in the
+unit cube of the study's space: a log-uniform one counts by its logarithm. It is judged on
+configurations that it was not trained on.
+
+Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
+(2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001); shares of
+the variance as in `variance.py`; principal components as in the paper's case study of
+hyper-parameters (Dreossi et al., CAV 2019).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.analysis.pca import Components, pca
+from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.sweeps.variance import boxes_of, variance_shares
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
+"""What is explained, and how people call it."""
+FEWEST = 10
+"""Configurations below which nothing is learned."""
+FEWEST_ROWS = 5
+"""Configurations of a verdict below which their principal components say nothing."""
+FOLDS = 5
+TREES = 40
+LEAST = 0.2
+"""R^2 on configurations kept aside below which importances mean nothing."""
+LEAST_LOSS = 0.02
+MOST_NAMED = 5
+MOST_CELLS = 8
+"""Different numbers in a column of an unknown domain up to which they are taken for choices."""
+
+
+@dataclass(frozen=True, eq=False)
+class HyperparameterImportance:
+    """How much each hyper-parameter matters.
+
+    **Fields:** `table`: one row a hyper-parameter, the most important first. For each of
+    `failure_rate` and `nominal_return`: the loss in R^2, on configurations that the model has not
+    seen, when the column is shuffled, with `_low` and `_high` two standard deviations of the
+    repetitions away; `_first` and `_total`, shares of the model's variance that it explains alone
+    and with all its interactions. NaN where there is no model. `scores`: R^2 of the models;
+    `missing`: why there is no model; `unsafe` and `safe`: principal components of these
+    configurations, None where there are fewer than five; `configurations`: how many there are;
+    `name` of the study.
+    """
+
+    table: "pd.DataFrame"
+    scores: Mapping[str, float]
+    missing: Mapping[str, str]
+    unsafe: Components | None
+    safe: Components | None
+    configurations: int
+    name: str
+
+    def trusted(self, target: str) -> bool:
+        """Whether the model of `"failure_rate"` or `"nominal_return"` predicts at all."""
+        return self.scores.get(target, -np.inf) >= LEAST
+
+    @property
+    def ranked(self) -> list[str]:
+        """Hyper-parameters from the most to the least important, for safety if that is known."""
+        return [str(name) for name in self.table.index]
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the losses as bars; returns the figure. **Raises:** `ValueError` without a model."""
+        from verifai_jax.report.style import new_figure, show_or_save
+        from verifai_jax.sweeps.picture import draw_importance
+
+        if not self.scores:
+            raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
+        figure = new_figure(figsize=(6.4, 1.6 + 0.42 * len(self.table)))
+        draw_importance(figure.subplots(), self)
+        return show_or_save(figure, path)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> list[str]:
+        lines = []
+        for target, what in TARGETS.items():
+            if target in self.missing:
+                lines.append(f"{what}: {self.missing[target]}")
+                continue
+            score = f"R^2 {self.scores[target]:.2f} on configurations kept aside"
+            if not self.trusted(target):
+                lines.append(
+                    f"{what}: what matters cannot be told from {self.configurations} "
+                    f"configurations, a model of some does not predict the others ({score})"
+                )
+                continue
+            losses = self.table[target].to_numpy(float)
+            order = [j for j in np.argsort(-losses, kind="stable") if losses[j] >= LEAST_LOSS]
+            shares = self.table[f"{target}_total"].to_numpy(float)
+            listed = ", ".join(
+                f"{self.table.index[j]} ({shares[j]:.0%} of the variance)"
+                for j in order[:MOST_NAMED]
+            )
+            lines.append(f"{what} depends on {listed or 'no single one'}; {score}")
+        for what, components in (("unsafe", self.unsafe), ("safe", self.safe)):
+            if components is not None and len(components.directions):
+                direction, names = components.directions[0], components.names
+                order = np.argsort(-np.abs(direction), kind="stable")[:3]
+                parts = " ".join(
+                    f"{direction[j]:+.2f} {names[j]}" for j in order if abs(direction[j]) >= 0.05
+                )
+                lines.append(
+                    f"{what} configurations vary most along {parts} "
+                    f"({components.shares[0]:.0%} of their variance)"
+                )
+        return lines
+
+
+@dataclass(frozen=True)
+class _Input:
+    """One hyper-parameter as the models see it."""
+
+    name: str
+    values: Float[np.ndarray, " rows"]
+    edges: Float[np.ndarray, " edges"] | None
+    ordered: bool
+
+
+def hyperparameter_importance(
+    table: "pd.DataFrame",
+    hyperparameters: Sequence[str],
+    space: FeatureSpace | None,
+    *,
+    name: str = "sweep",
+    repeats: int = 5,
+    seed: int = 0,
+) -> HyperparameterImportance:
+    """Measure it from the rows of a sweep's table; nothing is trained or simulated.
+
+    - `table`: with columns `configuration`, `steps`, `verdict`, `failure_rate`, `nominal_return`
+      and the hyper-parameters.
+    - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
+      one of them where it varies.
+    - `space`: that the study gave; None takes columns between their least and greatest entries.
+    - `repeats`: how often the folds are drawn anew and each column is shuffled.
+
+    Needs scikit-learn, which comes with verifai_jax.
+    """
+    import pandas as pd
+
+    names = list(dict.fromkeys([*hyperparameters, "steps"]))
+    inputs = _inputs(table, names, space)
+    groups = table["configuration"].to_numpy()
+    columns: dict[str, Any] = {}
+    scores: dict[str, float] = {}
+    missing: dict[str, str] = {}
+    for target in TARGETS:
+        values = table[target].to_numpy(np.float64)
+        usable = np.isfinite(values)
+        if reason := _unlearnable(values[usable], groups[usable], len(inputs)):
+            missing[target] = reason
+            continue
+        matrix = np.stack([one.values for one in inputs], axis=1)[usable]
+        score, losses = _shuffled(matrix, values[usable], groups[usable], repeats, seed)
+        mean, spread = losses.mean(axis=0), 2 * losses.std(axis=0, ddof=1)
+        forest = _forest(matrix.shape[1], seed).fit(matrix, values[usable])
+        shares = variance_shares(boxes_of(forest, [one.edges for one in inputs]))
+        scores[target] = score
+        columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
+        columns |= {f"{target}_first": shares.first, f"{target}_total": shares.total}
+    found = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
+    if scores:
+        by = max(scores, key=lambda target: (scores[target] >= LEAST, target == "failure_rate"))
+        found = found.sort_values(by, ascending=False, kind="stable")
+    unsafe, safe = (_components(table, inputs, kind) for kind in ("counterexamples", "safe"))
+    return HyperparameterImportance(
+        found, scores, missing, unsafe, safe, len(np.unique(groups)), name
+    )
+
+
+def _unlearnable(values: np.ndarray, groups: np.ndarray, inputs: int) -> str:
+    """Why nothing can be learned; empty if something can."""
+    count = len(np.unique(groups))
+    if not inputs:
+        return "no hyper-parameter varies"
+    if count < FEWEST:
+        some = f"{count} configuration{'s' * (count != 1)}" if count else "no configuration"
+        return f"{some} with a verdict, too few to learn from (at least {FEWEST})"
+    if np.ptp(values) == 0:
+        return f"it is {values[0]:.4g} for every policy"
+    return ""
+
+
+def _forest(inputs: int, seed: int) -> Any:
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    return ExtraTreesRegressor(
+        n_estimators=TREES,
+        min_samples_leaf=2,
+        max_leaf_nodes=48,
+        max_features=min(1.0, max(0.6, 3 / inputs)),
+        random_state=seed,
+    )
+
+
+def _shuffled(
+    matrix: Float[np.ndarray, "n d"],
+    values: Float[np.ndarray, " n"],
+    groups: Int[np.ndarray, " n"],
+    repeats: int,
+    seed: int,
+) -> tuple[float, Float[np.ndarray, "repeats d"]]:
+    """R^2 on configurations kept aside, and what it loses when a column is shuffled."""
+    generator = np.random.default_rng(seed)
+    rows, dimensions = matrix.shape
+    distinct, member = np.unique(groups, return_inverse=True)
+    scores, losses = [], []
+    for repeat in range(repeats):
+        # Seeds and snapshots of a configuration are alike: they stay on one side.
+        fold = generator.permutation(np.arange(len(distinct)) % FOLDS)[member]
+        guess = np.zeros((dimensions + 1, rows))
+        orders = [generator.permutation(rows) for _ in range(dimensions)]
+        for k in range(FOLDS):
+            aside = fold == k
+            model = _forest(dimensions, seed + repeat).fit(matrix[~aside], values[~aside])
+            asked = np.repeat(matrix[aside][None], dimensions + 1, axis=0)
+            for j, order in enumerate(orders):
+                asked[j + 1, :, j] = matrix[order, j][aside]
+            answers = model.predict(asked.reshape(-1, dimensions))
+            guess[:, aside] = answers.reshape(dimensions + 1, -1)
+        errors = np.square(guess - values).sum(axis=1)
+        reached = 1 - errors / np.square(values - values.mean()).sum()
+        scores.append(reached[0])
+        losses.append(reached[0] - reached[1:])
+    return float(np.mean(scores)), np.array(losses)
+
+
+def _inputs(
+    table: "pd.DataFrame", names: Sequence[str], space: FeatureSpace | None
+) -> list[_Input]:
+    """The columns that vary, as coordinates in the unit cube."""
+    import pandas as pd
+
+    found = []
+    domains = {} if space is None else space.domains
+    for name in names:
+        entries: Any = table[name]
+        if entries.nunique(dropna=True) < 2:
+            continue
+        number = pd.api.types.is_numeric_dtype(entries) and not pd.api.types.is_bool_dtype(entries)
+        domain = domains.get(name)
+        if domain is not None and domain.size == 1 and not isinstance(domain, Constant):
+            present = entries.dropna().unique().tolist()
+            place = {
+                entry: float(domain.to_unit(domain.from_columns({name: entry}, name))[0])
+                for entry in present
+            }
+            values = entries.map(place).to_numpy(np.float64)
+            levels, weights = domain.levels[0], domain.weights[0]
+            edges = np.linspace(0, 1, levels + 1) if levels else None
+            if weights is not None:
+                edges = np.concatenate([[0.0], np.cumsum(weights)])
+        elif number and entries.nunique() > MOST_CELLS:
+            real = entries.to_numpy(np.float64)
+            values, edges = (real - np.nanmin(real)) / np.ptp(real[~np.isnan(real)]), None
+        else:
+            # Snapshots, and columns of which nothing is known: by their order.
+            codes, kinds = pd.factorize(entries, sort=True)
+            values = np.where(codes < 0, np.nan, (codes + 0.5) / len(kinds))
+            edges = np.linspace(0, 1, len(kinds) + 1)
+        # What an algorithm lacks says nothing: the middle is as good as any.
+        values = np.where(np.isnan(values), 0.5, values)
+        found.append(_Input(name, values, edges, bool(number)))
+    return found
+
+
+def _components(table: "pd.DataFrame", inputs: Sequence[_Input], which: Any) -> Components | None:
+    """Principal components of the ordered hyper-parameters of the unsafe or the safe rows."""
+    import pandas as pd
+
+    ordered = [one for one in inputs if one.ordered and one.name != "steps"]
+    verdicts = table["verdict"].astype(str)
+    known = verdicts.str.startswith("safe") | (verdicts == "unsafe")
+    frame = pd.DataFrame({one.name: one.values for one in ordered}, index=table.index)
+    frame["violated"] = (verdicts == "unsafe").to_numpy()
+    # One row a configuration, at its last snapshot; the worst of its seeds decides.
+    last = table["steps"] == table.groupby("configuration")["steps"].transform("max")
+    frame = frame.loc[known & last].assign(configuration=table["configuration"])
+    frame = frame.sort_values("violated", kind="stable")
+    frame = frame.drop_duplicates("configuration", keep="last").drop(columns="configuration")
+    chosen = frame["violated"] == (which == "counterexamples")
+    if int(chosen.sum()) < FEWEST_ROWS or not ordered:
+        return None
+    return pca(frame, which=which, columns=[one.name for one in ordered], scale="raw")

@@ -1,0 +1,254 @@
+"""A sweep as a picture: return against safety, learning curves, and what matters."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.analysis.drawing import shortened
+from verifai_jax.report.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    WITHOUT_VERDICT,
+    new_figure,
+    show_or_save,
+    tidy,
+)
+from verifai_jax.sweeps.importance import HyperparameterImportance
+from verifai_jax.sweeps.ranking import chosen_first, is_safe, last_snapshots, least_full_return
+from verifai_jax.sweeps.telling import lead, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.sweeps.result import Sweep
+
+LOOKS = {"safe": (SAFE, "o"), "undecided": (WITHOUT_VERDICT, "D"), "unsafe": (FAILING, "X")}
+"""Colour and marker of each verdict."""
+RETURN = "#31688e"
+MOST_BARS = 8
+
+
+def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
+    """Draw the three panels; the second and third only where there is something to show."""
+    curves = _worth_drawing(sweep)
+    importance = sweep.importance() if len(sweep.table) else None
+    bars = importance is not None and any(importance.trusted(t) for t in importance.scores)
+    widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
+    figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
+    panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
+    draw_safety(panels.pop(0), sweep)
+    if curves:
+        draw_curves(panels.pop(0), sweep, curves)
+    if bars:
+        draw_importance(panels.pop(0), importance)
+    figure.suptitle(_wrapped(f"{shortened(sweep.name, 40)}: {lead(sweep)}", 12 * sum(widths) * 2.6))
+    return show_or_save(figure, path)
+
+
+def draw_safety(axes: Any, sweep: "Sweep") -> None:
+    """Each policy by its nominal return and its failure probability, with the interval."""
+    table = sweep.table.iloc[chosen_first(sweep.table)]
+    table = table.loc[np.isfinite(table["nominal_return"].to_numpy(np.float64))]
+    if not len(table):
+        axes.text(0.5, 0.5, "no policy was certified", ha="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    crowded = len(table) > 60
+    least = _least_shown(table)
+    shown = _spread(table, least)
+    final = shown.index.isin(last_snapshots(sweep.table).index)
+    for verdict, (colour, marker) in LOOKS.items():
+        of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
+        label = f"{verdict} ({int(of_kind.sum())})"
+        for rows, weight in ((shown.loc[of_kind & ~final], 0.3), (shown.loc[of_kind & final], 1.0)):
+            if not len(rows):
+                continue
+            if weight == 1.0:
+                _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
+            axes.scatter(
+                rows["nominal_return"],
+                rows["failure_rate"],
+                c=colour,
+                marker=marker,
+                s=26 if crowded else 42,
+                alpha=weight,
+                edgecolors="white",
+                linewidths=0.6,
+                label=label if weight == 1.0 else f"{verdict}, earlier snapshot",
+                zorder=2 + weight,
+            )
+    front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
+    axes.scatter(
+        front["nominal_return"],
+        front["failure_rate"],
+        facecolors="none",
+        edgecolors=BOUND,
+        s=110 if crowded else 130,
+        linewidths=1.1,
+        label=f"Pareto front ({len(front)})",
+        zorder=4,
+    )
+    # Linear up to the least rate that can be told from none, logarithmic from there on.
+    axes.set_yscale("symlog", linthresh=least, linscale=0.6)
+    axes.set_ylim(-0.25 * least, 1.6)
+    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
+    axes.set_yticks(ticks, [percent(tick) for tick in ticks])
+    axes.set_yticks([], minor=True)
+    if sweep.p is not None:
+        label = f"wanted: below {percent(sweep.p)}"
+        axes.axhline(sweep.p, color=BOUND, linewidth=0.9, linestyle="--", zorder=0, label=label)
+    axes.set_xlabel("nominal return of the policy")
+    axes.set_ylabel("failure probability")
+    axes.set_title("Return is not safety", fontsize=10)
+    tidy(axes)
+    _legend_below(axes, 3)
+
+
+def _draw_intervals(axes: Any, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
+    rate = rows["failure_rate"]
+    axes.errorbar(
+        rows["nominal_return"],
+        rate,
+        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate],
+        fmt="none",
+        ecolor=colour,
+        elinewidth=0.9,
+        alpha=alpha,
+        zorder=1,
+    )
+
+
+def _legend_below(axes: Any, columns: int) -> None:
+    """Where it hides nothing."""
+    axes.legend(
+        frameon=False,
+        fontsize=8,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16),
+        ncols=columns,
+        columnspacing=1.0,
+        handletextpad=0.4,
+    )
+
+
+def _least_shown(table: "pd.DataFrame") -> float:
+    """The power of ten below which the axis is linear: a single failure lies above it."""
+    counts = table["simulations"].to_numpy(np.float64)
+    most = float(np.nanmax(np.where(counts > 0, counts, np.nan))) if (counts > 0).any() else 1000.0
+    return float(10.0 ** np.floor(np.log10(1 / most)))
+
+
+def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
+    """The rows, points that would hide each other at no failure shifted a little to the side."""
+    shown = table.copy()
+    shown["nominal_return"] = shown["nominal_return"].astype(float)
+    span = float(np.ptp(shown["nominal_return"])) or 1.0
+    cell = list(zip(
+        np.round(shown["nominal_return"] / span * 60),
+        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), least / 3)) * 8),
+        strict=True,
+    ))  # fmt: skip
+    seen: dict[Any, int] = {}
+    for i, place in zip(shown.index, cell, strict=True):
+        turn = seen.get(place, 0)
+        seen[place] = turn + 1
+        side = (turn + 1) // 2 * (-1 if turn % 2 else 1)
+        shown.loc[i, "nominal_return"] += np.clip(side, -4, 4) * span / 200
+    return shown
+
+
+def _worth_drawing(sweep: "Sweep") -> list[int]:
+    """The best row, and a policy with a high return that is unsafe, if there is one."""
+    table = sweep.table
+    if not len(order := chosen_first(table)):
+        return []
+    best = int(table.index[order[0]])
+    last = last_snapshots(table)
+    # The whole curve of the best training says more than that up to its snapshot.
+    same = (last["configuration"] == table.loc[best, "configuration"]) & (
+        last["seed"] == table.loc[best, "seed"]
+    )
+    rows = [int(last.index[same][0]) if same.any() else best]
+    unsafe = last.loc[last["verdict"] == "unsafe"]
+    unsafe = unsafe.loc[unsafe["nominal_return"] >= least_full_return(table)]
+    if len(unsafe):
+        rows.append(int(unsafe["failure_rate"].idxmax()))  # pyright: ignore[reportArgumentType]
+    return [row for row in dict.fromkeys(rows) if np.isfinite(sweep._points(row)[1]).any()]
+
+
+def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
+    """The learning curves of some rows over environment steps."""
+    for row in rows:
+        entry = sweep.table.loc[row]
+        verdict = str(entry["verdict"])
+        colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
+        trace = sweep.curve(row)
+        clock = np.asarray(trace.clock()) / 1000
+        axes.plot(
+            clock,
+            np.asarray(trace["return"]),
+            color=colour,
+            marker=marker,
+            markevery=max(1, len(clock) // 8),
+            markersize=5,
+            linewidth=1.5,
+            label=f"row {row}, {verdict}: {_failures(entry)}",
+        )
+    axes.set_xlabel("environment steps in thousands")
+    axes.set_ylabel("mean return of training episodes")
+    axes.set_title("How they learnt", fontsize=10)
+    tidy(axes)
+    _legend_below(axes, 1)
+
+
+def _failures(row: "pd.Series") -> str:
+    if row["simulations"] > 0:
+        return f"{int(row['failures']):,} of {int(row['simulations']):,} simulations fail"
+    return f"fails in {percent(row['failure_rate'])}"
+
+
+def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
+    """The share of the variance of failing and of the return that each hyper-parameter explains."""
+    targets = [target for target in found.scores if found.trusted(target)] or list(found.scores)
+    shown = found.table.head(MOST_BARS)
+    looks = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
+    height, place = 0.76 / len(targets), np.arange(len(shown))
+    for k, target in enumerate(targets):
+        colour, what, hatch = looks[target]
+        at = place + (k - (len(targets) - 1) / 2) * height
+        axes.barh(
+            at,
+            shown[f"{target}_total"].to_numpy(float),
+            height * 0.9,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0,
+            label=f"{what} (model: R² {found.scores[target]:.2f})",
+        )
+        alone = shown[f"{target}_first"].to_numpy(float)
+        axes.vlines(
+            alone,
+            at - 0.45 * height,
+            at + 0.45 * height,
+            color=BOUND,
+            linewidth=1.6,
+            label="without interactions" if k == len(targets) - 1 else None,
+        )
+    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.02)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
+    axes.set_xlabel("share of the variance, with interactions")
+    axes.set_title("What matters", fontsize=10)
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+    _legend_below(axes, 1)
+
+
+def _wrapped(text: str, width: float) -> str:
+    import textwrap
+
+    return "\n".join(textwrap.wrap(text, max(40, int(width))))

@@ -1,0 +1,128 @@
+"""Rows of a sweep's table in the order in which a careful person would choose among them."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from verifai_jax.sweeps.pareto import fronts
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FULL = 0.01
+"""Part of the span of nominal returns within which a return counts as the best one."""
+_WORST_FIRST = ("unsafe", "undecided")
+
+
+def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
+    """Which rows have the verdict `safe@p`."""
+    return table["verdict"].astype(str).str.startswith("safe").to_numpy(bool)
+
+
+def chosen_first(table: "pd.DataFrame") -> Int[np.ndarray, " judged"]:
+    """Places of the rows with a certificate, the one to choose first.
+
+    Safe ones come before others, by their nominal return; the others by the upper end of their
+    failure probability. Then the lower failure rate, then fewer environment steps.
+    """
+    safe, high = is_safe(table), table["failure_high"].to_numpy(np.float64)
+    returned = np.nan_to_num(table["nominal_return"].to_numpy(np.float64), nan=-np.inf)
+    keys = (
+        table["steps"].to_numpy(np.float64),
+        np.where(safe, high, -returned),
+        np.nan_to_num(table["failure_rate"].to_numpy(np.float64), nan=np.inf),
+        np.where(safe, -returned, high),
+        ~safe,
+    )
+    order = np.lexsort(keys)
+    return order[np.isfinite(high)[order]]
+
+
+def pareto_fronts(table: "pd.DataFrame") -> Int[np.ndarray, " rows"]:
+    """The front of each row: more nominal return, less failure, fewer environment steps.
+
+    Failure counts by its upper end. -1 for a row without a return or a certificate.
+    """
+    columns = (-table["nominal_return"], table["failure_high"], table["steps"])
+    return fronts(np.stack([np.asarray(column, np.float64) for column in columns], axis=1))
+
+
+def least_full_return(table: "pd.DataFrame") -> float:
+    """The nominal return from which on a policy counts as one that has learnt the task.
+
+    The best of the table less one hundredth of the span of all; NaN for a table without any.
+    """
+    returned = table["nominal_return"].to_numpy(np.float64)
+    returned = returned[np.isfinite(returned)]
+    if not len(returned):
+        return float("nan")
+    return float(returned.max() - FULL * np.ptp(returned))
+
+
+def last_snapshots(table: "pd.DataFrame") -> "pd.DataFrame":
+    """The rows at the end of each training, as far as it went."""
+    last = table.groupby(["configuration", "seed"])["steps"].transform("max")
+    return table.loc[table["steps"] == last]
+
+
+def by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
+    """One row a configuration: its trainings at their last snapshots, together."""
+    import pandas as pd
+
+    names = [name for name in hyperparameters if name != "steps"]
+    place = {int(i): rank for rank, i in enumerate(table.index[chosen_first(table)])}
+    rows: list[dict[str, Any]] = []
+    for number, part in table.groupby("configuration", sort=True):
+        last = last_snapshots(part)
+        ranked = [int(i) for i in part.index if int(i) in place]
+        best = min(ranked, key=place.__getitem__, default=-1)
+        rows.append(
+            {
+                "configuration": number,
+                "steps": last["steps"].max(),
+                **{name: last[name].iloc[0] for name in names},
+                "seeds": len(last),
+                "seeds_safe": int(is_safe(last).sum()),
+                "verdict": _worst_verdict(last),
+                "nominal_return": last["nominal_return"].mean(),
+                "failure_rate": last["failure_rate"].mean(),
+                "failure_rate_worst": last["failure_rate"].max(),
+                "failure_high": last["failure_high"].max(skipna=False),
+                "training_seconds": last["training_seconds"].sum(),
+                "status": _told(last["status"]),
+                "best_row": best,
+                "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
+                "best_verdict": table.loc[best, "verdict"] if best >= 0 else "",
+            }
+        )
+    return pd.DataFrame(rows).set_index("configuration") if rows else pd.DataFrame()
+
+
+def return_and_safety(table: "pd.DataFrame") -> float:
+    """Spearman's rank correlation of nominal return and safety (one less the failure rate).
+
+    NaN for fewer than three rows that have both, or where one of them is the same for all.
+    """
+    pairs = table[["nominal_return", "failure_rate"]].dropna()
+    if len(pairs) < 3 or (pairs.nunique() < 2).any():
+        return float("nan")
+    ranks = pairs.rank()
+    return -float(np.corrcoef(ranks["nominal_return"], ranks["failure_rate"])[0, 1])
+
+
+def _worst_verdict(rows: "pd.DataFrame") -> str:
+    verdicts = rows["verdict"].astype(str)
+    for verdict in _WORST_FIRST:
+        if (verdicts == verdict).any():
+            return verdict
+    if is_safe(rows).all():
+        return str(verdicts.iloc[0])
+    # A seed without a certificate: what it would have trained is not known to be safe.
+    return "undecided" if is_safe(rows).any() else ""
+
+
+def _told(statuses: "pd.Series") -> str:
+    """What became of the trainings: one word if it is the same for all."""
+    return ", ".join(dict.fromkeys(str(status) for status in statuses))
