@@ -16,7 +16,7 @@ which `controller` drives it (see `either`).
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,8 +26,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from envs.randomisation import check_ranges, factor
 from verifai_jax.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
+from verifai_jax.rl.algorithm import Number
 from verifai_jax.rl.policy import Layers, written_out
 from verifai_jax.systems import Ode, ode, sin_cos
 from verifai_jax.systems.integrators import euler
@@ -168,7 +170,7 @@ def neural(
 
     def control(time: Scalar, state: State, features: Features) -> Scalar:
         if layers is not None:
-            (preference,) = written_out(layers, state)
+            (preference,) = written_out(layers, state, policy.activation)
         else:
             left, right = policy(jnp.stack(state))
             preference = right - left
@@ -193,10 +195,8 @@ def either(*controllers: Controller) -> Controller:
 
 
 def _known(policy: Policy) -> bool:
-    """Whether its numbers are constants, and what is between its layers is what is written out."""
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(policy))
-    plain = getattr(policy, "activation", "tanh") == "tanh" and not getattr(policy, "squash", False)
-    return plain and not traced
+    """Whether its numbers are constants, not being traced."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(policy))
 
 
 def _preferring(policy: Policy) -> Layers:
@@ -228,33 +228,85 @@ def _sign_jvp(primals: Any, tangents: Any) -> Any:
     return sign(*primals), (1 - smooth * smooth) / 2 * tangents[0]
 
 
+class Episode(NamedTuple):
+    """A state, and the features that this episode has."""
+
+    state: State
+    features: dict[str, Scalar]
+
+
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class CartPoleTask:
-    """CartPole-v1 to train on: nominal features, reward 1 a step, cut off after 500 steps."""
+    """CartPole-v1 to train on: nominal features, reward 1 a step, cut off after 500 steps.
 
-    time_limit: int = 500
+    What is None is as in CartPole-v1, which is what returns are measured on. Numbers may be traced.
+
+    - `masspole_range`, `length_range`: each episode's is the nominal one times a factor,
+      log-uniform between `1 / (1 + range)` and `1 + range`.
+    - `x0_range` (m), `theta0_range` (rad): the start is uniform in 0 +- this; 0.05 in CartPole-v1.
+    - `potential`: weight of a shaping: a step also earns `shaping_discount * potential(after) -
+      potential(before)`, where the potential falls from 1 in the middle and upright to 0 at the
+      limits, and is 0 at the end, which changes no best policy if that discount is the
+      algorithm's. Source: Ng, Harada and Russell, Policy invariance under reward transformations
+      (1999), theorem 1.
+
+    **Raises:** `ValueError` for a negative number, or a start beyond the limits.
+    """
+
+    masspole_range: Number | None = None
+    length_range: Number | None = None
+    x0_range: Number | None = None
+    theta0_range: Number | None = None
+    potential: Number | None = None
+    shaping_discount: Number = 0.99
+    time_limit: int = field(default=500, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self, {"x0_range": X_LIMIT, "theta0_range": THETA_LIMIT, "shaping_discount": 1.0}
+        )
 
     @property
     def action(self) -> Discrete:
         """0 pushes to the left, 1 to the right."""
         return Discrete(2)
 
-    def reset(self, key: Key[Array, ""]) -> State:
-        """Each part of the state uniform in +-0.05."""
-        return State(*jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05))
+    def reset(self, key: Key[Array, ""]) -> Episode:
+        """Each part of the state uniform in +-0.05, or in its range."""
+        state = State(*jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05))
+        for name, farthest in (("x", self.x0_range), ("theta", self.theta0_range)):
+            if farthest is not None:
+                state = state._replace(**{name: getattr(state, name) / 0.05 * farthest})
+        features = {}
+        ranges = {"masspole": self.masspole_range, "length": self.length_range}
+        for place, (name, spread) in enumerate(ranges.items()):
+            if spread is not None:
+                unit = jax.random.uniform(jax.random.fold_in(key, place), minval=-1.0)
+                features[name] = NOMINAL[name] * factor(unit, spread)
+        return Episode(state, features)
 
     def step(
-        self, key: Key[Array, ""], state: State, action: Int[Array, ""]
-    ) -> tuple[State, Scalar, Bool[Array, ""]]:
+        self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
+    ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
         """One step of 0.02 s."""
+        before, features = state
         force = jnp.where(action == 1, 1.0, -1.0) * NOMINAL["force_mag"]
         time = jnp.zeros(())
-        state = euler(lambda t, s: dynamics(t, s, force, {}), time, state, DT)
-        return state, jnp.ones(()), terminated(state, {})
+        after = euler(lambda t, s: dynamics(t, s, force, features), time, before, DT)
+        over, reward = terminated(after, features), jnp.ones(())
+        if self.potential is not None:
+            gain = self.shaping_discount * jnp.where(over, 0.0, _potential(after))
+            reward = reward + self.potential * (gain - _potential(before))
+        return Episode(after, features), reward, over
 
-    def observe(self, state: State) -> Float[Array, "4"]:
+    def observe(self, state: Episode) -> Float[Array, "4"]:
         """The state itself."""
-        return jnp.stack(state)
+        return jnp.stack(state.state)
+
+
+def _potential(state: State) -> Scalar:
+    return 1 - ((state.x / X_LIMIT) ** 2 + (state.theta / THETA_LIMIT) ** 2) / 2
 
 
 def cartpole(

@@ -17,7 +17,6 @@ Source: Moore, Efficient memory-based learning for robot control (1990), chapter
 those of Gymnasium 1.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -29,6 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from envs.arch.stepped import Stepped, real, value
+from envs.randomisation import check_ranges, factor
 from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
 from verifai_jax.rl.algorithm import Number
 from verifai_jax.systems import sin_cos
@@ -177,6 +177,9 @@ def mountain_car(
     )
 
 
+FARTHEST = {"start_range": -0.5 - LEFT, "start_speed_range": MAX_SPEED, "shaping_discount": 1.0}
+
+
 class Episode(NamedTuple):
     """A state, and the physics that this episode has."""
 
@@ -214,7 +217,7 @@ class MountainCarTask:
     time_limit: int = field(default=STEPS["discrete"], metadata={"static": True})
 
     def __post_init__(self) -> None:
-        _check(self)
+        check_ranges(self, FARTHEST)
 
     @property
     def action(self) -> Discrete:
@@ -253,7 +256,7 @@ class ContinuousMountainCarTask:
     time_limit: int = field(default=STEPS["continuous"], metadata={"static": True})
 
     def __post_init__(self) -> None:
-        _check(self)
+        check_ranges(self, FARTHEST)
 
     @property
     def action(self) -> Continuous:
@@ -283,22 +286,12 @@ class ContinuousMountainCarTask:
 Either = MountainCarTask | ContinuousMountainCarTask
 
 
-def _check(task: Either) -> None:
-    farthest = {"start_range": -0.5 - LEFT, "start_speed_range": MAX_SPEED, "shaping_discount": 1.0}
-    for name in task.__dataclass_fields__:
-        number, most = getattr(task, name), farthest.get(name, math.inf)
-        # JAX puts other things into a pytree's place too.
-        if isinstance(number, int | float) and not 0 <= number <= most:
-            wanted = "at least 0" if most == math.inf else f"between 0 and {most:g}"
-            raise ValueError(f"{type(task).__name__}'s {name} must be {wanted}; got {number}")
-
-
 def _reset(task: Either, key: Key[Array, ""], power: float) -> Episode:
     position, velocity, engine, pull = jax.random.uniform(key, (4,), minval=-1.0, maxval=1.0)
     return Episode(
         State(-0.5 + task.start_range * position, task.start_speed_range * velocity),
-        power * jnp.exp(engine * jnp.log1p(task.power_range)),
-        NOMINAL["gravity"] * jnp.exp(pull * jnp.log1p(task.gravity_range)),
+        power * factor(engine, task.power_range),
+        NOMINAL["gravity"] * factor(pull, task.gravity_range),
     )
 
 

@@ -20,7 +20,7 @@ discrete = vj.FeatureSpace(
         **starts,
         "power": vj.Box(0.0009, 0.0012),
         "gravity": vj.Box(0.0023, 0.0027),
-        "velocity_bias": vj.Box(-0.005, 0.005),
+        "velocity_bias": vj.Box(-0.002, 0.002),
     }
 )
 continuous = vj.FeatureSpace(

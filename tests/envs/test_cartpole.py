@@ -150,7 +150,7 @@ def test_task_steps_like_gymnasium():
     env = gymnasium.make("CartPole-v1").unwrapped
     env.reset(seed=0)
     task = cp.CartPoleTask()
-    state = cp.State(*(jnp.float32(v) for v in env.state))
+    state = cp.Episode(cp.State(*(jnp.float32(v) for v in env.state)), {})
     step = jax.jit(task.step)
     for action in [1, 0, 0] + [1] * 20:
         observed, reward, over, _, _ = env.step(action)
@@ -161,6 +161,48 @@ def test_task_steps_like_gymnasium():
         if over:
             break
     assert over
+
+
+def test_an_episode_has_its_own_pole_and_start():
+    task = cp.CartPoleTask(masspole_range=1.0, length_range=0.5, x0_range=1.0, theta0_range=0.1)
+    assert len(jax.tree.leaves(task)) == 5
+    episodes = jax.vmap(task.reset)(jax.random.split(KEY, 4000))
+    for name, least, most in (("masspole", 0.05, 0.2), ("length", 1 / 3, 0.75)):
+        values = np.asarray(episodes.features[name])
+        assert (values.min(), values.max()) == pytest.approx((least, most), rel=0.01)
+        assert np.median(values) == pytest.approx(cp.NOMINAL[name], rel=0.05)
+    for name, most in (("x", 1.0), ("theta", 0.1), ("x_dot", 0.05)):
+        values = np.asarray(getattr(episodes.state, name))
+        assert (values.min(), values.max()) == pytest.approx((-most, most), rel=0.01)
+    together = np.corrcoef([*episodes.features.values(), *episodes.state])
+    assert np.abs(together - np.eye(6)).max() < 0.06
+    # One step is that of the system with the same features.
+    first = jax.tree.map(lambda leaf: leaf[0], episodes)
+    after, reward, over = task.step(KEY, first, 1)
+    starts = zip(("x0", "x_dot0", "theta0", "theta_dot0"), first.state, strict=True)
+    features = {**dict(starts), **first.features}
+    trace = cp.cartpole(lambda time, state, f: 10.0, duration=cp.DT)(features, KEY)
+    np.testing.assert_allclose(task.observe(after)[2], trace["theta"][1], rtol=1e-6)
+    assert (float(reward), bool(over)) == (1.0, False)
+
+
+def test_shaping_sums_to_the_difference_of_potentials():
+    task = cp.CartPoleTask(potential=3.0, shaping_discount=0.9)
+    state = cp.State(*(jnp.float32(v) for v in (1.2, 0.0, cp.THETA_LIMIT / 2, 0.0)))
+    episode, total, weight, over = cp.Episode(state, {}), 0.0, 1.0, False
+    step = jax.jit(task.step)
+    while not over:
+        episode, reward, over = step(KEY, episode, 1)
+        total, weight = total + weight * (float(reward) - 1), weight * 0.9
+    # It ends where the potential is 0: what is left is that of the start.
+    assert total == pytest.approx(-3.0 * 0.75, rel=1e-4)
+
+
+def test_task_refuses_numbers_out_of_range():
+    with pytest.raises(ValueError, match=r"CartPoleTask's x0_range must be between 0 and 2.4; got"):
+        cp.CartPoleTask(x0_range=3.0)
+    with pytest.raises(ValueError, match="length_range must be at least 0; got -1"):
+        cp.CartPoleTask(length_range=-1)
 
 
 def test_argmax_pushes_with_full_force_and_has_the_derivative_of_the_mean_force():

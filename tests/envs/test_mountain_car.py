@@ -8,6 +8,8 @@ import pytest
 from gymnasium.envs.classic_control import continuous_mountain_car
 
 from envs import mountain_car as mc
+from specs.mountain_car import climb, climb_continuous, climb_with
+from verifai_jax.engine import judge
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate
 from verifai_jax.rl.policy import new_layers
 
@@ -267,13 +269,43 @@ def test_neural_refuses_what_it_cannot_use():
         mc.neural(Policy(layers, None, None, None, Discrete(2)))
 
 
+def pushing_along(continuous):
+    """The baseline as a network: full throttle the way it rolls, to the right from rest."""
+    if continuous:
+        layers = ((jnp.array([[0.0], [1e6]]), jnp.full(1, 1.0)),)
+        return Policy(layers, None, None, None, Continuous(-1.0, 1.0))
+    weight = jnp.array([[0.0, 0.0, 0.0], [-1e6, 0.0, 1e6]])
+    return Policy(((weight, jnp.array([0.0, -1.0, 0.5])),), None, None, None, Discrete(3))
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_one_program_judges_any_policy_of_a_form(continuous):
+    baseline = climb_continuous if continuous else climb
+    u = np.random.default_rng(0).uniform(size=(256, 5)).astype(np.float32)
+
+    def worst(problem, u):
+        def one(u):
+            return judge(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
+
+        return jax.vmap(one)(u)
+
+    judged = jax.jit(lambda policy, u: worst(climb_with(policy), u))
+    policy = pushing_along(continuous)
+    rho = np.asarray(judged(policy, u))
+    lazy = np.asarray(judged(jax.tree.map(jnp.zeros_like, policy), u))
+    assert judged._cache_size() == 1
+    # Some turn around a step earlier or later: rounding decides the sign of a small velocity.
+    close = np.isclose(rho, jax.jit(lambda u: worst(baseline, u))(u), atol=1e-5)
+    assert close.mean() > 0.95
+    assert np.mean(rho < 0) < 0.02
+    assert np.mean(lazy < 0) > 0.5
+    assert climb_with(policy).name == baseline.name
+    baseline.check()
+
+
 def test_pushing_along_solves_the_tasks():
-    weight = jnp.array([[0.0], [1e4]])
-    layers = ((weight, jnp.full(1, 1e-3)),)
-    policy = Policy(layers, None, None, None, Continuous(-1.0, 1.0))
-    returns = evaluate(mc.ContinuousMountainCarTask(), policy, episodes=50)
+    returns = evaluate(mc.ContinuousMountainCarTask(), pushing_along(True), episodes=50)
     assert returns.min() > 85
-    weight = jnp.array([[0.0, 0.0, 0.0], [-1e4, 0.0, 1e4]])
-    policy = Policy(((weight, jnp.array([0.0, -1.0, 0.5])),), None, None, None, Discrete(3))
+    policy = pushing_along(False)
     returns = evaluate(mc.MountainCarTask(), policy, episodes=50)
     assert -130 < returns.mean() < -100
