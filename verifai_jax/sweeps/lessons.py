@@ -181,7 +181,7 @@ class Lessons:
                 number = of[place]
                 policy, curve = home.policy(place), Curve(*home.curve(place))
                 work = _kept(policy, curve, home.seconds(place))
-                self.store.put({self._name(number, at): work})
+                self.store.put({self.name(number, at): work})
                 self._keep(number, at, work)
                 before = self._reached.get((number, at - 1))
                 share = home.seconds(place) - (before.seconds if before else 0.0)
@@ -193,7 +193,7 @@ class Lessons:
     def _recall(self, number: int, rung: int) -> None:
         if (number, rung) in self._reached:
             return
-        work = self.store.get(self._name(number, rung))
+        work = self.store.get(self.name(number, rung))
         if work is not None:
             self._keep(number, rung, work)
 
@@ -219,7 +219,8 @@ class Lessons:
             self._forms[structure] = jax.tree.structure(jax.eval_shape(first, key))
         return self._forms[structure]
 
-    def _name(self, number: int, rung: int) -> str:
+    def name(self, number: int, rung: int) -> str:
+        """What a training at a snapshot is called in the store."""
         lesson = self.lessons[number]
         total, at = lesson.snapshots[-1], lesson.snapshots[rung]
         return f"train/{lesson.key}/seed {lesson.seed}/{at} of {total}"

@@ -11,14 +11,22 @@ lacks is not used by it.
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.errors import unknown_name
-from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.features import (
+    Box,
+    Categorical,
+    Constant,
+    DiscreteBox,
+    FeatureSpace,
+    LogUniform,
+    TruncatedNormal,
+)
 from verifai_jax.features.domain import Domain
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.policy import Policy
@@ -31,6 +39,9 @@ _PROBES = 64
 """Choices of a domain up to which each is checked; the ends of larger ones."""
 _COMPANY = 16
 """Points of the space in whose company a value is refused before it is said to be impossible."""
+
+
+_CHUNK = 32
 
 
 class StudyError(ValueError):
@@ -234,10 +245,19 @@ def labelled(space: FeatureSpace, points: Any) -> list[dict[str, Any]]:
     Strings are strings, numbers of a `Categorical` the choices themselves; real numbers are those
     of float32, which is what a training sees.
     """
-    if not len(points):
-        return []
-    features = jax.jit(jax.vmap(space.unflatten))(jnp.asarray(points, jnp.float32))
-    return labels(space, features)
+    points = np.asarray(points, np.float32)
+    found: list[dict[str, Any]] = []
+    for start in range(0, len(points), _CHUNK):
+        some = points[start : start + _CHUNK]
+        padded = np.pad(some, ((0, _CHUNK - len(some)), (0, 0)), mode="edge")
+        found += labels(space, _unflatten(space)(padded))[: len(some)]
+    return found
+
+
+@lru_cache(maxsize=16)
+def _unflatten(space: FeatureSpace) -> Any:
+    """Compiled once for a space, whatever the number of points."""
+    return jax.jit(jax.vmap(space.unflatten))
 
 
 def labels(space: FeatureSpace, features: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -259,32 +279,29 @@ def labels(space: FeatureSpace, features: Mapping[str, Any]) -> list[dict[str, A
 
 def probes(domain: Domain) -> list[tuple[Any, str]]:
     """Values of a domain to check, with words for where they lie: its choices, or its ends."""
+    match domain:
+        case Constant():
+            return [(domain.value, "the value")]
+        case Categorical() if len(domain.choices) <= _PROBES:
+            return [(choice, "a choice") for choice in domain.choices]
+        case DiscreteBox() if domain.count <= _PROBES:
+            inner = [(value, "a value") for value in range(domain.low + 1, domain.high)]
+            return [(domain.low, "the lower end"), *inner, (domain.high, "the upper end")]
+        case Box() | DiscreteBox() | LogUniform() | TruncatedNormal():
+            # As it was written, not as float32 has it.
+            return [(domain.low, "the lower end"), (domain.high, "the upper end")]
     space = FeatureSpace({"value": domain})
     if not domain.size:
         return [(labelled(space, np.zeros((1, 0)))[0]["value"], "the value")]
-    count = domain.levels[0]
-    if 0 < count <= _PROBES:
-        from verifai_jax.proposals import cube_of
-
-        centres = np.asarray(cube_of(space).centres(np.arange(count)[:, None]))
-        values = [row["value"] for row in labelled(space, centres)]
-        if type(domain).__name__ != "DiscreteBox":
-            return [(value, "a choice") for value in values]
-        found = [(value, "a value") for value in values]
-        return [(values[0], "the lower end"), *found[1:-1], (values[-1], "the upper end")][:count]
-    ends = [row["value"] for row in labelled(space, np.array([[0.0], [1.0]], np.float32))]
-    # As it was written, not as float32 has it.
-    low, high = (
-        getattr(domain, end, found) for end, found in zip(("low", "high"), ends, strict=True)
-    )
-    return [(low, "the lower end"), (high, "the upper end")]
+    ends = [row["value"] for row in labelled(space, np.array([[0.0], [1.0]]))]
+    return [(ends[0], "the lower end"), (ends[1], "the upper end")]
 
 
 def _company(space: FeatureSpace) -> list[dict[str, Any]]:
     """Points all over the space, the middle first, as companions of a value to check."""
     rng = np.random.default_rng(0)
     points = np.concatenate([np.full((1, space.dim), 0.5), rng.random((_COMPANY, space.dim))])
-    return labelled(space, points.astype(np.float32))
+    return labelled(space, points)
 
 
 def _fields(owner: Any) -> tuple[str, ...]:
