@@ -57,7 +57,7 @@ def planted():
         lambda u, steps: 0.8 * (u[0] > 0.5) + 0.2 * (int(3 * u[2]) == 1),
         lambda u, steps: 500 * u[1],
     )
-    return hyperparameter_importance(table, list(SPACE.domains), SPACE, name="planted")
+    return hyperparameter_importance(table, list(SPACE.domains), SPACE, name="planted", repeats=3)
 
 
 def test_what_was_planted_is_found(planted):
@@ -94,7 +94,7 @@ def test_snapshots_count_as_training_set_size():
         lambda u, steps: u[0],
         snapshots=(1000, 2000, 4000),
     )
-    found = hyperparameter_importance(table, list(SPACE.domains), SPACE)
+    found = hyperparameter_importance(table, list(SPACE.domains), SPACE, repeats=2)
     assert found.table["failure_rate"].idxmax() == "steps"
     assert found.table.loc["steps", "failure_rate_total"] > 0.9
 

@@ -33,8 +33,8 @@ MOST_BARS = 8
 def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
     """Draw the three panels; the second and third only where there is something to show."""
     curves = _worth_drawing(sweep)
-    importance = sweep.importance() if len(sweep.table) else None
-    bars = importance is not None and any(importance.trusted(t) for t in importance.scores)
+    importance = sweep.importance()
+    bars = any(importance.trusted(target) for target in importance.scores)
     widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
     figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
     panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
@@ -203,7 +203,7 @@ def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
     _legend_below(axes, 1)
 
 
-def _failures(row: "pd.Series") -> str:
+def _failures(row: Any) -> str:
     if row["simulations"] > 0:
         return f"{int(row['failures']):,} of {int(row['simulations']):,} simulations fail"
     return f"fails in {percent(row['failure_rate'])}"

@@ -105,14 +105,14 @@ def return_and_safety(table: "pd.DataFrame") -> float:
 
     NaN for fewer than three rows that have both, or where one of them is the same for all.
     """
-    pairs = table[["nominal_return", "failure_rate"]].dropna()
+    pairs: Any = table[["nominal_return", "failure_rate"]].dropna()
     if len(pairs) < 3 or (pairs.nunique() < 2).any():
         return float("nan")
     ranks = pairs.rank()
     return -float(np.corrcoef(ranks["nominal_return"], ranks["failure_rate"])[0, 1])
 
 
-def _worst_verdict(rows: "pd.DataFrame") -> str:
+def _worst_verdict(rows: Any) -> str:
     verdicts = rows["verdict"].astype(str)
     for verdict in _WORST_FIRST:
         if (verdicts == verdict).any():
@@ -123,6 +123,6 @@ def _worst_verdict(rows: "pd.DataFrame") -> str:
     return "undecided" if is_safe(rows).any() else ""
 
 
-def _told(statuses: "pd.Series") -> str:
+def _told(statuses: Any) -> str:
     """What became of the trainings: one word if it is the same for all."""
     return ", ".join(dict.fromkeys(str(status) for status in statuses))

@@ -19,6 +19,7 @@ from verifai_jax.falsify import falsify
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
 from verifai_jax.rl.policy import Policy
+from verifai_jax.search import Search
 from verifai_jax.sweeps.curves import curve_trace
 from verifai_jax.sweeps.importance import HyperparameterImportance, hyperparameter_importance
 from verifai_jax.sweeps.ranking import by_configuration, chosen_first, is_safe, pareto_fronts
@@ -179,12 +180,17 @@ class Sweep:
 
     @suggests_options
     def counterexamples(
-        self, i: int | None = None, *, simulations: int = 2048, seed: int = 0
+        self,
+        i: int | None = None,
+        *,
+        simulations: int = 2048,
+        search: str | Search = "portfolio",
+        seed: int = 0,
     ) -> "pd.DataFrame":
         """Features with which the policy of row `i` fails, the worst first; of the best by default.
 
-        - `simulations`: that the default search may take to find some; 0 gives only the worst
-          that the sweep itself met, which needs no study.
+        - `simulations`: that the `search` may take to find some; 0 gives only the worst that the
+          sweep itself met, which needs no study.
 
         Columns are the problem's features and `rho`. None found does not mean that there are none:
         that is what the certificate is about.
@@ -201,7 +207,7 @@ class Sweep:
             parts.append(pd.DataFrame([{**worst, "rho": rho}]))
         if simulations:
             problem = self.problem(i)
-            run = falsify(problem, budget=simulations, seed=seed, progress=False)
+            run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
             parts.append(run.table.counterexamples[[*problem.space.columns, "rho"]])
         elif not parts:
             names = list(worst or {}) if self.study is None else self.problem(i).space.columns

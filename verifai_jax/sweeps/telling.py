@@ -16,8 +16,6 @@ from verifai_jax.sweeps.ranking import (
 )
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from verifai_jax.sweeps.result import Sweep
 
 MOST_ROWS = 8
@@ -26,7 +24,8 @@ MOST_ROWS = 8
 
 def summary(sweep: "Sweep") -> str:
     """The findings of a sweep, the most important first."""
-    table, groups = sweep.table, sweep.configurations
+    table: Any = sweep.table
+    groups: Any = sweep.configurations
     lines = [f"{sweep.name}: {lead(sweep)}"]
     if not sweep.record.complete:
         lines.append("  NOT FINISHED: interrupted or out of time; what was finished is here")
@@ -62,7 +61,7 @@ def summary(sweep: "Sweep") -> str:
 
 def lead(sweep: "Sweep") -> str:
     """How many configurations reach full return, and how many of those are safe."""
-    groups = sweep.configurations
+    groups: Any = sweep.configurations
     if not len(groups):
         return "no configuration was trained"
     text = f"{plural(len(groups), 'configuration')}; "
@@ -80,7 +79,7 @@ def lead(sweep: "Sweep") -> str:
     )
 
 
-def verdict_counts(rows: "pd.DataFrame") -> str:
+def verdict_counts(rows: Any) -> str:
     """How many rows have which verdict."""
     verdicts = rows["verdict"].astype(str)
     parts = [f"{int(is_safe(rows).sum())} safe"]
@@ -92,7 +91,7 @@ def verdict_counts(rows: "pd.DataFrame") -> str:
     return ", ".join(parts)
 
 
-def interval(row: Mapping[str, Any]) -> str:
+def interval(row: Any) -> str:
     """The failures of a row and the ends of its failure probability."""
     text = f"between {percent(row['failure_low'])} and {percent(row['failure_high'])}"
     if row["simulations"] > 0:
@@ -117,7 +116,7 @@ def plural(count: int, what: str) -> str:
     return f"{count:,} {what}{'s' * (count != 1)}"
 
 
-def values_of(sweep: "Sweep", row: "pd.Series") -> str:
+def values_of(sweep: "Sweep", row: Any) -> str:
     """The hyper-parameters of a row."""
     values = {name: row[name] for name in sweep.hyperparameters if name in row}
     missing = [
@@ -144,7 +143,7 @@ def as_html(sweep: "Sweep") -> str:
     )
 
 
-def _html_row(i: int, row: "pd.Series", names: list[str]) -> str:
+def _html_row(i: int, row: Any, names: list[str]) -> str:
     from verifai_jax.report.style import FAILING, SAFE, WITHOUT_VERDICT
 
     verdict = str(row["verdict"])
@@ -162,7 +161,7 @@ def _html_row(i: int, row: "pd.Series", names: list[str]) -> str:
 
 
 def _best(sweep: "Sweep") -> list[str]:
-    best = sweep.best
+    best: Any = sweep.best
     verdict = str(best["verdict"])
     if verdict.startswith("safe"):
         which = f"row {best.name}, {verdict}"
@@ -183,7 +182,7 @@ def _best(sweep: "Sweep") -> list[str]:
     return lines
 
 
-def _lost(table: "pd.DataFrame") -> str:
+def _lost(table: Any) -> str:
     """Rows that did not train, and why the first did not."""
     statuses = table["status"].astype(str)
     parts = []

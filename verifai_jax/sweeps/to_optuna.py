@@ -9,8 +9,6 @@ from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, LogUni
 from verifai_jax.features.domain import Domain
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from verifai_jax.sweeps.result import Sweep
 
 METRICS = ("upper end of the failure probability", "nominal return")
@@ -50,7 +48,7 @@ def to_optuna(sweep: "Sweep", storage: Any = None, name: str | None = None) -> A
     finally:
         optuna.logging.set_verbosity(loudness)
     made.set_user_attr("metrics", list(METRICS))
-    groups = sweep.configurations
+    groups: Any = sweep.configurations
     names = [n for n in sweep.hyperparameters if n in groups]
     domains = {} if sweep.space is None else sweep.space.domains
     known = {n: distribution(optuna, domains.get(n), groups[n]) for n in names}
@@ -61,7 +59,7 @@ def to_optuna(sweep: "Sweep", storage: Any = None, name: str | None = None) -> A
     return made
 
 
-def distribution(optuna: Any, domain: Domain | None, values: "pd.Series") -> Any:
+def distribution(optuna: Any, domain: Domain | None, values: Any) -> Any:
     """Optuna's distribution for a domain of ours; None for what does not vary.
 
     - `values`: that were tried, of which the range is taken where Optuna has no such domain.
@@ -94,7 +92,7 @@ def distribution(optuna: Any, domain: Domain | None, values: "pd.Series") -> Any
     return optuna.distributions.FloatDistribution(float(low), float(high))
 
 
-def _trial(optuna: Any, number: int, row: "pd.Series", distributions: dict[str, Any]) -> Any:
+def _trial(optuna: Any, number: int, row: Any, distributions: dict[str, Any]) -> Any:
     values = [float(row["failure_high"]), float(row["nominal_return"])]
     state = optuna.trial.TrialState.COMPLETE
     if not np.isfinite(values).all():
