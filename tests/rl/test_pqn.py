@@ -1,4 +1,4 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +14,14 @@ NONE = jnp.zeros(3, bool)
 SMALL = PQN(hidden=(16,), environments=8, horizon=16, minibatches=4)
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Corridor:
     """Five cells; the end pays 1, each step costs 0.1, so from cell 0 the best is 0.7."""
 
-    time_limit: int = 20
+    end: float = 4.0
+    each: float = -0.1
+    time_limit: int = field(default=20, metadata={"static": True})
 
     @property
     def action(self):
@@ -28,22 +31,12 @@ class Corridor:
         return jnp.float32(0.0)
 
     def step(self, key, state, action):
-        state = jnp.maximum(state + jnp.where(action == 1, 1.0, -1.0), 0.0)
-        over = state >= 4.0
-        return state, jnp.where(over, 1.0, -0.1), over
+        state = jnp.clip(state + jnp.where(action == 1, 1.0, -1.0), 0.0, 4.0)
+        over = state >= self.end
+        return state, jnp.where(over, 1.0, self.each), over
 
     def observe(self, state):
         return jnp.stack([state - 2.0, 1.0])
-
-
-@dataclass(frozen=True)
-class Forever(Corridor):
-    """A reward of 1 in each step, whatever one does; cut off after 5 steps, never over."""
-
-    time_limit: int = 5
-
-    def step(self, key, state, action):
-        return state, jnp.float32(1.0), jnp.array(False)
 
 
 def targets(terminated=NONE, truncated=NONE, q_lambda=0.5):
@@ -86,8 +79,7 @@ def test_targets_are_values_plus_advantages_of_the_greedy_policy():
 
 def test_exploration_takes_its_part_of_the_steps_and_holds_on():
     pqn = PQN(epsilon_start=0.3, epsilon_end=0.3, hold=5.0)
-    training = SMALL.init(Corridor(), jax.random.key(0), updates=10)
-    keep, start = _exploring(pqn, training)
+    keep, start = _exploring(pqn, done=3, updates=10)
 
     def step(held, drawn):
         held = _next_held(held, *drawn, keep, start)
@@ -113,12 +105,13 @@ def test_learns_the_corridor_and_the_same_from_the_same_seed():
 
 
 def test_cut_off_is_not_terminated():
-    # Of a reward of 1 for ever the value is 1 / (1 - 0.9) = 10, though episodes last 5 steps.
-    pqn = PQN(
-        hidden=(16,), environments=8, horizon=16, minibatches=4, discount=0.9, learning_rate=3e-3
-    )
-    policy = train(Forever(), pqn, seed=0, steps=30_000).policy
-    np.testing.assert_allclose(policy(jnp.array([-2.0, 1.0])) / pqn.reward_scale, 10.0, rtol=0.05)
+    # Of a reward of 1 for ever the value is 1 / (1 - 0.95) = 20, though episodes last 20 steps:
+    # if each were over for good, it would be 12.8 at their beginning and less later.
+    forever = Corridor(end=9.0, each=1.0)
+    pqn = replace(SMALL, discount=0.95, learning_rate=1e-2)
+    policy = train(forever, pqn, seed=0, steps=8_000).policy
+    seen = jnp.stack([jnp.arange(-2.0, 2.0), jnp.ones(4)], axis=1)
+    np.testing.assert_allclose(policy(seen) / pqn.reward_scale, 20.0, rtol=0.15)
 
 
 def test_it_is_an_algorithm_for_discrete_actions():

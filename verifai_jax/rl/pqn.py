@@ -183,7 +183,7 @@ def _collect(
     pqn: PQN, task: Task, training: Training, key: Key[Array, ""]
 ) -> tuple[Episodes, Int[Array, " environments"], Experience]:
     choice_key, action_key, step_key = jax.random.split(key, 3)
-    keep, start = _exploring(pqn, training)
+    keep, start = _exploring(pqn, training.done, training.updates)
     # All random numbers of the update at once: in the loop each draw would cost a pass of its own.
     chances = jax.random.uniform(choice_key, (pqn.horizon, pqn.environments))
     options = jax.random.randint(
@@ -208,14 +208,15 @@ def _collect(
     return episodes, held, experience
 
 
-def _exploring(pqn: PQN, training: Training) -> tuple[Array, Array]:
+def _exploring(
+    pqn: PQN, done: int | Int[Array, ""], updates: int | Int[Array, ""]
+) -> tuple[Array, Array]:
     """Chances to go on holding a random action, and to begin with one.
 
     With these the part of steps that explore is epsilon, whatever the hold: the stationary
     distribution of the chain of two states, exploring or not.
     """
-    part = training.done / (pqn.exploration * training.updates)
-    way = jnp.clip(part, 0.0, 1.0)
+    way = jnp.clip(done / (pqn.exploration * updates), 0.0, 1.0)
     epsilon = pqn.epsilon_start + way * (pqn.epsilon_end - pqn.epsilon_start)
     keep = 1.0 - 1.0 / pqn.hold
     return jnp.asarray(keep), epsilon * (1.0 - keep) / jnp.maximum(1.0 - epsilon * keep, 1e-6)
