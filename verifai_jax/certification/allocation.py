@@ -1,0 +1,226 @@
+"""Who is simulated next: policies whose verdict is open, and those that could be the safest.
+
+    allocation = Allocation(p=0.01, samples=512, budget=65_536)
+    while (blocks := allocation.next(failures, simulations)).any():
+        ...                                             # simulate so many blocks of each policy
+
+    race(draw, arms=64)                                 # only the name of the safest
+
+What comes next is a pure function of the counts so far: nothing is remembered, so a memo of the
+simulations is enough to go through the same decisions again.
+
+**Naming the safest** is best-arm identification with Bernoulli arms. The posterior of each failure
+rate, from Jeffreys' prior Beta(1/2, 1/2), gives the chance that the leader (the least posterior
+mean) is the safest up to `tie`. Until that chance is high enough, half of the simulations go to the
+leader and half to its likeliest rivals (top-two sampling: Russo, Simple Bayesian algorithms for
+best-arm identification, Operations Research 68, 2020). The chance decides when to stop and is no
+bound; nothing is certified by it.
+
+**Verdicts** stand on bounds that hold at any time (`bounds.py`), so they are right whatever this
+file decides. An open policy is simulated further where its observed rate promises a decision within
+the budget, the nearest decisions first.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.certification.bounds import evidence_above, evidence_below, needed
+
+QUANTILES = 24
+"""Points of the leader's posterior in the integral over it."""
+GROWTH = 8
+"""A policy's samples grow by this part of them in one round, at least by a block."""
+
+
+class Standing(NamedTuple):
+    """Who leads, and how surely.
+
+    - `leader`: the number with the least posterior mean.
+    - `chance`: posterior probability that no rate is below the leader's by more than `tie`.
+    - `rivals`: of each policy the probability that its rate is.
+    """
+
+    leader: int
+    chance: float
+    rivals: Float[np.ndarray, " n"]
+
+
+def standing(
+    failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"], tie: float
+) -> Standing:
+    """Who leads; see `Standing`. Of equal means the one with more samples, then the first."""
+    from scipy.special import betainc, betaincinv
+
+    k, n = np.asarray(failures, float), np.asarray(simulations, float)
+    mean = (k + 0.5) / (n + 1)
+    leader = int(np.lexsort((np.arange(len(k)), -n, mean))[0])
+    levels = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    rates = betaincinv(k[leader] + 0.5, n[leader] - k[leader] + 0.5, levels)
+    below = np.maximum(rates - tie, 0.0)[:, None]
+    better = betainc(k + 0.5, n - k + 0.5, below)
+    better[:, leader] = 0.0
+    chance = float(np.mean(np.prod(1 - better, axis=1)))
+    return Standing(leader, chance, np.mean(better, axis=0))
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """What to simulate next; see the module's docstring.
+
+    - `p`, `confidence`: of the verdicts. The safest is named at half the error that `confidence`
+      leaves: among near ties its posterior chance is a little too high.
+    - `samples`: of each policy at least; `block`: of one policy in one piece.
+    - `budget`: samples of all policies together, at most.
+    - `tie`: rates that differ by less count as equal; `p / 10` when left out.
+    - `verdicts`, `safest`: what is to be decided.
+    """
+
+    p: float = 0.01
+    confidence: float = 0.95
+    samples: int = 512
+    budget: int = 65_536
+    block: int = 64
+    tie: float | None = None
+    verdicts: bool = True
+    safest: bool = True
+
+    @property
+    def sure(self) -> float:
+        """The chance at which the safest is named."""
+        return (1 + self.confidence) / 2
+
+    @property
+    def tolerance(self) -> float:
+        """Rates that differ by less count as equal."""
+        return self.p / 10 if self.tie is None else self.tie
+
+    def next(
+        self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
+    ) -> Int[np.ndarray, " n"]:
+        """Blocks to simulate of each policy; all zero once everything is decided, or can't be."""
+        k, n = np.asarray(failures), np.asarray(simulations)
+        least = np.maximum(-(-(self.samples - n) // self.block), 0)
+        if least.any():
+            return least
+        left = (self.budget - int(n.sum())) // self.block
+        if left <= 0:
+            return np.zeros(len(n), np.int64)
+        blocks = np.zeros(len(n), np.int64)
+        if self.safest and len(n) > 1:
+            blocks = self._rivals(k, n, left)
+        if self.verdicts:
+            blocks = np.maximum(blocks, self._open(k, n, left - int(blocks.sum())))
+        return blocks
+
+    def undecided(
+        self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Which verdicts are open."""
+        limit = needed(self.confidence, len(failures))
+        p = np.full(len(failures), self.p)
+        safe = evidence_below(failures, simulations, p) > limit
+        return ~(safe | (evidence_above(failures, simulations, p) > limit))
+
+    def _grown(self, n: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """Blocks of a round for policies with `n` samples."""
+        return np.maximum(n // (GROWTH * self.block), 1)
+
+    def _rivals(
+        self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int
+    ) -> Int[np.ndarray, " n"]:
+        """Blocks of the leader and of its likeliest rivals."""
+        blocks = np.zeros(len(n), np.int64)
+        now = standing(k, n, self.tolerance)
+        if now.chance >= self.sure:
+            return blocks
+        rivals = np.flatnonzero(now.rivals >= 0.5 * now.rivals.max())
+        if k[now.leader] == 0:
+            # Nothing sets two without a failure apart: the leader alone is played until it fails,
+            # or is known to be as good as any.
+            rivals = rivals[k[rivals] > 0]
+        # Few at a time, the likeliest first: what they show may settle it.
+        rivals = rivals[np.argsort(-now.rivals[rivals], kind="stable")][:4]
+        each = self._grown(n)
+        if n[now.leader] <= n[rivals].sum() or not len(rivals):
+            blocks[now.leader] = each[now.leader]
+        if not blocks.any() or (len(rivals) and n[now.leader] >= n[rivals].max()):
+            blocks[rivals] = each[rivals]
+        return _within(blocks, left)
+
+    def _open(
+        self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int
+    ) -> Int[np.ndarray, " n"]:
+        """Blocks of policies whose verdict is open and within reach."""
+        blocks = np.zeros(len(n), np.int64)
+        where = np.flatnonzero(self.undecided(k, n))
+        if not len(where):
+            return blocks
+        more = np.array([self._missing(float(k[i]), int(n[i]), len(n)) for i in where])
+        for i, missing in sorted(zip(where, more, strict=True), key=lambda pair: pair[1]):
+            wanted = -(-missing // self.block)
+            if not math.isfinite(missing) or wanted > left:
+                continue
+            # A failure more takes twice as many: look again on the way.
+            blocks[i] = min(int(wanted), int(self._grown(n[i : i + 1])[0]))
+            left -= int(wanted)
+        return blocks
+
+    def _missing(self, failures: float, simulations: int, among: int) -> float:
+        """How many more samples decide, if they fail as those so far; infinite if never."""
+        limit = needed(self.confidence, among)
+        rate = failures / simulations
+        evidence = evidence_below if rate < self.p else evidence_above
+        more = np.unique(np.geomspace(self.block, max(self.budget, self.block), 60).astype(int))
+        found = evidence(failures + rate * more, simulations + more, np.full(len(more), self.p))
+        enough = np.flatnonzero(found > limit)
+        return float(more[enough[0]]) if len(enough) else math.inf
+
+
+def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:
+    """The same blocks, the first ones only where they are more than are left."""
+    before = np.concatenate([[0], np.cumsum(blocks)[:-1]])
+    return np.clip(left - before, 0, blocks)
+
+
+class Raced(NamedTuple):
+    """What `race` found: the safest arm, its chance to be it, and the counts of all arms."""
+
+    arm: int
+    chance: float
+    failures: Int[np.ndarray, " arms"]
+    simulations: Int[np.ndarray, " arms"]
+
+
+def race(
+    draw: Callable[[int, int], int],
+    arms: int,
+    *,
+    confidence: float = 0.95,
+    tie: float = 0.001,
+    first: int = 16,
+    block: int = 16,
+    budget: int = 1_000_000,
+) -> Raced:
+    """Name the arm that fails least often.
+
+    - `draw(arm, n)`: how many of the next `n` samples of an arm fail.
+    - `first`: samples of each arm to begin with; then blocks of `block`.
+    - `budget`: samples at most.
+    """
+    allocation = Allocation(
+        p=1.0, confidence=confidence, samples=first, budget=budget, block=block, tie=tie,
+        verdicts=False,
+    )  # fmt: skip
+    failures, simulations = np.zeros(arms, np.int64), np.zeros(arms, np.int64)
+    while (blocks := allocation.next(failures, simulations)).any():
+        for arm in np.flatnonzero(blocks):
+            count = int(blocks[arm]) * block
+            failures[arm] += draw(int(arm), count)
+            simulations[arm] += count
+    now = standing(failures, simulations, tie)
+    return Raced(now.leader, now.chance, failures, simulations)

@@ -1,0 +1,109 @@
+"""Policies of one structure: their weights are arguments of one compiled program.
+
+    families(policies)              # [Family(numbers=(0, 2, 3), ...), Family(numbers=(1,), ...)]
+    digest(policy)                  # what names a policy in a memo: a hash of its arrays
+
+Hidden layers are padded with units whose weights are zero, up to a width that depends on the policy
+alone, so that policies of different widths share a program and none of them simulates differently
+in other company. Padding is exact in real numbers, since activations are 0 at 0; in float32 the
+padded sums may round differently from the policy's own.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from verifai_jax.rl import Policy
+
+LEAST_WIDTH = 64
+"""Hidden layers up to this width share a program; wider ones go to the next power of two."""
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Policies that one program can simulate.
+
+    - `numbers`: their places in the list that was given.
+    - `weights`: the padded policies, with NumPy leaves, in that order.
+    - `structure`: what they have in common, as text.
+    - `traced`: False for a policy that is no pytree of numbers and has to stay as it is.
+    """
+
+    numbers: tuple[int, ...]
+    weights: tuple[Any, ...]
+    structure: str
+    traced: bool = True
+
+
+def families(policies: Sequence[Any]) -> list[Family]:
+    """Sort policies by structure, in the order in which the structures first appear."""
+    found: dict[str, tuple[list[int], list[Any], bool]] = {}
+    for number, policy in enumerate(policies):
+        traced = is_numbers(policy)
+        whole = padded(policy) if traced else policy
+        structure = structure_of(whole) if traced else f"policy {number}"
+        numbers, weights, _ = found.setdefault(structure, ([], [], traced))
+        numbers.append(number)
+        weights.append(whole)
+    return [
+        Family(tuple(numbers), tuple(weights), structure, traced)
+        for structure, (numbers, weights, traced) in found.items()
+    ]
+
+
+def is_numbers(policy: Any) -> bool:
+    """Whether JAX can have all that a policy is made of as arguments."""
+    leaves = jax.tree.leaves(policy)
+    plain = (np.ndarray, np.generic, jax.Array, int, float)
+    return bool(leaves) and all(isinstance(leaf, plain) for leaf in leaves)
+
+
+def padded(policy: Any) -> Any:
+    """The policy with NumPy leaves; if it is a `Policy`, with hidden layers of the shared width."""
+    policy = jax.tree.map(_on_host, policy)
+    if not isinstance(policy, Policy):
+        return policy
+    layers = []
+    last = len(policy.layers) - 1
+    for i, (weight, bias) in enumerate(policy.layers):
+        rows, columns = np.shape(weight)
+        more = (
+            0 if i == 0 else shared_width(rows) - rows,
+            0 if i == last else shared_width(columns) - columns,
+        )
+        layers.append((np.pad(weight, ((0, more[0]), (0, more[1]))), np.pad(bias, (0, more[1]))))
+    return replace(policy, layers=tuple(layers))
+
+
+def shared_width(width: int) -> int:
+    """The width that a hidden layer of `width` units is padded to."""
+    return max(LEAST_WIDTH, 1 << (width - 1).bit_length())
+
+
+def structure_of(policy: Any) -> str:
+    """Text that is equal for policies which one program can simulate."""
+    leaves, form = jax.tree.flatten(policy)
+    shapes = [f"{np.dtype(leaf.dtype).str}{list(np.shape(leaf))}" for leaf in leaves]
+    return f"{form} {' '.join(shapes)}"
+
+
+def digest(policy: Any, number: int = 0) -> str:
+    """A hash of a policy's structure and numbers; of its `number` where it has no numbers."""
+    if not is_numbers(policy):
+        return f"policy-{number}"
+    policy = jax.tree.map(_on_host, policy)
+    told = hashlib.sha256(structure_of(policy).encode())
+    for leaf in jax.tree.leaves(policy):
+        told.update(np.ascontiguousarray(leaf).tobytes())
+    return told.hexdigest()[:32]
+
+
+def _on_host(leaf: Any) -> np.ndarray:
+    array = np.asarray(leaf)
+    # As JAX would take it, in the precision of simulations.
+    kinds: dict[str, Any] = {"f": np.float32, "i": np.int32, "u": np.uint32}
+    return array.astype(kinds.get(array.dtype.kind, array.dtype))

@@ -1,0 +1,188 @@
+"""What a certification returns: for each policy how often it fails, and how sure that is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.certification.bounds import UNSAFE, safe_at
+from verifai_jax.rates import Rate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """What is known of one policy.
+
+    - `simulations`: independent samples of the prior; `failures` and `not_finite` among them.
+      Samples without a verdict (`not_finite`) count as failures in the `rate`.
+    - `rate`: with an interval that holds together with those of all other policies, whatever
+      decided the number of samples; None before the first sample.
+    - `verdict`: `"safe@p"` if the interval is below p, `"unsafe"` if above, or `"undecided"`.
+    - `attacks`: simulations of the attack, `attack_failures` among them; they are in no rate.
+    - `worst_robustness`: the least over everything simulated, NaN if nothing had a verdict;
+      `worst_features`: the table columns at which it was met.
+    - `counterexamples`: columns of features and `rho`, worst first.
+    """
+
+    number: int
+    failures: int
+    simulations: int
+    not_finite: int
+    rate: Rate | None
+    verdict: str
+    attacks: int
+    attack_failures: int
+    worst_robustness: float
+    worst_features: Mapping[str, Any] | None
+    counterexamples: Mapping[str, np.ndarray] = field(repr=False)
+
+    @property
+    def cost(self) -> int:
+        """Simulations of both stages."""
+        return self.simulations + self.attacks
+
+    def __str__(self) -> str:
+        return f"policy {self.number}: {self.verdict}, {self._told()}"
+
+    def _told(self) -> str:
+        if self.rate is None:
+            text = "no sample yet"
+        else:
+            text = f"{self.failures + self.not_finite} of {self.simulations} fail: {self.rate}"
+        if self.not_finite:
+            text += f"; {self.not_finite} of them gave no verdict"
+        if np.isfinite(self.worst_robustness):
+            text += f"; worst robustness {self.worst_robustness:.4g}"
+        return text
+
+
+@dataclass(frozen=True, eq=False)
+class Certificates:
+    """What `certify` returns; `certificates[i]` is the `Certificate` of policy i.
+
+    **Fields:** `p` and `confidence` of the verdicts: with this probability no interval of any
+    policy, and so no verdict, is wrong; `safest`: number of the policy that fails least often, None
+    before all have been sampled; `chance`: its posterior probability to be the safest up to `tie`
+    (an estimate, no bound); `budget` of samples; `blocks`: samples simulated together;
+    `stopped`: `"decided"`, `"budget"` (verdicts are open and the budget, or what is left of it, is
+    too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name.
+    """
+
+    rows: tuple[Certificate, ...] = field(repr=False)
+    problem: str
+    p: float
+    confidence: float
+    safest: int | None
+    chance: float | None
+    tie: float
+    seed: int
+    samples: int
+    budget: int
+    stopped: str
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, number: int) -> Certificate:
+        return self.rows[number]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def safe(self) -> tuple[int, ...]:
+        """Numbers of the policies that are safe at p."""
+        return tuple(row.number for row in self.rows if row.verdict == safe_at(self.p))
+
+    @property
+    def unsafe(self) -> tuple[int, ...]:
+        """Numbers of the policies that fail with a probability above p."""
+        return tuple(row.number for row in self.rows if row.verdict == UNSAFE)
+
+    @property
+    def simulations(self) -> int:
+        """Samples of the certificates, all policies together; without the attack."""
+        return sum(row.simulations for row in self.rows)
+
+    @property
+    def attacks(self) -> int:
+        """Simulations of the attack, all policies together."""
+        return sum(row.attacks for row in self.rows)
+
+    @property
+    def uniform(self) -> int:
+        """Samples if every policy had had as many as the one that needed most."""
+        return len(self.rows) * max((row.simulations for row in self.rows), default=0)
+
+    def table(self) -> "pd.DataFrame":
+        """One row a policy, in the order they were given."""
+        import pandas as pd
+
+        def bound(row: Certificate, name: str) -> float:
+            return float("nan") if row.rate is None else getattr(row.rate, name)
+
+        return pd.DataFrame(
+            {
+                "policy": [row.number for row in self.rows],
+                "verdict": [row.verdict for row in self.rows],
+                "failures": [row.failures for row in self.rows],
+                "simulations": [row.simulations for row in self.rows],
+                "not_finite": [row.not_finite for row in self.rows],
+                "failure_rate": [bound(row, "estimate") for row in self.rows],
+                "failure_low": [bound(row, "low") for row in self.rows],
+                "failure_high": [bound(row, "high") for row in self.rows],
+                "worst_robustness": [row.worst_robustness for row in self.rows],
+                "attacks": [row.attacks for row in self.rows],
+                "attack_failures": [row.attack_failures for row in self.rows],
+                "cost": [row.cost for row in self.rows],
+            }
+        )
+
+    def counterexamples(self, number: int) -> "pd.DataFrame":
+        """Failing features of a policy with their robustness `rho`, worst first."""
+        import pandas as pd
+
+        return pd.DataFrame(dict(self.rows[number].counterexamples))
+
+    def __str__(self) -> str:
+        open_ = len(self.rows) - len(self.safe) - len(self.unsafe)
+        lines = [
+            f"certificates of {len(self.rows)} policies for {self.problem}: {len(self.safe)} "
+            f"{safe_at(self.p)}, {len(self.unsafe)} unsafe, {open_} undecided "
+            f"({self.confidence * 100:g} % that all are right)"
+        ]
+        if self.safest is not None and self.chance is not None:
+            lines.append(
+                f"  safest: policy {self.safest}, {self._chance(self.chance)} that none is better "
+                f"by more than {self.tie:g}"
+            )
+        # The safe ones first, then the least failing.
+        order = sorted(self.rows, key=lambda row: (_rank(row, self.p), row.number))
+        shown = order if len(order) <= 16 else order[:12]
+        lines += [f"  {row}" for row in shown]
+        if len(shown) < len(order):
+            lines.append(f"  ... and {len(order) - len(shown)} more: .table()")
+        equal = (
+            f"; the same number for every policy would be {self.uniform:,}"
+            if self.uniform > self.simulations
+            else ""
+        )
+        lines.append(
+            f"  {self.simulations:,} samples{equal}; {self.attacks:,} more in the attack; "
+            f"{self.seconds:.1f} s, stopped: {self.stopped}"
+        )
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    @staticmethod
+    def _chance(chance: float) -> str:
+        return "almost certain" if chance > 0.9995 else f"chance {100 * chance:.1f} %"
+
+
+def _rank(row: Certificate, p: float) -> float:
+    if row.rate is None:
+        return 3.0
+    return row.rate.estimate + (0.0 if row.verdict == safe_at(p) else 1.0)
