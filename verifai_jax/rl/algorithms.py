@@ -8,8 +8,8 @@ from typing import Any
 
 from verifai_jax.errors import unknown_name
 from verifai_jax.rl.algorithm import Algorithm
-from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.ppo import PPO
+from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
 from verifai_jax.rl.task import Action
 
