@@ -43,4 +43,4 @@ def advantages(
         advantage = delta + discount * gae_lambda * same_episode * later
         return advantage, advantage
 
-    return jax.lax.scan(backwards, jnp.zeros(()), (delta, same_episode), reverse=True)[1]
+    return jax.lax.scan(backwards, jnp.zeros(()), (delta, same_episode), reverse=True, unroll=16)[1]

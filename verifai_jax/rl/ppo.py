@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, Key
 from verifai_jax.rl.advantage import Ends, advantages
 from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
 from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
+from verifai_jax.rl.shuffling import permutation
 from verifai_jax.rl.task import Action, Continuous, Discrete, Task
 
 
@@ -165,7 +166,7 @@ class Experience(NamedTuple):
 
     observation: Float[Array, " k"]
     action: Array
-    log_probability: Float[Array, ""]
+    outputs: Float[Array, " outputs"]
     reward: Float[Array, ""]
     next_observation: Float[Array, " k"]
     ends: Ends
@@ -176,13 +177,14 @@ def _collect(
     ppo: PPO, task: Task, training: Training, key: Key[Array, ""]
 ) -> tuple[Episodes, Experience]:
     """Experience `[environments, horizon]` under the present policy, resetting as episodes end."""
+    log_std = training.weights.log_std
 
-    def step(carry: Any, key: Key[Array, ""]) -> Any:
+    def step(carry: Any, drawn: Any) -> Any:
         state, age, total = carry
-        action_key, step_key, reset_key = jax.random.split(key, 3)
+        noise, step_key, reset_key = drawn
         observation = task.observe(state)
         outputs = network(training.weights.policy, _look(ppo, training.seen, observation))
-        action = _draw(task.action, outputs, training.weights.log_std, action_key)
+        action = _explore(task.action, outputs, log_std, noise)
         taken = action if isinstance(task.action, Discrete) else in_range(task.action, action)
         after, reward, terminated = task.step(step_key, state, taken)
         age, total = age + 1, total + reward
@@ -191,9 +193,7 @@ def _collect(
         seen = Experience(
             observation=observation,
             action=action,
-            log_probability=_log_probability(
-                task.action, outputs, training.weights.log_std, action
-            ),
+            outputs=outputs,
             reward=jnp.asarray(reward, jnp.float32),
             next_observation=task.observe(after),
             ends=ends,
@@ -204,8 +204,14 @@ def _collect(
             lambda new, old: jnp.where(over, new, old), fresh, (after, age, total)
         ), seen
 
+    def draw(key: Key[Array, ""]) -> Any:
+        action_key, step_key, reset_key = jax.random.split(key, 3)
+        return _noise(task.action, action_key), step_key, reset_key
+
     def one(episode: Any, key: Key[Array, ""]) -> Any:
-        return jax.lax.scan(step, episode, jax.random.split(key, ppo.horizon))
+        # All at once: random bits of a few lanes at a time would cost as much as the network.
+        drawn = jax.vmap(draw)(jax.random.split(key, ppo.horizon))
+        return jax.lax.scan(step, episode, drawn)
 
     keys = jax.random.split(key, ppo.environments)
     episodes, experience = jax.vmap(one)(tuple(training.episodes), keys)
@@ -229,10 +235,14 @@ def _learn(
         ppo.discount,
         ppo.gae_lambda,
     )
+    log_std = training.weights.log_std
+    log_probability = jax.vmap(jax.vmap(lambda o, a: _log_probability(task.action, o, log_std, a)))(
+        experience.outputs, experience.action
+    )
     batch = (
         observation,
         experience.action,
-        experience.log_probability,
+        log_probability,
         advantage,
         advantage + value,
     )
@@ -241,20 +251,22 @@ def _learn(
     left = 1.0 - training.done * (1.0 / training.updates) if ppo.anneal else 1.0
     rate = ppo.learning_rate * left
 
-    def minibatch(carry: Any, rows: Int[Array, " rows"]) -> Any:
+    def minibatch(carry: Any, part: Any) -> Any:
         weights, moments = carry
-        part = jax.tree.map(lambda leaf: leaf[rows], batch)
         gradient = jax.grad(_loss)(weights, ppo, task.action, part)
         direction, moments = optimizer.update(gradient, moments)
         weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
         return (weights, moments), None
 
-    def shuffled(key: Key[Array, ""]) -> Int[Array, "minibatches rows"]:
-        return jax.random.permutation(key, ppo.steps_per_update).reshape(ppo.minibatches, -1)
+    def epoch(carry: Any, key: Key[Array, ""]) -> Any:
+        order = permutation(key, ppo.steps_per_update)
+        parts = jax.tree.map(
+            lambda leaf: leaf[order].reshape(ppo.minibatches, -1, *leaf.shape[1:]), batch
+        )
+        return jax.lax.scan(minibatch, carry, parts)
 
-    orders = jax.vmap(shuffled)(jax.random.split(key, ppo.epochs))
-    order = orders.reshape(ppo.epochs * ppo.minibatches, -1)
-    return jax.lax.scan(minibatch, (training.weights, training.moments), order)[0]
+    start = (training.weights, training.moments)
+    return jax.lax.scan(epoch, start, jax.random.split(key, ppo.epochs))[0]
 
 
 def _loss(weights: Weights, ppo: PPO, action: Action, part: Any) -> Float[Array, ""]:
@@ -282,15 +294,25 @@ def _optimizer(ppo: PPO) -> Any:
     )
 
 
-def _draw(action: Action, outputs: Array, log_std: Any, key: Key[Array, ""]) -> Array:
+def _noise(action: Action, key: Key[Array, ""]) -> Array:
+    """What an action is drawn with: the same whatever the network says."""
     if isinstance(action, Discrete):
-        return jax.random.categorical(key, outputs).astype(jnp.int32)
-    return outputs + jnp.exp(log_std) * jax.random.normal(key, outputs.shape)
+        return jax.random.gumbel(key, (action.n,))
+    return jax.random.normal(key, (action.size,))
+
+
+def _explore(action: Action, outputs: Array, log_std: Any, noise: Array) -> Array:
+    """A draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
+    if isinstance(action, Discrete):
+        return jnp.argmax(noise + outputs).astype(jnp.int32)
+    return outputs + jnp.exp(log_std) * noise
 
 
 def _log_probability(action: Action, outputs: Array, log_std: Any, taken: Array) -> Array:
     if isinstance(action, Discrete):
-        return jax.nn.log_softmax(outputs)[taken]
+        # A choice instead of an index, whose derivative would scatter row by row.
+        chosen = jnp.arange(action.n) == taken
+        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0))
     standard = (taken - outputs) / jnp.exp(log_std)
     return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2)
 

@@ -1,0 +1,103 @@
+"""CPU time of an environment step in training: our PPO and stable-baselines3's, side by side.
+
+    .venv-bench/bin/python benchmarks/training.py
+    .venv-bench/bin/python benchmarks/training.py --task mountain_car --rounds 7
+
+Both have two hidden layers of 64 tanh units, 8 environments x 128 steps an update, 4 epochs of 4
+minibatches (256 rows). The two take turns; the ratio is the median over the rounds. Ours is
+measured with its program compiled (what compiling costs is told apart), theirs after a first call
+that warms it up, on one thread of torch, which is faster for it than two.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+HIDDEN = (64, 64)
+ENVIRONMENTS, HORIZON, EPOCHS, MINIBATCHES = 8, 128, 4, 4
+STEPS = 32_768
+
+
+def ours(task_name: str) -> Callable[[int], float]:
+    """A training by seed; returns CPU seconds."""
+    from envs.cartpole import CartPoleTask
+    from verifai_jax.rl import PPO, train
+
+    if task_name == "cartpole":
+        task: Any = CartPoleTask()
+    else:
+        from envs.mountain_car import ContinuousMountainCarTask
+
+        task = ContinuousMountainCarTask()
+    ppo = PPO(
+        learning_rate=3e-4,
+        entropy=0.0,
+        hidden=HIDDEN,
+        value_hidden=HIDDEN,
+        environments=ENVIRONMENTS,
+        horizon=HORIZON,
+        epochs=EPOCHS,
+        minibatches=MINIBATCHES,
+        anneal=False,
+    )
+
+    def run(seed: int) -> float:
+        before = time.process_time()
+        train(task, ppo, seed=seed, steps=STEPS)
+        return time.process_time() - before
+
+    return run
+
+
+def theirs(task_name: str) -> Callable[[int], float]:
+    """The same with stable-baselines3."""
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+
+    torch.set_num_threads(1)
+    environment = {"cartpole": "CartPole-v1", "mountain_car": "MountainCarContinuous-v0"}[task_name]
+
+    def run(seed: int) -> float:
+        environments = make_vec_env(environment, n_envs=ENVIRONMENTS, seed=seed)
+        model = PPO(
+            "MlpPolicy",
+            environments,
+            learning_rate=3e-4,
+            n_steps=HORIZON,
+            batch_size=ENVIRONMENTS * HORIZON // MINIBATCHES,
+            n_epochs=EPOCHS,
+            policy_kwargs={"net_arch": list(HIDDEN)},
+            seed=seed,
+            device="cpu",
+        )
+        before = time.process_time()
+        model.learn(STEPS)
+        return time.process_time() - before
+
+    return run
+
+
+def main() -> None:
+    """Print CPU microseconds a step of both, and the ratio."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", choices=["cartpole", "mountain_car"], default="cartpole")
+    parser.add_argument("--rounds", type=int, default=5)
+    chosen = parser.parse_args()
+    mine, other = ours(chosen.task), theirs(chosen.task)
+    before = time.process_time()
+    mine(0)
+    print(f"first call, compilation included: {time.process_time() - before:.1f} CPU s")
+    other(0)
+    pairs = [(mine(seed), other(seed)) for seed in range(1, chosen.rounds + 1)]
+    for name, side in (("verifai_jax", 0), ("stable-baselines3", 1)):
+        median = statistics.median(pair[side] for pair in pairs)
+        print(f"{name:18} {1e6 * median / STEPS:8.1f} us of CPU a step")
+    ratios = sorted(b / a for a, b in pairs)
+    print(f"ratio {statistics.median(ratios):.1f} (from {ratios[0]:.1f} to {ratios[-1]:.1f})")
+
+
+if __name__ == "__main__":
+    main()
