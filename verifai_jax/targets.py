@@ -1,4 +1,4 @@
-"""Problems by the name of the file or module that defines them: `specs/cartpole.py:balance`.
+"""Problems and studies by the file or module that defines them: `specs/cartpole.py:balance`.
 
 A target runs the Python file it names, as a test runner does; it is never read from a file.
 """
@@ -8,9 +8,13 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from verifai_jax.errors import unknown_name
 from verifai_jax.problem import Problem
+
+if TYPE_CHECKING:
+    from verifai_jax.sweeps.study import Study
 
 
 class TargetError(ValueError):
@@ -22,11 +26,17 @@ def problems_in(place: str) -> dict[str, Problem]:
 
     **Raises:** `TargetError` where there is no such file or module, or it does not import.
     """
-    module = _import(place)
-    problems = {p.name: p for p in vars(module).values() if isinstance(p, Problem)}
-    if not problems:
-        raise TargetError(f"{place} defines no Problem")
-    return problems
+    return _defined(place, Problem, "Problem")
+
+
+def studies_in(place: str) -> "dict[str, Study]":
+    """Studies of a file or module, by name.
+
+    **Raises:** as `problems_in`.
+    """
+    from verifai_jax.sweeps.study import Study
+
+    return _defined(place, Study, "Study")
 
 
 def load_target(target: str) -> Problem:
@@ -34,20 +44,41 @@ def load_target(target: str) -> Problem:
 
     **Raises:** `TargetError` or `UnknownNameError`, listing what there is.
     """
+    return _named(target, problems_in, "problem")
+
+
+def load_study(target: str) -> "Study":
+    """The study named by `FILE.py:NAME` or `MODULE:NAME`; NAME may be left out if it is alone.
+
+    **Raises:** as `load_target`.
+    """
+    return _named(target, studies_in, "study")
+
+
+def _defined(place: str, kind: type, called: str) -> dict[str, Any]:
+    module = _import(place)
+    found = {p.name: p for p in vars(module).values() if isinstance(p, kind)}
+    if not found:
+        raise TargetError(f"{place} defines no {called}")
+    return found
+
+
+def _named(target: str, defined: Any, called: str) -> Any:
     place, colon, name = target.rpartition(":")
     if not colon:
         place, name = target, ""
-    problems = problems_in(place)
+    found = defined(place)
     if not name:
-        if len(problems) == 1:
-            return next(iter(problems.values()))
+        if len(found) == 1:
+            return next(iter(found.values()))
+        plural = "studies" if called == "study" else f"{called}s"
         raise TargetError(
-            f"{place} has {len(problems)} problems; name one: "
-            + ", ".join(f"{place}:{known}" for known in problems)
+            f"{place} has {len(found)} {plural}; name one: "
+            + ", ".join(f"{place}:{known}" for known in found)
         )
-    if name not in problems:
-        raise unknown_name(f"problem in {place}", name, problems)
-    return problems[name]
+    if name not in found:
+        raise unknown_name(f"{called} in {place}", name, found)
+    return found[name]
 
 
 def _import(place: str) -> ModuleType:

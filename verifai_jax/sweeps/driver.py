@@ -102,6 +102,7 @@ def sweep(
     with Store(store) as memory, Watch(study.name, max_seconds, progress) as watch:
         memory.belongs(describe(study, options))
         options |= {"configurations": configurations, "p": study.p}
+        options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         sweeping = _Sweeping(study, options, memory, watch, halving, attack)
         return Sweep(sweeping.run(asker), study)
 
@@ -387,7 +388,7 @@ class _Sweeping:
             hyperparameters=tuple(self.study.space.columns),
             certificates=certificates,
             certified=tuple(certified[place] for place in self.judged),
-            options={**self.options, "made": self.store.made},
+            options=self.options,
             version=__version__,
             seconds=dict(self.watch.seconds),
             complete=complete,

@@ -87,7 +87,7 @@ def _cells(row: Row, study: Study) -> dict[str, Any]:
 
 
 def _values(entries: list[Any]) -> np.ndarray:
-    """A column of hyper-parameters: numbers as numbers, all else as it is."""
+    """A column of hyper-parameters: numbers as numbers, all else as text."""
     kinds = {type(entry) for entry in entries}
     if kinds == {bool}:
         return np.array(entries, bool)
@@ -95,6 +95,4 @@ def _values(entries: list[Any]) -> np.ndarray:
         return np.array(entries, np.int64)
     if kinds and kinds <= {int, float}:
         return np.array(entries, np.float64)
-    column = np.empty(len(entries), object)
-    column[:] = entries
-    return column
+    return np.array([str(entry) for entry in entries], object)

@@ -10,10 +10,11 @@ moment leaves all that was committed. An entry is the bytes of its arrays with t
 and a checksum: nothing in it is ever executed.
 """
 
+import contextlib
 import json
 import sqlite3
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,18 +44,21 @@ class Store:
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
-        self.path = None if path is None else _file(Path(path))
+        self.path = None if path is None else store_file(Path(path))
         self.made = 0
         """Pieces of work that were computed, not found."""
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-        # Transactions are begun and ended here, not by the module.
-        self._base = sqlite3.connect(
-            ":memory:" if self.path is None else self.path, timeout=60, isolation_level=None
-        )
+        try:
+            # Transactions are begun and ended here, not by the module.
+            self._base = sqlite3.connect(
+                ":memory:" if self.path is None else self.path, timeout=60, isolation_level=None
+            )
+        except sqlite3.Error as error:
+            raise StoreError(f"{self.path} cannot be opened: {error}") from error
         try:
             self._open()
-        except sqlite3.DatabaseError as error:
+        except sqlite3.Error as error:
             self._base.close()
             raise StoreError(f"{self.path} is no store of a sweep: {error}") from error
         except BaseException:
@@ -94,15 +98,11 @@ class Store:
 
         **Raises:** `StoreError`, saying what differs.
         """
-        # The first to write it decides, if two processes start at once.
+        text = json.dumps(description, sort_keys=True)
         with self._transaction():
-            text = json.dumps(description, sort_keys=True)
+            # The first to write it decides, if two processes start at once.
             self._base.execute("INSERT OR IGNORE INTO about VALUES ('sweep', ?)", (text,))
-        found = self._base.execute("SELECT value FROM about WHERE name='sweep'").fetchone()[0]
-        try:
-            known = json.loads(found)
-        except json.JSONDecodeError as error:
-            raise StoreError(f"{self.path} is damaged: it does not say what it is of") from error
+        known = self.note("sweep")
         differences = list(_differences(json.loads(text), known))
         if differences:
             raise StoreError(
@@ -111,17 +111,27 @@ class Store:
                 "this one is of"
             )
 
+    def note(self, name: str, value: Any = None) -> Any:
+        """Plain data kept under a name beside the work; with a `value`, keep that instead."""
+        with self._transaction():
+            if value is not None:
+                row = (name, json.dumps(value))
+                self._base.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", row)
+            found = self._base.execute("SELECT value FROM about WHERE name=?", (name,)).fetchone()
+        try:
+            return None if found is None else json.loads(found[0])
+        except (json.JSONDecodeError, TypeError) as error:
+            raise StoreError(f"{self.path} is damaged in its note {name!r}") from error
+
     def get(self, name: str) -> Work | None:
         """The arrays of a finished piece of work; None where it is not finished.
 
         **Raises:** `StoreError` for an entry that is damaged.
         """
-        try:
+        with self._transaction(reading=True):
             found = self._base.execute(
                 "SELECT form, checksum, bytes FROM work WHERE name=?", (name,)
             ).fetchone()
-        except sqlite3.DatabaseError as error:
-            raise StoreError(f"{self.path} is damaged: {error}") from error
         return None if found is None else self._decoded(name, *found)
 
     def put(self, work: Mapping[str, Work]) -> None:
@@ -155,8 +165,22 @@ class Store:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _transaction(self) -> "_Transaction":
-        return _Transaction(self._base)
+    @contextlib.contextmanager
+    def _transaction(self, reading: bool = False) -> Iterator[None]:
+        """All of the statements inside, or none; what SQLite says against them is our error."""
+        try:
+            self._base.execute("BEGIN" if reading else "BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                self._base.execute("ROLLBACK")
+                raise
+            self._base.execute("COMMIT")
+        except sqlite3.Error as error:
+            what = "is damaged" if isinstance(error, sqlite3.DatabaseError) else "failed"
+            if isinstance(error, sqlite3.OperationalError):
+                what = "cannot be used"  # Locked, read-only, or the disk is full.
+            raise StoreError(f"{self.path} {what}: {error}") from error
 
     def _decoded(self, name: str, form: str, checksum: int, data: bytes) -> Work:
         try:
@@ -167,20 +191,8 @@ class Store:
             raise StoreError(f"{self.path} is damaged in {name!r}: {error}") from error
 
 
-class _Transaction:
-    """All of the statements inside, or none."""
-
-    def __init__(self, base: sqlite3.Connection) -> None:
-        self.base = base
-
-    def __enter__(self) -> None:
-        self.base.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: Any, *_: object) -> None:
-        self.base.execute("COMMIT" if kind is None else "ROLLBACK")
-
-
-def _file(path: Path) -> Path:
+def store_file(path: Path) -> Path:
+    """The file of the store at this place."""
     if path.suffix in (".sqlite", ".sqlite3", ".db"):
         if path.is_dir():
             raise StoreError(f"{path} is a folder; a store is a file")
