@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -192,12 +193,29 @@ def test_counterexamples_are_failing_features(small):
     assert (found["rho"] < 0).all()
     assert (found["x"] > 0.7).all()
     assert len(found) > 1
-    stored = small.counterexamples(2, simulations=0)
+    stored = small.counterexamples(2)
     assert stored.to_dict("records") == [{"x": pytest.approx(0.85), "rho": pytest.approx(-0.3)}]
     # The best never fails.
-    assert small.counterexamples(simulations=0).empty
+    assert small.counterexamples().empty
     with pytest.raises(UnknownNameError, match="did you mean 'simulations'"):
         small.counterexamples(2, simulation=3)
+
+
+class ToyCertificates:
+    """What a certification says of its policies: here of rows 2 and 3."""
+
+    def counterexamples(self, number):
+        return pd.DataFrame({"x": [0.9, 0.75], "rho": [-0.2, -0.05 * (number + 1)]})
+
+
+def test_what_the_certification_met_is_kept(tmp_path):
+    record = record_of(ROWS, certificates=ToyCertificates(), certified=(2, 3))
+    sweep = Sweep(record, ToyStudy())
+    assert sweep.counterexamples(3)["rho"].tolist() == [-0.2, -0.1]
+    loaded = load_sweep(sweep.save(tmp_path))
+    pd.testing.assert_frame_equal(loaded.counterexamples(3), sweep.counterexamples(3))
+    assert loaded.counterexamples(1)["rho"].tolist() == [-0.004]
+    assert loaded.counterexamples(0).empty
 
 
 def test_a_curve_goes_up_to_the_rows_own_snapshot(small):
@@ -246,12 +264,21 @@ def test_saved_and_loaded_it_is_the_same(small, tmp_path):
     assert load_policy(folder / "policies" / "0.npz").action.n == 2
 
 
+def test_choices_of_several_kinds_are_kept(tmp_path):
+    record = record_of(ROWS[:2])
+    columns = {**record.columns, "algorithm": np.array([None, 0.5], object)}
+    sweep = Sweep(replace(record, columns=columns))
+    loaded = load_sweep(sweep.save(tmp_path))
+    assert loaded.table["algorithm"].tolist() == [None, 0.5]
+    assert isinstance(loaded.summary(), str)
+
+
 def test_loaded_without_its_study_everything_but_simulations_works(small, tmp_path):
     loaded = load_sweep(small.save(tmp_path))
     assert loaded.space == SPACE
     assert loaded.best.name == 0
     assert int(loaded.policy(2).act(jnp.array([0.8]))) == 1
-    assert len(loaded.counterexamples(2, simulations=0)) == 1
+    assert len(loaded.counterexamples(2)) == 1
     with pytest.raises(ValueError, match=r"without its study.*load_sweep\(path, study\)"):
         loaded.problem(2)
 

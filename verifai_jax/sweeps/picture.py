@@ -17,7 +17,7 @@ from verifai_jax.report.style import (
 )
 from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import chosen_first, is_safe, last_snapshots, least_full_return
-from verifai_jax.sweeps.telling import lead, percent
+from verifai_jax.sweeps.telling import failures, lead, percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -205,7 +205,7 @@ def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
 
 def _failures(row: Any) -> str:
     if row["simulations"] > 0:
-        return f"{int(row['failures']):,} of {int(row['simulations']):,} simulations fail"
+        return failures(row)
     return f"fails in {percent(row['failure_rate'])}"
 
 

@@ -7,6 +7,7 @@ vj.falsify(sweep.problem(12))        the closed loop with that policy
 sweep.save("sweeps/mine"); load_sweep("sweeps/mine", study)
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -38,13 +39,15 @@ class Sweep:
 
     **Fields:** `record`: all that was trained and certified, as plain data; `study`: what was
     swept, None for a loaded sweep without it; `space` of the hyper-parameters, the study's if left
-    out, None where it is not known; `folder` on disk, if it was loaded.
+    out, None where it is not known; `folder` on disk, if it was loaded; `failing`: what each row
+    failed with, row -> DataFrame, of a loaded sweep, which has no certificates to ask.
     """
 
     record: SweepRecord
     study: "Study | None" = None
     space: FeatureSpace | None = None
     folder: Path | None = None
+    failing: "Mapping[int, pd.DataFrame]" = field(default_factory=dict, repr=False)
     _problems: dict[int, Problem] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -183,14 +186,14 @@ class Sweep:
         self,
         i: int | None = None,
         *,
-        simulations: int = 2048,
+        simulations: int = 0,
         search: str | Search = "portfolio",
         seed: int = 0,
     ) -> "pd.DataFrame":
         """Features with which the policy of row `i` fails, the worst first; of the best by default.
 
-        - `simulations`: that the `search` may take to find some; 0 gives only the worst that the
-          sweep itself met, which needs no study.
+        - `simulations`: that the `search` may take to find more than the sweep itself met, which
+          needs the study.
 
         Columns are the problem's features and `rho`. None found does not mean that there are none:
         that is what the certificate is about.
@@ -200,20 +203,27 @@ class Sweep:
         import pandas as pd
 
         i = int(self.best.name) if i is None else self._row(i)  # pyright: ignore[reportArgumentType]
-        rho = float(self.table.loc[i, "worst_robustness"])  # pyright: ignore[reportArgumentType]
-        worst = self.record.worst[i]
-        parts = []
-        if worst is not None and rho < 0:
-            parts.append(pd.DataFrame([{**worst, "rho": rho}]))
+        parts = [self.met(i)]
         if simulations:
             problem = self.problem(i)
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
             parts.append(run.table.counterexamples[[*problem.space.columns, "rho"]])
-        elif not parts:
-            names = list(worst or {}) if self.study is None else self.problem(i).space.columns
-            parts.append(pd.DataFrame(columns=[*names, "rho"]))
-        found = pd.concat([part for part in parts if len(part)] or parts[:1])
+        found = pd.concat([part for part in parts if len(part)] or parts[-1:])
         return found.sort_values("rho", kind="stable").reset_index(drop=True)
+
+    def met(self, i: int) -> "pd.DataFrame":
+        """Features with which the policy of row `i` failed during the sweep, and `rho`."""
+        import pandas as pd
+
+        i = self._row(i)
+        certificates: Any = self.record.certificates
+        if certificates is not None and i in self.record.certified:
+            return certificates.counterexamples(self.record.certified.index(i))
+        if i in self.failing:
+            return self.failing[i]
+        worst, rho = self.record.worst[i], float(self.record.columns["worst_robustness"][i])
+        found = pd.DataFrame([{**(worst or {}), "rho": rho}])
+        return found if rho < 0 and worst is not None else found.iloc[:0]
 
     def curve(self, i: int) -> Trace:
         """The learning curve up to the policy of row `i`, a trace over environment steps.

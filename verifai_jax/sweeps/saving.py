@@ -2,6 +2,7 @@
 
     sweep.json            study, options, space of the hyper-parameters, worst features
     table.parquet         the table
+    failing.parquet       what each row failed with
     curves.npz            the learning curves
     policies/12.npz       the policy of row 12; `rl.load_policy` reads it too
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 RECORD = "sweep.json"
 TABLE = "table.parquet"
+FAILING = "failing.parquet"
 CURVES = "curves.npz"
 POLICIES = "policies"
 FORMAT = 1
@@ -43,11 +45,14 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     (folder / RECORD).unlink(missing_ok=True)
     for old in (folder / POLICIES).glob("*.npz"):
         old.unlink()
-    sweep.table.to_parquet(folder / TABLE)
+    mixed = _mixed(sweep.table)
+    texts = {name: [json.dumps(_plain(v)) for v in sweep.table[name]] for name in mixed}
+    sweep.table.assign(**texts).to_parquet(folder / TABLE)
     for i, policy in enumerate(record.policies):
         if policy is not None:
             notes = {"study": record.study, "row": i, "verdict": str(sweep.table.loc[i, "verdict"])}
             save_policy(policy, folder / POLICIES / f"{i}.npz", **notes)
+    _failing(sweep).to_parquet(folder / FAILING)
     arrays: dict[str, Any] = {}
     for (configuration, seed), curve in record.curves.items():
         arrays[f"{configuration}/{seed}/steps"] = np.asarray(curve.steps)
@@ -55,7 +60,7 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     np.savez_compressed(folder / CURVES, **arrays)
     data = {name: _plain(getattr(record, name)) for name in _PLAIN}
     data |= {"format": FORMAT, "complete": record.complete, "rows": record.rows}
-    data |= {"worst": _plain(record.worst), "space": _space_data(sweep.space)}
+    data |= {"mixed": mixed, "worst": _plain(record.worst), "space": _space_data(sweep.space)}
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(data, indent=2) + "\n")
     partial.replace(folder / RECORD)
@@ -67,7 +72,8 @@ def load_sweep(path: str | Path, study: "Study | None" = None) -> Sweep:
 
     - `study`: needed for `.problem(i)` and new counterexamples; a file names no code to run.
 
-    The certificates are those of the table; the object that made them is not saved.
+    The certificates are those of the table, and what the policies failed with; the object that
+    made them is not saved.
 
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.
@@ -87,11 +93,12 @@ def load_sweep(path: str | Path, study: "Study | None" = None) -> Sweep:
     try:
         record = _record(folder, data)
         space = _space_from(data["space"])
+        failing = _failing_from(folder)
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
-    return Sweep(record, study, None if study is not None else space, folder)
+    return Sweep(record, study, None if study is not None else space, folder, failing)
 
 
 def _check_same(folder: Path, data: Mapping[str, Any], study: "Study") -> None:
@@ -115,6 +122,8 @@ def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
             f"the sweep in {folder} is damaged: {len(frame)} rows in {TABLE}, "
             f"{data['rows']} in {RECORD}"
         )
+    for name in data["mixed"]:
+        frame[name] = pd.Series([json.loads(v) for v in frame[name]], frame.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
     with np.load(folder / CURVES, allow_pickle=False) as arrays:
         for name in arrays.files:
@@ -137,6 +146,32 @@ def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
         certified=tuple(data["certified"]),
         **{name: data[name] for name in ("study", "seed", "options", "version", "seconds")},
     )
+
+
+def _mixed(table: Any) -> list[str]:
+    """Columns of choices that are not all texts, such as a number or None, which Parquet has not."""
+    return [
+        str(name)
+        for name in table.columns
+        if table[name].dtype == object and not all(isinstance(v, str) for v in table[name])
+    ]
+
+
+def _failing(sweep: Sweep) -> Any:
+    """What the rows failed with, one below the other."""
+    import pandas as pd
+
+    parts = [sweep.met(i).assign(row=i) for i in range(sweep.record.rows)]
+    return pd.concat([part for part in parts if len(part)] or [pd.DataFrame({"row": [0]})[:0]])
+
+
+def _failing_from(folder: Path) -> dict[int, Any]:
+    import pandas as pd
+
+    frame: Any = pd.read_parquet(folder / FAILING)
+    return {
+        int(i): part.drop(columns="row").reset_index(drop=True) for i, part in frame.groupby("row")
+    }
 
 
 def _space_data(space: FeatureSpace | None) -> Any:

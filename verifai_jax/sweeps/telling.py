@@ -95,8 +95,14 @@ def interval(row: Any) -> str:
     """The failures of a row and the ends of its failure probability."""
     text = f"between {percent(row['failure_low'])} and {percent(row['failure_high'])}"
     if row["simulations"] > 0:
-        return f"{int(row['failures']):,} of {int(row['simulations']):,} simulations fail: {text}"
+        return f"{failures(row)}: {text}"
     return f"failure probability {text}"
+
+
+def failures(row: Any) -> str:
+    """How many of the samples failed; those without a verdict count as failures, as in the rate."""
+    failed = round(float(row["failure_rate"]) * float(row["simulations"]))
+    return f"{failed:,} of {int(row['simulations']):,} simulations fail"
 
 
 def percent(probability: float) -> str:
