@@ -8,7 +8,18 @@ import click
 
 from verifai_jax.commands.asked import plain_values
 
-_FIXED = ("search", "seed", "samples", "confidence", "budget", "attack", "reduction", "by", "only")
+_FIXED = (
+    "search",
+    "seed",
+    "samples",
+    "confidence",
+    "budget",
+    "attack",
+    "attacker",
+    "reduction",
+    "by",
+    "only",
+)
 _SHOWN = 12
 """Rows of the table that are printed."""
 
@@ -22,7 +33,8 @@ _SHOWN = 12
 @click.option("--samples", type=int, help="Simulations of a policy at most  [default: 512]")
 @click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
 @click.option("--budget", type=int, help="Simulations of the certification in all.")
-@click.option("--attack", help="Search that refutes policies  [default: by the certification]")
+@click.option("--attack", type=int, help="Simulations of each policy's attack  [default: 256]")
+@click.option("--attacker", help="Search that attacks  [default: cross_entropy]")
 @click.option("--halving", "reduction", type=float, help="Of so many configurations one goes on.")
 @click.option("--halving-by", "by", help="return or safety  [default: return]")
 @click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
@@ -110,7 +122,7 @@ def _understood(asked: dict[str, Any], options: tuple[str, ...]) -> dict[str, An
 
     how = {
         name: asked[name]
-        for name in ("seed", "samples", "confidence", "budget", "attack")
+        for name in ("seed", "samples", "confidence", "budget", "attack", "attacker")
         if asked[name] is not None
     }
     search, given = asked["search"] or "halton", plain_values("--set", options)

@@ -7,15 +7,17 @@ from typing import Any, NamedTuple
 from verifai_jax.problem import Problem
 from verifai_jax.rl.policy import Policy
 
-QUICK = 128
-"""Simulations of a policy by which a search or halving chooses; verdicts take fresh ones."""
+QUICK = 64
+"""Samples of a policy, and simulations of the attack on it, by which a search or halving chooses;
+verdicts take fresh ones."""
 
 
 @dataclass(frozen=True)
 class Judged:
     """What the certification says of one policy.
 
-    - `failures` of `simulations` samples of the prior; `rate` between `low` and `high`.
+    - `failures` of `simulations` samples of the prior, those without a verdict among them; `rate`
+      between `low` and `high`.
     - `worst`: the least robustness met, `features` those it was met with.
     """
 
@@ -45,14 +47,14 @@ def certify_policies(
     samples: int,
     seed: int,
     budget: int | None,
-    attack: Any,
+    attack: int,
+    attacker: Any,
     remember: Callable[[str, Callable[[], Any]], Any],
-    progress: Any,
+    progress: Callable[[int, int, str], None] | None,
 ) -> Judgement:
     """Falsify and certify policies; what `certification.certify` does."""
-    from verifai_jax.certification import certify
+    from verifai_jax.certification.certify import certify
 
-    options: dict[str, Any] = {} if attack is None else {"search": attack}
     certificates = certify(
         problem_of,
         policies,
@@ -61,13 +63,25 @@ def certify_policies(
         samples=samples,
         seed=seed,
         budget=budget,
+        search=attacker,
+        attack=attack,
         remember=remember,
-        progress=None,
-        **options,
+        progress=progress,
     )
-    return Judgement(certificates, [judged(certificates, i) for i in range(len(policies))])
+    return Judgement(certificates, [_judged(certificates[i]) for i in range(len(policies))])
 
 
-def judged(certificates: Any, i: int) -> Judged:
-    """One policy's part of the certificates."""
-    raise NotImplementedError
+def _judged(certificate: Any) -> Judged:
+    rate = certificate.rate
+    nan = float("nan")
+    return Judged(
+        failures=certificate.failures + certificate.not_finite,
+        simulations=certificate.simulations,
+        rate=nan if rate is None else rate.estimate,
+        low=nan if rate is None else rate.low,
+        high=nan if rate is None else rate.high,
+        worst=certificate.worst_robustness,
+        features=certificate.worst_features,
+        # Nothing is known of a policy that was not sampled before an interruption.
+        verdict="" if rate is None else certificate.verdict,
+    )

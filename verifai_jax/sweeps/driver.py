@@ -20,7 +20,7 @@ from verifai_jax.errors import suggests_options
 from verifai_jax.sweeps.certifying import QUICK, Judged, Judgement, certify_policies
 from verifai_jax.sweeps.describing import describe
 from verifai_jax.sweeps.halving import SAFETY, Halving
-from verifai_jax.sweeps.lessons import Lessons, Reached, digest, policy_digest
+from verifai_jax.sweeps.lessons import Lessons, Reached, digest
 from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord
 from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.returns import EPISODES, each_return
@@ -47,7 +47,8 @@ def sweep(
     samples: int = 512,
     confidence: float = 0.95,
     budget: int | None = None,
-    attack: Any = None,
+    attack: int = 256,
+    attacker: Any = "cross_entropy",
     halving: Halving | None = None,
     batch: int | None = None,
     episodes: int = EPISODES,
@@ -68,9 +69,10 @@ def sweep(
       how nearly, then what they earn.
     - `configurations`: how many, at most; each is trained once for each of the study's seeds.
     - `seed`: of the search and of the samples; training seeds are the study's.
-    - `samples`, `confidence`, `budget`: of the certification: simulations of a policy at most,
-      confidence of all verdicts together, and simulations in all.
-    - `attack`: the search that tries to refute policies first; the certification's own if left out.
+    - `samples`, `confidence`, `budget`: of the certification: samples of each policy at least,
+      confidence of all verdicts together, and samples in all; see `certify`.
+    - `attack`, `attacker`: simulations of each policy in which this search tries to refute it
+      first; what it finds is in no rate.
     - `halving`: stop all but the best at each snapshot.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: over which the nominal return is a mean.
@@ -92,7 +94,8 @@ def sweep(
         "samples": samples,
         "confidence": confidence,
         "budget": budget,
-        "attack": None if attack is None else repr(attack),
+        "attack": attack,
+        "attacker": attacker if isinstance(attacker, str) else repr(attacker),
         "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
         "episodes": episodes,
     }
@@ -103,7 +106,7 @@ def sweep(
         memory.belongs(describe(study, options))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
-        sweeping = _Sweeping(study, options, memory, watch, halving, attack)
+        sweeping = _Sweeping(study, options, memory, watch, halving, attacker)
         return Sweep(sweeping.run(asker), study)
 
 
@@ -163,7 +166,7 @@ class _Sweeping:
     store: Store
     watch: Watch
     halving: Halving | None
-    attack: Any
+    attacker: Any
     lessons: Lessons = field(init=False)
     found: list[_Configuration] = field(default_factory=list)
     known: dict[str, int] = field(default_factory=dict)
@@ -186,6 +189,7 @@ class _Sweeping:
             except OutOfTime:
                 complete = False
             certificates = self._certify()
+            complete &= getattr(certificates, "stopped", "") != "interrupted"
         except (KeyboardInterrupt, OutOfTime):
             complete = False
         return self._record(certificates, complete)
@@ -316,7 +320,17 @@ class _Sweeping:
             # Other samples than those of the certificates.
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
             policies = [self._policy(place) for place in finite]
-            quick = self._certified(policies, samples=samples, budget=None, seed=seed)
+            quick = self._certified(
+                policies,
+                samples=samples,
+                budget=samples * len(policies),
+                seed=seed,
+                attack=min(QUICK, self.options["attack"]),
+                progress=None,
+            )
+            if getattr(quick.certificates, "stopped", "") == "interrupted":
+                # Nobody should choose by half of what there is to know.
+                raise KeyboardInterrupt
             judged = dict(zip(finite, quick.policies, strict=True))
         bad: dict[int, float | None] = {}
         for number, found in places.items():
@@ -352,23 +366,30 @@ class _Sweeping:
                 samples=self.options["samples"],
                 budget=self.options["budget"],
                 seed=self.options["seed"],
+                attack=self.options["attack"],
+                progress=self.watch.told,
             )
         self.judged = dict(zip(places, made.policies, strict=True))
         return made.certificates
 
     def _certified(self, policies: list[Any], **how: Any) -> Judgement:
-        how |= {"p": self.study.p, "confidence": self.options["confidence"]}
-        # Names of pieces of work mean the same for these policies alone.
-        about = digest({**how, "attack": self.options["attack"], "of": policy_digest(policies)})
-
         def remember(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> Any:
-            self.watch.check()
-            return self.store.remember(f"certify/{about}/{name}", compute)
+            try:
+                self.watch.check()
+            except OutOfTime:
+                # As if somebody had stopped it: then the certification says what it knows.
+                raise KeyboardInterrupt from None
+            return self.store.remember(f"certify/{name}", compute)
 
         return certify_policies(
-            self.study.problem, policies, attack=self.attack, remember=remember,
-            progress=self.watch, **how,
-        )  # fmt: skip
+            self.study.problem,
+            policies,
+            p=self.study.p,
+            confidence=self.options["confidence"],
+            attacker=self.attacker,
+            remember=remember,
+            **how,
+        )
 
     # The record
 

@@ -229,23 +229,9 @@ class Lessons:
         return self.lessons[number].snapshots[rung] if rung >= 0 else 0
 
 
-def digest(value: Any) -> str:
-    """A short name for plain data, or for arrays."""
-    if isinstance(value, Mapping):
-        value = json.dumps(value, sort_keys=True).encode()
-    return hashlib.sha256(value).hexdigest()[:20]
-
-
-def policy_digest(policies: Sequence[Policy]) -> str:
-    """A short name for what these policies compute."""
-    said = hashlib.sha256()
-    for policy in policies:
-        leaves, form = jax.tree.flatten(policy)
-        said.update(str(form).encode())
-        for leaf in leaves:
-            array = np.asarray(leaf)
-            said.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
-    return said.hexdigest()[:20]
+def digest(value: Mapping[str, Any]) -> str:
+    """A short name for plain data."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:20]
 
 
 def _kept(policy: Policy, curve: Curve, seconds: float) -> Work:

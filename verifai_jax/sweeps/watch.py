@@ -36,7 +36,6 @@ class Watch:
         self._limit = self._until
         self._bar: Any = None
         self._task: Any = None
-        self._done = 0.0
 
     def __enter__(self) -> "Watch":
         if self.show:
@@ -90,6 +89,11 @@ class Watch:
         """Tell that so much more is done."""
         if self._task is not None:
             self._bar.update(self._task, advance=amount, figures=figures)
+
+    def told(self, done: float, total: float, figures: str) -> None:
+        """Tell that `done` of `total` are done; the total may have changed."""
+        if self._task is not None:
+            self._bar.update(self._task, completed=done, total=total, figures=figures)
 
     def compiled(self, seconds: float) -> None:
         """Tell that so much of the present stage went into compiling."""
