@@ -207,7 +207,8 @@ class Sweep:
         if simulations:
             problem = self.problem(i)
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
-            parts.append(run.table.counterexamples[[*problem.space.columns, "rho"]])
+            more: Any = run.table.counterexamples[[*problem.space.columns, "rho"]]
+            parts.append(more)
         found = pd.concat([part for part in parts if len(part)] or parts[-1:])
         return found.sort_values("rho", kind="stable").reset_index(drop=True)
 

@@ -149,7 +149,7 @@ def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
 
 
 def _mixed(table: Any) -> list[str]:
-    """Columns of choices that are not all texts, such as a number or None, which Parquet has not."""
+    """Columns of choices that are not all texts, which Parquet does not have: a number or None."""
     return [
         str(name)
         for name in table.columns
