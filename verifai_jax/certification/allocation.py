@@ -24,7 +24,7 @@ the budget, the nearest decisions first.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,14 +51,22 @@ class Standing(NamedTuple):
 
 
 def standing(
-    failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"], tie: float
+    failures: Int[np.ndarray, " n"],
+    simulations: Int[np.ndarray, " n"],
+    tie: float,
+    margins: Float[np.ndarray, " n"] | None = None,
 ) -> Standing:
-    """Who leads; see `Standing`. Of equal means the one with more samples, then the first."""
+    """Who leads; see `Standing`.
+
+    Of equal means the one with more samples, then the one with the larger of the `margins`, such as
+    the least robustness in an attack, then the first.
+    """
     from scipy.special import betainc, betaincinv
 
     k, n = np.asarray(failures, float), np.asarray(simulations, float)
     mean = (k + 0.5) / (n + 1)
-    leader = int(np.lexsort((np.arange(len(k)), -n, mean))[0])
+    order = np.zeros(len(k)) if margins is None else -np.nan_to_num(margins, nan=-np.inf)
+    leader = int(np.lexsort((np.arange(len(k)), order, -n, mean))[0])
     levels = (np.arange(QUANTILES) + 0.5) / QUANTILES
     rates = betaincinv(k[leader] + 0.5, n[leader] - k[leader] + 0.5, levels)
     below = np.maximum(rates - tie, 0.0)[:, None]
@@ -100,9 +108,15 @@ class Allocation:
         return self.p / 10 if self.tie is None else self.tie
 
     def next(
-        self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
+        self,
+        failures: Int[np.ndarray, " n"],
+        simulations: Int[np.ndarray, " n"],
+        margins: Float[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Blocks to simulate of each policy; all zero once everything is decided, or can't be."""
+        """Blocks to simulate of each policy; all zero once everything is decided, or can't be.
+
+        - `margins`: what decides between equals who leads; see `standing`.
+        """
         k, n = np.asarray(failures), np.asarray(simulations)
         least = np.maximum(-(-(self.samples - n) // self.block), 0)
         if least.any():
@@ -112,7 +126,7 @@ class Allocation:
             return np.zeros(len(n), np.int64)
         blocks = np.zeros(len(n), np.int64)
         if self.safest and len(n) > 1:
-            blocks = self._rivals(k, n, left)
+            blocks = self._rivals(k, n, left, margins)
         if self.verdicts:
             blocks = np.maximum(blocks, self._open(k, n, left - int(blocks.sum())))
         return blocks
@@ -120,7 +134,8 @@ class Allocation:
     def undecided(
         self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Which verdicts are open."""
+        """Which verdicts are open; that of a policy without samples is."""
+        simulations = np.maximum(simulations, 1)
         limit = needed(self.confidence, len(failures))
         p = np.full(len(failures), self.p)
         safe = evidence_below(failures, simulations, p) > limit
@@ -131,11 +146,11 @@ class Allocation:
         return np.maximum(n // (GROWTH * self.block), 1)
 
     def _rivals(
-        self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int
+        self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int, margins: Any
     ) -> Int[np.ndarray, " n"]:
         """Blocks of the leader and of its likeliest rivals."""
         blocks = np.zeros(len(n), np.int64)
-        now = standing(k, n, self.tolerance)
+        now = standing(k, n, self.tolerance, margins)
         if now.chance >= self.sure:
             return blocks
         rivals = np.flatnonzero(now.rivals >= 0.5 * now.rivals.max())

@@ -90,13 +90,14 @@ def certify(
     attacker = usable_search(pieces.problem, search)
     rounds = -(-attack // lanes)
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
-    sampled = [Seen.nothing() for _ in policies]
-    attacked = [Seen.nothing() for _ in policies]
+    sampled = [Seen() for _ in policies]
+    attacked = [Seen() for _ in policies]
     report = _Report(progress, len(policies) * rounds * lanes, budget)
-    stopped = "decided"
+    stopped, margins = "decided", np.full(len(policies), np.nan)
     try:
         refute(pieces, attacked, attacker, rounds, report.attacked)
-        stopped = _sample(pieces, sampled, allocation, report)
+        margins = np.array([one.least for one in attacked])
+        stopped = _sample(pieces, sampled, allocation, margins, report)
     except KeyboardInterrupt:
         stopped = "interrupted"
     rows = tuple(
@@ -104,7 +105,7 @@ def certify(
         for number in range(len(policies))
     )
     known = all(row.simulations for row in rows)
-    now = standing(*_counts(sampled), allocation.tolerance) if known else None
+    now = standing(*_counts(sampled), allocation.tolerance, margins) if known else None
     return Certificates(
         rows=rows,
         problem=pieces.problem.name,
@@ -122,21 +123,28 @@ def certify(
     )
 
 
-def _sample(pieces: Pieces, sampled: list[Seen], allocation: Allocation, report: "_Report") -> str:
+def _sample(
+    pieces: Pieces,
+    sampled: list[Seen],
+    allocation: Allocation,
+    margins: np.ndarray,
+    report: "_Report",
+) -> str:
     """Simulate what the allocation asks for until it asks for nothing; says why it ended."""
     while True:
         failures, simulations = _counts(sampled)
-        blocks = allocation.next(failures, simulations)
+        blocks = allocation.next(failures, simulations, margins)
         if not blocks.any():
             break
+        undecided = int(allocation.undecided(failures, simulations).sum())
         asked = [
-            (number, len(sampled[number].rho) + block)
+            (number, len(sampled[number].outcomes) + block)
             for number in range(len(sampled))
             for block in range(int(blocks[number]))
         ]
         for (number, block), outcome in pieces.certificate(asked):
             sampled[number].add(pieces.points(block), outcome)
-            report.sampled(pieces.lanes, int(allocation.undecided(*_safely(sampled)).sum()))
+            report.sampled(pieces.lanes, undecided)
     return "budget" if allocation.undecided(failures, simulations).any() else "decided"
 
 
@@ -144,11 +152,6 @@ def _counts(seen: list[Seen]) -> tuple[np.ndarray, np.ndarray]:
     """Failures of each policy, those without a verdict included, and simulations."""
     failures = np.array([one.failures + one.not_finite for one in seen])
     return failures, np.array([one.simulations for one in seen])
-
-
-def _safely(seen: list[Seen]) -> tuple[np.ndarray, np.ndarray]:
-    failures, simulations = _counts(seen)
-    return failures, np.maximum(simulations, 1)
 
 
 def _certificate(
@@ -180,8 +183,9 @@ def _met(space: FeatureSpace, both: Sequence[Seen]) -> tuple[float, Any, dict[st
     if not points:
         return float("nan"), None, {}
     u = np.concatenate(points)
-    rho = np.concatenate([r for seen in both for r in seen.rho])
-    failing = np.concatenate([f for seen in both for f in seen.failing])
+    outcomes = [outcome for seen in both for outcome in seen.outcomes]
+    rho = np.concatenate([outcome.rho for outcome in outcomes])
+    failing = np.concatenate([outcome.failing for outcome in outcomes])
     order = np.argsort(rho, kind="stable")  # NaN come last.
     kept = order[failing[order]][:MOST_KEPT]
     shown = np.concatenate([order[:1], kept])

@@ -15,14 +15,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.certification.families import digest, families, is_numbers
+from verifai_jax.certification.families import digest, families
 from verifai_jax.certification.programs import (
-    NEEDS_NUMBERS,
     Alone,
     Outcome,
     Simulator,
-    Traced,
     problem_with,
+    traced,
 )
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem, ProblemError
@@ -90,14 +89,14 @@ class Pieces:
         first: Problem | None = None
         plans = []
         for family in families(policies):
-            numbers, traced = family.numbers, family.traced
+            numbers, together = family.numbers, family.traced
             problem = _checked(problem_of, policies[numbers[0]], numbers[0])
             first = problem if first is None else first
             _check_same(first, problem, numbers[0])
             problems = [problem]
-            if traced and not problem.black_box:
-                traced = self._traceable(problem_of, family.weights[0], numbers)
-            if not traced or problem.black_box:
+            if together and not problem.black_box:
+                together = self._traceable(problem_of, family.weights[0], numbers)
+            if not together or problem.black_box:
                 others = [_checked(problem_of, policies[n], n) for n in numbers[1:]]
                 for number, other in zip(numbers[1:], others, strict=True):
                     _check_same(first, other, number)
@@ -111,7 +110,7 @@ class Pieces:
             simulator: Simulator = (
                 Alone(problems, lanes)
                 if family is None
-                else Traced(problem_of, family, lanes, self.space.dim, devices)
+                else traced(problem_of, family, lanes, self.space.dim, devices)
             )
             for number in numbers:
                 self._owner[number] = len(self._simulators)
@@ -205,10 +204,12 @@ class Pieces:
                 dim = problem_of(policy).space.dim
             u = jax.ShapeDtypeStruct((dim,), np.float32)
             jax.eval_shape(simulated, policy, u, jax.eval_shape(lambda: jax.random.key(0)))
-        except NEEDS_NUMBERS as error:
+        except Exception as error:
+            # With the numbers themselves it worked.
+            told = str(error).strip().split("\n")[0]
             self.notes.append(
-                f"policies {_listed(numbers)} were compiled one by one: problem_of needs their "
-                f"numbers, so JAX cannot trace it ({type(error).__name__})"
+                f"policies {_listed(numbers)} were compiled one by one, since JAX could not trace "
+                f"problem_of in their numbers: {type(error).__name__}: {told[:120]}"
             )
             return False
         return True
@@ -280,6 +281,3 @@ def _filled(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "
 def _listed(numbers: Sequence[int]) -> str:
     shown = ", ".join(map(str, numbers[:8]))
     return shown + (", ..." if len(numbers) > 8 else "")
-
-
-__all__ = ["Arrays", "Asked", "Outcome", "Pieces", "Remember", "is_numbers", "just_compute"]

@@ -11,7 +11,7 @@ on its policy and samples alone, bit for bit, not on the other blocks or the num
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -32,15 +32,6 @@ MOST_BLOCKS = 64
 """Blocks of a device in one call at most."""
 SLICE_SECONDS = 1.0
 """How long a call lasts at most, about: between calls one can stop."""
-
-# What JAX raises where code needs the numbers that it traces.
-NEEDS_NUMBERS = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerBoolConversionError,
-    jax.errors.TracerIntegerConversionError,
-    jax.errors.NonConcreteBooleanIndexError,
-)
 
 
 class Outcome(NamedTuple):
@@ -94,94 +85,121 @@ def problem_with(problem_of: Callable[[Any], Problem], policy: Any) -> Problem:
 class Traced:
     """All policies of a family in one program; see the module's docstring."""
 
-    def __init__(
-        self,
-        problem_of: Callable[[Any], Problem],
-        family: Family,
-        lanes: int,
-        dim: int,
-        devices: Sequence[Any] | None = None,
-    ) -> None:
-        self.problem_of, self.family, self.lanes, self.dim = problem_of, family, lanes, dim
-        self.devices = tuple(jax.local_devices() if devices is None else devices)
-        self.capacity = MOST_BLOCKS
-        self._seconds: float | None = None  # Of a block, on one device.
-        self._executables: dict[str, Any] = {}
+    def __init__(self, program: "_Program", family: Family) -> None:
+        self.lanes = program.lanes
+        self._program, self._family = program, family
 
     def together(self) -> int:
-        if self._seconds is None:
-            return len(self.devices)
-        each = max(1, min(self.capacity, int(SLICE_SECONDS / max(self._seconds, 1e-9))))
-        return each * len(self.devices)
-
-    def compile(self) -> None:
-        """Compile now."""
-        self._executable("evaluate")
+        return self._program.together()
 
     def __call__(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
         outcomes: list[Outcome] = []
-        most = self.capacity * len(self.devices)
+        most = self._program.capacity * len(self._program.devices)
         for start in range(0, len(members), most):
             part = slice(start, start + most)
             outcomes += self._call(members[part], points[part], first[part], key)
         return outcomes
 
     def _call(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
-        rho, status = self._run("evaluate", members, points, first, key)
+        policies = [self._family.weights[member] for member in members]
+        rho, status = self._program("evaluate", policies, points, first, key)
         proper = status == Status.OK
         broken = np.any(rho < 0, axis=2) & proper
         zero = proper & ~broken & np.any(rho == 0, axis=2)
         if zero.any():
             # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
             places = np.flatnonzero(zero.any(axis=1))
-            some = [members[i] for i in places]
-            (holds,) = self._run("verdicts", some, points[places], first[places], key)
+            some = [policies[i] for i in places]
+            (holds,) = self._program("verdicts", some, points[places], first[places], key)
             broken[places] |= zero[places] & ~np.all(holds, axis=2)
         least = np.where(proper, np.min(rho, axis=2), np.nan).astype(np.float32)
         return [Outcome(*block) for block in zip(least, broken, proper, strict=True)]
 
-    def _run(self, mode: str, members: Any, points: Any, first: Any, key: Any) -> list[np.ndarray]:
-        count, devices = len(members), len(self.devices)
-        executable = self._executable(mode)
+
+def traced(
+    problem_of: Callable[[Any], Problem],
+    family: Family,
+    lanes: int,
+    dim: int,
+    devices: Sequence[Any] | None = None,
+) -> Traced:
+    """The simulator of a family; what it compiles is kept as long as `problem_of` is in use."""
+    where = tuple(jax.local_devices() if devices is None else devices)
+    try:
+        program = _known_program(problem_of, family.structure, lanes, dim, where)
+    except TypeError:  # It cannot be hashed.
+        program = _Program(problem_of, lanes, dim, where)
+    return Traced(program, family)
+
+
+@lru_cache(maxsize=16)
+def _known_program(
+    problem_of: Any, structure: str, lanes: int, dim: int, devices: tuple[Any, ...]
+) -> "_Program":
+    return _Program(problem_of, lanes, dim, devices)
+
+
+class _Program:
+    """What is compiled for one structure: blocks in, robustness and status out."""
+
+    def __init__(
+        self,
+        problem_of: Callable[[Any], Problem],
+        lanes: int,
+        dim: int,
+        devices: tuple[Any, ...],
+    ) -> None:
+        self.problem_of, self.lanes, self.dim, self.devices = problem_of, lanes, dim, devices
+        self.capacity = MOST_BLOCKS
+        self._seconds: float | None = None  # Of a block, on one device.
+        self._executables: dict[str, Any] = {}
+
+    def together(self) -> int:
+        """Blocks in a call that lasts about `SLICE_SECONDS`; few at first."""
+        if self._seconds is None:
+            return len(self.devices)
+        each = max(1, min(self.capacity, int(SLICE_SECONDS / max(self._seconds, 1e-9))))
+        return each * len(self.devices)
+
+    def __call__(
+        self, mode: str, policies: Sequence[Any], points: Any, first: Any, key: Any
+    ) -> list[np.ndarray]:
+        """Results `[blocks, lanes, ...]` of as many blocks as there are policies."""
+        count, devices = len(policies), len(self.devices)
         share = -(-count // devices)
         # Device i works on blocks i * share and following, which lie at the start of its part.
         place = np.arange(count)
         place = place // share * self.capacity + place % share
         whole = devices * self.capacity
-        spread = np.zeros(whole, np.int32)
-        spread[place] = np.asarray(members, np.int32)
         # Weights are stacked block by block: the program does not know how many policies there are.
-        weights = jax.tree.map(
-            lambda *leaves: np.stack(leaves), *[self.family.weights[m] for m in spread]
-        )
-        u = np.full((whole, self.lanes, self.dim), 0.5, np.float32)
-        u[place] = points
-        numbers = np.zeros(whole, np.int32)
-        numbers[place] = first
+        weights = jax.tree.map(lambda *leaves: _spread(leaves, place, whole), *policies)
+        u = _spread(points, place, whole)
+        numbers = _spread(first, place, whole)
         counts = np.clip(count - np.arange(devices) * share, 0, share).astype(np.int32)
+        executable = self._executable(mode, policies[0])
         began = time.perf_counter()
-        results = [np.asarray(r)[place] for r in executable(weights, u, numbers, counts, key)]
+        results = executable(weights, u, numbers, counts, key)
+        results = [np.asarray(result)[place] for result in results]
         self._seconds = (time.perf_counter() - began) / share
         return results
 
-    def _executable(self, mode: str) -> Any:
+    def _executable(self, mode: str, policy: Any) -> Any:
         if mode not in self._executables:
             enable_compile_cache()
             whole = len(self.devices) * self.capacity
             arguments = (
                 jax.tree.map(
-                    lambda leaf: jax.ShapeDtypeStruct((whole, *leaf.shape), leaf.dtype),
-                    self.family.weights[0],
+                    lambda leaf: jax.ShapeDtypeStruct((whole, *leaf.shape), leaf.dtype), policy
                 ),
                 jax.ShapeDtypeStruct((whole, self.lanes, self.dim), jnp.float32),
                 jax.ShapeDtypeStruct((whole,), jnp.int32),
                 jax.ShapeDtypeStruct((len(self.devices),), jnp.int32),
                 jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32")),
             )
-            self._executables[mode] = jax.jit(self._program(mode)).lower(*arguments).compile()
+            self._executables[mode] = jax.jit(self._traced(mode)).lower(*arguments).compile()
         return self._executables[mode]
 
-    def _program(self, mode: str) -> Any:
+    def _traced(self, mode: str) -> Any:
         def row(problem: Problem) -> Any:
             carried = carried_monitor(problem) if mode == "evaluate" else None
 
@@ -222,6 +240,15 @@ class Traced:
             # A user's scan need not say that its carry differs between devices.
             check_vma=False,
         )
+
+
+def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
+    """The rows at these places of an array of `whole` rows, the first one elsewhere."""
+    given = np.asarray(rows)
+    spread = np.empty((whole, *given.shape[1:]), given.dtype)
+    spread[:] = given[0]
+    spread[places] = given
+    return spread
 
 
 class Alone:

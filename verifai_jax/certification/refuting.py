@@ -8,14 +8,14 @@ says that a policy can fail, never how likely it is: points that it chose are no
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.certification.pieces import Pieces
+from verifai_jax.certification.programs import Outcome
 from verifai_jax.options import check_search
 from verifai_jax.problem import Problem
 from verifai_jax.proposals import Proposals
@@ -24,39 +24,30 @@ from verifai_jax.search import Search
 
 @dataclass(eq=False)
 class Seen:
-    """Simulations of one policy: points of the unit cube, robustness, and whether they fail."""
+    """What was simulated of one policy: its points, what came of them, and the counts.
 
-    points: list[Float[np.ndarray, "n d"]]
-    rho: list[Float[np.ndarray, " n"]]
-    failing: list[Bool[np.ndarray, " n"]]
-    proper: list[Bool[np.ndarray, " n"]]
+    `failures` ended properly and break a formula; `not_finite` have no verdict.
+    """
 
-    @classmethod
-    def nothing(cls) -> "Seen":
-        """Before the first simulation."""
-        return cls([], [], [], [])
+    points: list[Float[np.ndarray, "n d"]] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+    simulations: int = 0
+    failures: int = 0
+    not_finite: int = 0
 
-    def add(self, points: Any, outcome: Any) -> None:
+    def add(self, points: Float[np.ndarray, "n d"], outcome: Outcome) -> None:
         """Take in one block."""
         self.points.append(points)
-        self.rho.append(outcome.rho)
-        self.failing.append(outcome.failing)
-        self.proper.append(outcome.proper)
+        self.outcomes.append(outcome)
+        self.simulations += len(points)
+        self.failures += int(np.sum(outcome.failing))
+        self.not_finite += int(np.sum(~outcome.proper))
 
     @property
-    def simulations(self) -> int:
-        """Simulations so far."""
-        return sum(map(len, self.rho))
-
-    @property
-    def failures(self) -> int:
-        """Those that ended properly and break a formula."""
-        return int(sum(map(np.sum, self.failing)))
-
-    @property
-    def not_finite(self) -> int:
-        """Those without a verdict."""
-        return int(sum(np.sum(~proper) for proper in self.proper))
+    def least(self) -> float:
+        """The least robustness; NaN where nothing had a verdict."""
+        values = [outcome.rho[outcome.proper] for outcome in self.outcomes]
+        return float(min((np.min(rho) for rho in values if len(rho)), default=np.nan))
 
 
 def usable_search(problem: Problem, search: str | Search) -> Search:
@@ -98,12 +89,8 @@ def refute(
                 asked.append((number, points))
             else:
                 attacker.tell_refused()
-        for place, outcome in pieces.attack(asked, round_, _name(search)):
+        for place, outcome in pieces.attack(asked, round_, repr(search)):
             number, points = asked[place]
             seen[number].add(points, outcome)
             attackers[number].tell(outcome.rho, outcome.proper, None)
             told(len(points))
-
-
-def _name(search: Search) -> str:
-    return repr(search)
