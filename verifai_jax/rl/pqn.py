@@ -31,6 +31,7 @@ from verifai_jax.rl.experience import (
 )
 from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers
+from verifai_jax.rl.shuffling import permutation
 from verifai_jax.rl.task import Discrete, Task
 
 
@@ -250,26 +251,31 @@ def _learn(
     left = 1.0 - training.done * (1.0 / training.updates) if pqn.anneal else 1.0
     rate = pqn.learning_rate * left
 
-    def minibatch(carry: Any, rows: Int[Array, " rows"]) -> Any:
+    def minibatch(carry: Any, part: Any) -> Any:
         layers, moments = carry
-        gradient = jax.grad(_loss)(layers, pqn, *[leaf[rows] for leaf in batch])
+        gradient = jax.grad(_loss)(layers, pqn, *part)
         direction, moments = optimizer.update(gradient, moments)
         layers = jax.tree.map(lambda w, d: w - rate * d, layers, direction)
         return (layers, moments), None
 
-    def shuffled(key: Key[Array, ""]) -> Int[Array, "minibatches rows"]:
-        return jax.random.permutation(key, pqn.steps_per_update).reshape(pqn.minibatches, -1)
+    def epoch(carry: Any, key: Key[Array, ""]) -> Any:
+        order = permutation(key, pqn.steps_per_update)
+        parts = jax.tree.map(
+            lambda leaf: leaf[order].reshape(pqn.minibatches, -1, *leaf.shape[1:]), batch
+        )
+        return jax.lax.scan(minibatch, carry, parts)
 
-    orders = jax.vmap(shuffled)(jax.random.split(key, pqn.epochs))
-    order = orders.reshape(pqn.epochs * pqn.minibatches, -1)
-    return jax.lax.scan(minibatch, (training.layers, training.moments), order)[0]
+    start = (training.layers, training.moments)
+    return jax.lax.scan(epoch, start, jax.random.split(key, pqn.epochs))[0]
 
 
 def _loss(
     layers: Layers, pqn: PQN, observation: Array, action: Array, target: Array
 ) -> Float[Array, ""]:
     values = network(layers, observation, pqn.activation)
-    value = jnp.take_along_axis(values, action[:, None], axis=-1)[:, 0]
+    # A choice instead of an index, whose derivative would scatter row by row.
+    chosen = jnp.arange(values.shape[-1]) == action[:, None]
+    value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)
     return jnp.mean(jnp.square(value - target)) / 2
 
 
