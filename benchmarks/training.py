@@ -1,12 +1,14 @@
 """CPU time of an environment step in training: our PPO and stable-baselines3's, side by side.
 
-    .venv-bench/bin/python benchmarks/training.py
-    .venv-bench/bin/python benchmarks/training.py --task mountain_car --rounds 7
+    pip install -e '.[bench-rl]'
+    python benchmarks/training.py
+    python/bin/python benchmarks/training.py --task mountain_car --rounds 7
 
 Both have two hidden layers of 64 tanh units, 8 environments x 128 steps an update, 4 epochs of 4
 minibatches (256 rows). The two take turns; the ratio is the median over the rounds. Ours is
 measured with its program compiled (what compiling costs is told apart), theirs after a first call
-that warms it up, on one thread of torch, which is faster for it than two.
+that warms it up. `--threads 1` holds torch to one thread, which takes it much less CPU time than
+its own choice of one a core.
 """
 
 import argparse
@@ -51,13 +53,14 @@ def ours(task_name: str) -> Callable[[int], float]:
     return run
 
 
-def theirs(task_name: str) -> Callable[[int], float]:
+def theirs(task_name: str, threads: int | None) -> Callable[[int], float]:
     """The same with stable-baselines3."""
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
-    torch.set_num_threads(1)
+    if threads is not None:
+        torch.set_num_threads(threads)
     environment = {"cartpole": "CartPole-v1", "mountain_car": "MountainCarContinuous-v0"}[task_name]
 
     def run(seed: int) -> float:
@@ -85,8 +88,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=["cartpole", "mountain_car"], default="cartpole")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, help="of torch; its own choice when left out")
     chosen = parser.parse_args()
-    mine, other = ours(chosen.task), theirs(chosen.task)
+    mine, other = ours(chosen.task), theirs(chosen.task, chosen.threads)
     before = time.process_time()
     mine(0)
     print(f"first call, compilation included: {time.process_time() - before:.1f} CPU s")

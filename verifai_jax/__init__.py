@@ -4,7 +4,10 @@ __version__ = "0.1.0"
 
 from verifai_jax import analysis as analysis
 from verifai_jax import mtl as mtl
+from verifai_jax import rl as rl
 from verifai_jax import search as search
+from verifai_jax.certification import Certificates as Certificates
+from verifai_jax.certification import certify as certify
 from verifai_jax.counterexample import Confirmation as Confirmation
 from verifai_jax.counterexample import Confirmations as Confirmations
 from verifai_jax.counterexample import confirm as confirm
@@ -62,6 +65,14 @@ from verifai_jax.rulebook import Rulebook as Rulebook
 from verifai_jax.run import Replay as Replay
 from verifai_jax.run import Run as Run
 from verifai_jax.run import load as load
+from verifai_jax.sweeps import Halving as Halving
+from verifai_jax.sweeps import OptunaSampler as OptunaSampler
+from verifai_jax.sweeps import Study as Study
+from verifai_jax.sweeps import StudyError as StudyError
+from verifai_jax.sweeps import Sweep as Sweep
+from verifai_jax.sweeps import Trainer as Trainer
+from verifai_jax.sweeps import load_sweep as load_sweep
+from verifai_jax.sweeps import sweep as sweep
 from verifai_jax.synthesis import Repair as Repair
 from verifai_jax.synthesis import Synthesis as Synthesis
 from verifai_jax.synthesis import repair as repair

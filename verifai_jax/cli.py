@@ -18,6 +18,7 @@ from verifai_jax.commands.estimate import estimate
 from verifai_jax.commands.explain import explain
 from verifai_jax.commands.repair import repair
 from verifai_jax.commands.shrink import shrink
+from verifai_jax.commands.sweep import sweep
 from verifai_jax.commands.synthesize import synthesize
 from verifai_jax.errors import MissingExtra
 
@@ -154,7 +155,7 @@ def falsify(
         click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
 
 
-for _command in (confirm, estimate, explain, repair, shrink, synthesize):
+for _command in (confirm, estimate, explain, repair, shrink, sweep, synthesize):
     main.add_command(_command)
 
 
