@@ -175,25 +175,37 @@ class Allocation:
         where = np.flatnonzero(self.undecided(k, n))
         if not len(where):
             return blocks
-        more = np.array([self._missing(float(k[i]), int(n[i]), len(n)) for i in where])
-        for i, missing in sorted(zip(where, more, strict=True), key=lambda pair: pair[1]):
-            wanted = -(-missing // self.block)
-            if not math.isfinite(missing) or wanted > left:
-                continue
-            # A failure more takes twice as many: look again on the way.
-            blocks[i] = min(int(wanted), int(self._grown(n[i : i + 1])[0]))
-            left -= int(wanted)
+        more = self._missing(k[where], n[where], len(n))
+        for place in np.argsort(more, kind="stable"):
+            i, missing = where[place], more[place]
+            if not math.isfinite(missing) or missing > left * self.block:
+                break
+            # What it shows on the way may change what is missing.
+            wanted = math.ceil(missing / self.block)
+            blocks[i] = min(wanted, int(self._grown(n[i : i + 1])[0]))
+            left -= wanted
         return blocks
 
-    def _missing(self, failures: float, simulations: int, among: int) -> float:
-        """How many more samples decide, if they fail as those so far; infinite if never."""
+    def _missing(
+        self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"], among: int
+    ) -> Float[np.ndarray, " n"]:
+        """How many more samples may well decide; infinite where the budget could not.
+
+        If the rate is the lower quartile of its posterior, or the upper one, whichever is sooner.
+        """
+        from scipy.special import betaincinv
+
         limit = needed(self.confidence, among)
-        rate = failures / simulations
-        evidence = evidence_below if rate < self.p else evidence_above
-        more = np.unique(np.geomspace(self.block, max(self.budget, self.block), 60).astype(int))
-        found = evidence(failures + rate * more, simulations + more, np.full(len(more), self.p))
-        enough = np.flatnonzero(found > limit)
-        return float(more[enough[0]]) if len(enough) else math.inf
+        most = max(self.budget, 2 * self.block)
+        steps = np.geomspace(self.block, most, 32)
+        fewest = np.full(len(failures), np.inf)
+        k, n = failures[:, None].astype(float), simulations[:, None] + steps
+        for evidence, level in ((evidence_below, 0.25), (evidence_above, 0.75)):
+            rates = betaincinv(k + 0.5, simulations[:, None] - k + 0.5, level)
+            found = evidence(k + rates * steps, n, np.full(n.shape, self.p)) > limit
+            first = np.where(found.any(axis=1), steps[np.argmax(found, axis=1)], np.inf)
+            fewest = np.minimum(fewest, first)
+        return fewest
 
 
 def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:
