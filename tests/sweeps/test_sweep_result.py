@@ -16,7 +16,7 @@ from verifai_jax.sweeps.pareto import fronts
 from verifai_jax.sweeps.record import AFTER, BEFORE
 from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.saving import SweepFileError, load_sweep
-from verifai_jax.sweeps.telling import lead
+from verifai_jax.sweeps.telling import lead, values_of
 
 NOT_TRAINED = {
     "nominal_return": np.nan,
@@ -121,6 +121,28 @@ def test_the_lead_counts_the_safe_among_those_with_full_return(small, large):
     assert f"{safe} of those {len(full)} are certified safe" in lead(large)
     one = Sweep(record_of([ROWS[0]]), ToyStudy())
     assert "1 reaches full return (at least 100), and it is certified safe" in lead(one)
+
+
+class ToyTrainer:
+    """PPO has no `discount`; a hyper-parameter that an algorithm lacks is not used by it."""
+
+    by_name = ("ppo", "sac")
+
+    @staticmethod
+    def uses(values):
+        return tuple(n for n in values if values["algorithm"] != "ppo" or n != "discount")
+
+
+def test_what_an_algorithm_lacks_is_not_told_of_it(tmp_path):
+    study = ToyStudy()
+    study.trainer = ToyTrainer()
+    sweep = Sweep(record_of(planted_rows(40)), study)
+    assert sweep.used["ppo"] == ("learning_rate", "width", "algorithm")
+    ppo = sweep.table.index[sweep.table["algorithm"] == "ppo"][0]
+    sac = sweep.table.index[sweep.table["algorithm"] == "sac"][0]
+    assert "discount" not in values_of(sweep, sweep.table.loc[ppo])
+    assert "discount" in values_of(sweep, sweep.table.loc[sac])
+    assert load_sweep(sweep.save(tmp_path)).used == sweep.used
 
 
 def test_the_summary_says_what_was_found_and_at_what_price(small):
@@ -314,7 +336,8 @@ def test_the_picture_is_written(small, tmp_path):
     # Too few configurations for a panel of what matters.
     assert [axes.get_title() for axes in figure.axes] == ["Return is not safety", "How they learnt"]
     labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert "safe (4)" in labels
+    assert "safe (3)" in labels
+    assert "safe, earlier snapshot (1)" in labels
     assert "wanted: below 1 %" in labels
 
 

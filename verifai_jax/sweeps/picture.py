@@ -43,7 +43,10 @@ def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
         draw_curves(panels.pop(0), sweep, curves)
     if bars:
         draw_importance(panels.pop(0), importance)
-    figure.suptitle(_wrapped(f"{shortened(sweep.name, 40)}: {lead(sweep)}", 12 * sum(widths) * 2.6))
+    title = f"{shortened(sweep.name, 40)}: {lead(sweep)}"
+    if len(title) > 10 * figure.get_figwidth():
+        title = title.replace("; ", "\n", 1)
+    figure.suptitle(title, fontsize=11)
     return show_or_save(figure, path)
 
 
@@ -61,10 +64,10 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
     final = shown.index.isin(last_snapshots(sweep.table).index)
     for verdict, (colour, marker) in LOOKS.items():
         of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
-        label = f"{verdict} ({int(of_kind.sum())})"
         for rows, weight in ((shown.loc[of_kind & ~final], 0.3), (shown.loc[of_kind & final], 1.0)):
             if not len(rows):
                 continue
+            when = "" if weight == 1.0 else ", earlier snapshot"
             if weight == 1.0:
                 _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
             axes.scatter(
@@ -76,7 +79,7 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
                 alpha=weight,
                 edgecolors="white",
                 linewidths=0.6,
-                label=label if weight == 1.0 else f"{verdict}, earlier snapshot",
+                label=f"{verdict}{when} ({len(rows)})",
                 zorder=2 + weight,
             )
     front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
@@ -246,9 +249,3 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
     tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 1)
-
-
-def _wrapped(text: str, width: float) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(text, max(40, int(width))))

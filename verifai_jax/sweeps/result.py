@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
     from verifai_jax.sweeps.study import Study
 
+ALGORITHM = "algorithm"
+"""The hyper-parameter that says which of the others have a meaning."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
@@ -40,7 +43,8 @@ class Sweep:
     **Fields:** `record`: all that was trained and certified, as plain data; `study`: what was
     swept, None for a loaded sweep without it; `space` of the hyper-parameters, the study's if left
     out, None where it is not known; `folder` on disk, if it was loaded; `failing`: what each row
-    failed with, row -> DataFrame, of a loaded sweep, which has no certificates to ask.
+    failed with, row -> DataFrame, of a loaded sweep, which has no certificates to ask; `used`:
+    the hyper-parameters that each algorithm has, by its name; empty where all have all.
     """
 
     record: SweepRecord
@@ -48,11 +52,14 @@ class Sweep:
     space: FeatureSpace | None = None
     folder: Path | None = None
     failing: "Mapping[int, pd.DataFrame]" = field(default_factory=dict, repr=False)
+    used: Mapping[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
     _problems: dict[int, Problem] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.space is None and self.study is not None:
             object.__setattr__(self, "space", self.study.space)
+        if not self.used and self.study is not None:
+            object.__setattr__(self, "used", _used(self.study))
 
     @property
     def name(self) -> str:
@@ -63,6 +70,10 @@ class Sweep:
     def hyperparameters(self) -> tuple[str, ...]:
         """Names of the columns that were swept."""
         return self.record.hyperparameters
+
+    def applies(self, name: str, algorithm: Any) -> bool:
+        """Whether the algorithm of this name has the hyper-parameter; None has all."""
+        return name in self.used.get(str(algorithm), (name,))
 
     @cached_property
     def table(self) -> "pd.DataFrame":
@@ -172,8 +183,14 @@ class Sweep:
 
         Nothing is trained or simulated. With too few configurations it says so.
         """
+        table = self.table
+        if self.used:
+            # What an algorithm lacks cannot matter to it.
+            for name in self.hyperparameters:
+                has = [self.applies(name, algorithm) for algorithm in table[ALGORITHM]]
+                table = table.assign(**{name: table[name].where(np.array(has, bool))})
         return hyperparameter_importance(
-            self.table,
+            table,
             self.hyperparameters,
             self.space,
             name=self.name,
@@ -301,3 +318,14 @@ class Sweep:
         from verifai_jax.sweeps.to_optuna import to_optuna
 
         return to_optuna(self, storage, name)
+
+
+def _used(study: Any) -> dict[str, tuple[str, ...]]:
+    """Which of the hyper-parameters each algorithm of a study has."""
+    names = study.space.columns
+    if ALGORITHM not in names or not hasattr(study, "trainer"):
+        return {}
+    return {
+        algorithm: study.trainer.uses({**dict.fromkeys(names), ALGORITHM: algorithm})
+        for algorithm in study.trainer.by_name
+    }

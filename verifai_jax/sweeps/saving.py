@@ -60,7 +60,12 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     np.savez_compressed(folder / CURVES, **arrays)
     data = {name: _plain(getattr(record, name)) for name in _PLAIN}
     data |= {"format": FORMAT, "complete": record.complete, "rows": record.rows}
-    data |= {"mixed": mixed, "worst": _plain(record.worst), "space": _space_data(sweep.space)}
+    data |= {
+        "used": _plain(sweep.used),
+        "mixed": mixed,
+        "worst": _plain(record.worst),
+        "space": _space_data(sweep.space),
+    }
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(data, indent=2) + "\n")
     partial.replace(folder / RECORD)
@@ -98,7 +103,8 @@ def load_sweep(path: str | Path, study: "Study | None" = None) -> Sweep:
         raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
-    return Sweep(record, study, None if study is not None else space, folder, failing)
+    used = {name: tuple(has) for name, has in data["used"].items()}
+    return Sweep(record, study, None if study is not None else space, folder, failing, used)
 
 
 def _check_same(folder: Path, data: Mapping[str, Any], study: "Study") -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 8
 """Rows that a notebook shows."""
+_VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
 
 
 def summary(sweep: "Sweep") -> str:
@@ -56,6 +57,7 @@ def summary(sweep: "Sweep") -> str:
         lines.append(f"  evidence        {evidence}")
     if spent := _spent(sweep.record.seconds):
         lines.append(f"  time            {spent}")
+    lines.append(f"  see             {_VIEWS}")
     return "\n".join(lines)
 
 
@@ -83,9 +85,9 @@ def verdict_counts(rows: Any) -> str:
     """How many rows have which verdict."""
     verdicts = rows["verdict"].astype(str)
     parts = [f"{int(is_safe(rows).sum())} safe"]
-    parts += [
-        f"{int((verdicts == verdict).sum())} {verdict}" for verdict in ("unsafe", "undecided")
-    ]
+    for verdict in ("unsafe", "undecided"):
+        if count := int((verdicts == verdict).sum()):
+            parts.append(f"{count} {verdict}")
     if other := int((verdicts == "").sum()):
         parts.append(f"{other} not certified")
     return ", ".join(parts)
@@ -123,8 +125,9 @@ def plural(count: int, what: str) -> str:
 
 
 def values_of(sweep: "Sweep", row: Any) -> str:
-    """The hyper-parameters of a row."""
-    values = {name: row[name] for name in sweep.hyperparameters if name in row}
+    """The hyper-parameters of a row, those that its algorithm has."""
+    names = [name for name in sweep.hyperparameters if name != "steps"]
+    values = {name: row[name] for name in names if sweep.applies(name, row.get("algorithm"))}
     missing = [
         name for name, value in values.items() if isinstance(value, float) and value != value
     ]
@@ -153,8 +156,8 @@ def _html_row(i: int, row: Any, names: list[str]) -> str:
     from verifai_jax.report.style import FAILING, SAFE, WITHOUT_VERDICT
 
     verdict = str(row["verdict"])
-    colour = SAFE if verdict.startswith("safe") else FAILING
-    colour = WITHOUT_VERDICT if verdict not in ("unsafe",) and colour == FAILING else colour
+    colour = SAFE if verdict.startswith("safe") else WITHOUT_VERDICT
+    colour = FAILING if verdict == "unsafe" else colour
     shown = [
         f"{percent(row['failure_low'])} to {percent(row['failure_high'])}",
         number(row["nominal_return"]),

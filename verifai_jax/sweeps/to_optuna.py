@@ -53,9 +53,10 @@ def to_optuna(sweep: "Sweep", storage: Any = None, name: str | None = None) -> A
     domains = {} if sweep.space is None else sweep.space.domains
     known = {n: distribution(optuna, domains.get(n), groups[n]) for n in names}
     distributions = {n: found for n, found in known.items() if found is not None}
-    made.add_trials(
-        [_trial(optuna, int(i), row, distributions) for i, row in groups.iterrows()]  # pyright: ignore
-    )
+    for i, row in groups.iterrows():
+        algorithm = row.get("algorithm")
+        own = {n: d for n, d in distributions.items() if sweep.applies(n, algorithm)}
+        made.add_trial(_trial(optuna, int(i), row, own))
     return made
 
 
