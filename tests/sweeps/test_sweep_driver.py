@@ -1,0 +1,363 @@
+"""Sweeps of a toy: what is trained, what is remembered, and that interruptions change nothing."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+from drifting import Drift, Point, drifting, quick_certificates
+
+import verifai_jax as vj
+from verifai_jax.errors import MissingExtra, UnknownNameError
+from verifai_jax.rl import evaluate, train
+from verifai_jax.sweeps import driver, lessons
+from verifai_jax.sweeps.driver import sweep
+from verifai_jax.sweeps.halving import Halving
+from verifai_jax.sweeps.optuna import OptunaSampler
+from verifai_jax.sweeps.record import AFTER, BEFORE
+from verifai_jax.sweeps.returns import nominal_returns
+from verifai_jax.sweeps.searching import WORST, CubeAsker, badness
+from verifai_jax.sweeps.store import Store, StoreError
+from verifai_jax.sweeps.trainer import StudyError
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+
+
+def same_tables(one, other, but=("training_seconds",)):
+    """Equal tables and bit-equal policies and curves."""
+    left, right = one.record, other.record
+    assert list(left.columns) == list(right.columns)
+    for name in left.columns:
+        if name not in but:
+            np.testing.assert_array_equal(left.columns[name], right.columns[name], err_msg=name)
+    assert left.worst == right.worst
+    assert left.curves.keys() == right.curves.keys()
+    for key, curve in left.curves.items():
+        np.testing.assert_array_equal(curve.mean_return, right.curves[key].mean_return)
+    for a, b in zip(left.policies, right.policies, strict=True):
+        same_policies(a, b)
+
+
+def same_policies(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driver, "certify_policies", quick_certificates)
+        return sweep(drifting(seeds=2), configurations=5, samples=64)
+
+
+def test_one_row_a_policy(whole):
+    columns = whole.record.columns
+    assert list(columns) == [*BEFORE, "rate", *AFTER]
+    assert columns["configuration"].tolist() == list(np.repeat(range(5), 6))
+    assert columns["seed"].tolist() == [0, 0, 0, 1, 1, 1] * 5
+    assert columns["steps"].tolist() == [32, 64, 128] * 10
+    assert set(columns["status"]) == {"trained"}
+    assert (columns["simulations"] == 64).all()
+    assert columns["rate"].dtype == np.float64
+    assert columns["failures"].dtype == np.int64
+    np.testing.assert_array_equal(columns["failure_rate"], columns["failures"] / 64)
+    assert whole.record.certified == tuple(range(30))
+    assert whole.record.complete
+    assert {"training", "certifying"} <= set(whole.record.seconds)
+
+
+def test_rows_are_what_a_training_of_their_own_gives(whole):
+    for row in (0, 1, 11, 20):
+        cell = {name: column[row] for name, column in whole.record.columns.items()}
+        alone = train(
+            Point(), Drift(rate=float(cell["rate"])), seed=int(cell["seed"]), steps=128,
+            snapshots=(32, 64),
+        )  # fmt: skip
+        of_it = {at.steps: at.policy for at in alone.snapshots} | {128: alone.policy}
+        same_policies(whole.record.policies[row], of_it[cell["steps"]])
+        steps, returns = whole.record.curves[cell["configuration"], cell["seed"]]
+        np.testing.assert_array_equal(steps, alone.steps)
+        np.testing.assert_array_equal(returns, alone.mean_return)
+    # An episode ends in every other update; the last tenth of them is one update.
+    returns = np.float64(whole.record.curves[0, 0].mean_return)
+    expected = [np.nan, returns[1], returns[3]]
+    np.testing.assert_array_equal(whole.record.columns["training_return"][:3], expected)
+
+
+def test_nominal_returns_are_those_of_the_task_itself():
+    # The reset is not random: one episode says all.
+    study = drifting({"rate": vj.LogUniform(0.01, 1.0), "reward_scale": vj.Box(1.0, 9.0)})
+    found = sweep(study, configurations=3, samples=8)
+    for row, policy in enumerate(found.record.policies):
+        expected = float(evaluate(Point(), policy, episodes=1)[0])
+        assert found.record.columns["nominal_return"][row] == pytest.approx(expected, rel=1e-6)
+
+
+def test_returns_do_not_depend_on_company(whole):
+    policies = whole.record.policies
+    together = nominal_returns(Point(), policies, episodes=4)
+    for some in ([0], [29, 3], list(range(7, 29))):
+        np.testing.assert_array_equal(
+            nominal_returns(Point(), [policies[i] for i in some], episodes=4), together[some]
+        )
+
+
+def test_what_cannot_train_or_explodes_is_a_row():
+    space = {"limit": vj.Categorical(0.3, 100.0), "rate": vj.Categorical(0.1, 0.5)}
+    found = sweep(drifting(space), search="grid", configurations=4, samples=16)
+    table = found.table
+    assert len(table) == 1 + 3 * 3
+    refused = table["status"] == "error: Drift's rate must be less than limit = 0.3; got 0.5"
+    assert (refused == ((table["limit"] == 0.3) & (table["rate"] == 0.5))).all()
+    lost = table["status"] == "nonfinite"
+    # 0.1 an update: beyond 0.3 before the fourth.
+    assert lost.sum() == 1
+    assert (lost == ((table["limit"] == 0.3) & (table["steps"] == 128) & ~refused)).all()
+    assert table.loc[lost, "nominal_return"].isna().all()
+    assert table.loc[lost | refused, "verdict"].eq("").all()
+    assert table.loc[lost | refused, "failure_high"].isna().all()
+    assert [policy is None for policy in found.record.policies] == list(lost | refused)
+
+
+def test_a_training_that_raises_is_a_row(monkeypatch):
+    def step(self, task, state, step=Drift.step):
+        if self.environments == 8:
+            raise RuntimeError("no room\nfor so many")
+        return step(self, task, state)
+
+    monkeypatch.setattr(Drift, "step", step)
+    study = drifting({"environments": vj.Categorical(4, 8), "rate": vj.Box(0.1, 0.2)}, seeds=2)
+    table = sweep(study, configurations=4, samples=8).table
+    assert set(table["status"]) == {"trained", "error: RuntimeError: no room"}
+    assert (table["status"] == "trained").sum() == 2 * 2 * 3
+
+
+def test_algorithms_and_widths_in_one_sweep():
+    space = {
+        "algorithm": vj.Categorical("slow", "fast"),
+        "width": vj.Categorical(4, 5),
+        "rate": vj.Box(0.05, 0.06),
+    }
+    study = drifting(space, algorithms={"slow": Drift(), "fast": Drift(noise=0.0)}, snapshots=())
+    found = sweep(study, configurations=4, samples=8)
+    assert len(found.table) == 4
+    for row, policy in zip(found.table.itertuples(), found.record.policies, strict=True):
+        assert policy.layers[0][0].shape == (2, row.width)
+        noise = {"slow": 0.01, "fast": 0.0}[row.algorithm]
+        chosen = Drift(rate=row.rate, noise=noise, hidden=(row.width,))
+        same_policies(policy, train(Point(), chosen, steps=128).policy)
+
+
+def test_steps_are_a_hyper_parameter_too():
+    space = {"steps": vj.Categorical(64, 96), "rate": vj.Box(0.05, 0.06)}
+    study = drifting(space, snapshots=(32, 80))
+    found = sweep(study, configurations=2, samples=8)
+    assert list(found.record.columns)[:4] == ["configuration", "seed", "steps", "rate"]
+    assert found.record.hyperparameters == ("steps", "rate")
+    of_one = found.table.groupby("configuration")["steps"].apply(list)
+    assert sorted(of_one) == [[32, 64], [32, 80, 96]]
+
+
+def test_a_curve_is_judged():
+    found = sweep(drifting(curve="always return >= 9.8"), configurations=3, samples=8)
+    table = found.table
+    for row in table.itertuples():
+        curve = found.record.curves[row.configuration, 0]
+        known = np.asarray(curve.mean_return)[: row.steps // 32]
+        known = known[np.isfinite(known)]
+        expected = known.min() - 9.8 if len(known) else np.nan
+        assert row.curve_robustness == pytest.approx(expected, abs=1e-5, nan_ok=True)
+
+
+def test_configurations_are_distinct():
+    space = {"rate": vj.Categorical(0.1, 0.2, 0.3), "noise": vj.Categorical(0.0, 0.1)}
+    found = sweep(drifting(space, snapshots=()), search="uniform", configurations=50, samples=8)
+    assert len(found.table) == 6
+    assert not found.table[["rate", "noise"]].duplicated().any()
+
+
+class Stopped(Store):
+    """Interrupted as soon as so many pieces of work are finished."""
+
+    after = 10**9
+
+    def put(self, work):
+        super().put(work)
+        if self.made >= self.after:
+            raise KeyboardInterrupt
+
+
+CASES = {
+    "halton": {"configurations": 5},
+    "cross_entropy": {"configurations": 6, "search": "cross_entropy", "batch": 2},
+    "halving": {"configurations": 6, "halving": Halving(2)},
+    "halving by safety": {"configurations": 6, "halving": Halving(2, by="safety")},
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_path):
+    study, how = drifting(), {"samples": 64, **CASES[case]}
+    through = sweep(study, store=tmp_path / "through", **how)
+    with Store(tmp_path / "through") as kept:
+        pieces = len(kept.names())
+    monkeypatch.setattr(driver, "Store", Stopped)
+    for after in (1, 4, pieces // 2, pieces - 2):
+        monkeypatch.setattr(Stopped, "after", after)
+        some = sweep(study, store=tmp_path / str(after), **how)
+        assert not some.record.complete
+        assert len(some.table) <= len(through.table)
+        monkeypatch.setattr(Stopped, "after", 10**9)
+        again = sweep(study, store=tmp_path / str(after), **how)
+        assert again.record.complete
+        same_tables(again, through)
+    # Nothing is trained again: all is remembered, with the seconds that it took.
+    monkeypatch.setattr(lessons.Trainings, "advance", None)
+    same_tables(sweep(study, store=tmp_path / "through", **how), through, but=())
+
+
+def test_a_store_of_another_sweep_says_what_differs(tmp_path):
+    sweep(drifting(), configurations=2, samples=8, store=tmp_path)
+    for other, how, told in (
+        (drifting(), {"samples": 16}, "options.samples is 16, in the store 8"),
+        (drifting(), {"search": "sobol"}, "options.search.name is sobol, in the store halton"),
+        (drifting(steps=256), {}, "steps is 256, in the store 128"),
+        (
+            drifting(algorithms=Drift(noise=0.5)), {},
+            "algorithms.drift.noise is 0.5, in the store 0.01",
+        ),
+        (
+            drifting({"rate": vj.Box(0.1, 0.3)}), {},
+            r"space.rate is Box\(0.1, 0.3\), in the store LogUniform\(0.01, 1\)",
+        ),
+    ):  # fmt: skip
+        with pytest.raises(StoreError, match=f"holds a different sweep: {told}"):
+            sweep(other, **{"configurations": 2, "samples": 8, **how}, store=tmp_path)
+    # More of the same is the same sweep.
+    more = sweep(drifting(), configurations=3, samples=8, store=tmp_path)
+    same_tables(more, sweep(drifting(), configurations=3, samples=8))
+
+
+def test_halving_keeps_the_best_by_return():
+    study = drifting()
+    all_of_them = sweep(study, configurations=7, samples=8).table
+    table = sweep(study, configurations=7, samples=8, halving=Halving(2.0)).table
+    alive = set(range(7))
+    for steps, after in itertools.pairwise((32, 64, 128)):
+        here = all_of_them[all_of_them["steps"] == steps].set_index("configuration")
+        order = sorted(alive, key=lambda n: (-here["nominal_return"][n], n))
+        going = set(order[: -(-len(alive) // 2)])
+        rows = table[table["steps"] == steps].set_index("configuration")
+        assert set(rows.index) == alive
+        assert set(rows.index[rows["status"] == "stopped"]) == alive - going
+        assert set(table.loc[table["steps"] == after, "configuration"]) == going
+        alive = going
+    # The rows that there are, are those of the sweep that stops nobody.
+    merged = table.merge(all_of_them, on=["configuration", "steps"])
+    assert len(merged) == len(table) == 7 + 4 + 2
+    np.testing.assert_array_equal(merged["nominal_return_x"], merged["nominal_return_y"])
+
+
+def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
+    told = []
+
+    tell = CubeAsker.tell
+
+    def record(self, badness):
+        told.extend(badness)
+        return tell(self, badness)
+
+    monkeypatch.setattr(CubeAsker, "tell", record)
+    space = {"rate": vj.Box(0.01, 1.0), "limit": vj.Categorical(0.5, 100.0)}
+    found = sweep(drifting(space), search="mutation", configurations=8, batch=4, samples=64)
+    last = found.table[found.table["steps"] == 128]
+    assert len(told) == len(last) == 8
+    for bad, row in zip(told, last.itertuples(), strict=True):
+        if row.status == "nonfinite":
+            assert bad == WORST
+        else:
+            assert 0 <= bad - row.failure_rate <= 0.11 + 0.2  # Of other samples than the table's.
+    finite = [b for b, s in zip(told, last["status"], strict=True) if s == "trained"]
+    assert len(finite) < 8
+    assert max(finite) < WORST
+
+
+def test_badness_is_failures_first_then_robustness_then_return():
+    ordered = [
+        badness(0.0, 0.5, 9.0, (0.0, 10.0)),
+        badness(0.0, 0.5, 1.0, (0.0, 10.0)),
+        badness(0.0, 0.1, 9.0, (0.0, 10.0)),
+        badness(0.0, -2.0, 9.0, (0.0, 10.0)),
+        badness(0.2, -2.0, 9.0, (0.0, 10.0)),
+        badness(1.0, -1e30, 0.0, (0.0, 10.0)),
+    ]
+    assert ordered == sorted(ordered)
+    assert len(set(ordered)) == 6
+    assert ordered[-1] < WORST
+    assert badness(float("nan"), 0.0, 0.0, (0.0, 1.0)) is None
+
+
+def test_optuna_proposes_and_is_told(tmp_path):
+    pytest.importorskip("optuna")
+    space = {
+        "rate": vj.LogUniform(0.01, 1.0),
+        "noise": vj.TruncatedNormal(0.05, 0.02, 0.0, 0.1),
+        "limit": vj.DiscreteBox(50, 60),
+        "reward_scale": vj.Categorical(1.0, 2.0),
+    }
+    study = drifting(space, snapshots=())
+    how = {"configurations": 14, "batch": 3, "samples": 16}
+    one = sweep(study, search="optuna:tpe", store=tmp_path, **how)
+    assert len(one.table) == 14
+    assert one.table["limit"].isin(range(50, 61)).all()
+    assert set(one.table["reward_scale"]) == {1.0, 2.0}
+    assert one.table["rate"].between(0.01, 1.0).all()
+    assert one.table["noise"].between(0.0, 0.1).all()
+    same_tables(sweep(study, search=OptunaSampler("tpe"), store=tmp_path, **how), one, but=())
+    same_tables(sweep(study, search=OptunaSampler("tpe"), **how), one)
+    with pytest.raises(UnknownNameError, match="unknown sampler of Optuna 'tp'; did you mean"):
+        sweep(study, search="optuna:tp")
+
+
+def test_without_optuna_it_says_how_to_get_it(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'verifai_jax\[optuna\]'"):
+        sweep(drifting(), search="optuna:tpe")
+
+
+def test_out_of_time_is_what_there_is():
+    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1e-6)
+    assert not found.record.complete
+    assert len(found.table) in range(1, 4 * 3)
+
+
+def test_options_are_refused_first(monkeypatch):
+    monkeypatch.setattr(driver, "Lessons", None)
+    for how, error, told in (
+        ({"configurations": 0}, ValueError, "configurations must be a whole number of at least 1"),
+        ({"confidence": 1.0}, ValueError, "confidence must lie between 0 and 1"),
+        ({"max_seconds": 0}, ValueError, "max_seconds must be positive"),
+        ({"search": "halten"}, UnknownNameError, "did you mean 'halton'"),
+        ({"search": "gradient"}, ValueError, "needs gradients, which trainings do not have"),
+        ({"search": 3}, TypeError, "search must be a name, a Search or an OptunaSampler; got 3"),
+        ({"halving": 3}, TypeError, "halving must be a Halving; got 3"),
+        ({"sampels": 3}, UnknownNameError, "did you mean 'samples'"),
+    ):
+        with pytest.raises(error, match=told):
+            sweep(drifting(), **how)
+    with pytest.raises(TypeError, match="sweep needs a Study"):
+        sweep(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(StudyError, match="the study has none before the end at 128 steps"):
+        sweep(drifting(snapshots=()), halving=Halving())
+    with pytest.raises(StudyError, match="take steps out of the space"):
+        sweep(drifting({"steps": vj.Categorical(64, 128)}), halving=Halving())
+    with pytest.raises(ValueError, match="reduction must be greater than 1; got 1"):
+        Halving(1)
+    with pytest.raises(UnknownNameError, match="unknown criterion of halving 'retrun'"):
+        Halving(by="retrun")
