@@ -250,14 +250,16 @@ def test_an_environment_of_brax_is_its_own_rollout_and_can_be_learnt(brax):
     task = brax_task("inverted_pendulum", backend="generalized")
     assert task == brax_task("inverted_pendulum", backend="generalized")
     assert hash(task) == hash(brax_task("inverted_pendulum", backend="generalized"))
+    actions = [jnp.array([np.sin(k)], jnp.float32) for k in range(20)]
     with warnings.catch_warnings():
+        # Of Brax on itself, when a model is loaded and when its step is traced.
         warnings.simplefilter("ignore")
         env = brax.get_environment("inverted_pendulum", backend="generalized")
-    theirs, ours = jax.jit(env.reset)(KEY), jax.jit(task.reset)(KEY)
-    advance, mine = jax.jit(env.step), jax.jit(task.step)
-    for k in range(20):
-        action = jnp.array([np.sin(k)], jnp.float32)
-        theirs = advance(theirs, action)
+        advance, states = jax.jit(env.step), [jax.jit(env.reset)(KEY)]
+        for action in actions:
+            states.append(advance(states[-1], action))
+    mine, ours = jax.jit(task.step), jax.jit(task.reset)(KEY)
+    for action, theirs in zip(actions, states[1:], strict=True):
         ours, reward, over = mine(KEY, ours, action)
         np.testing.assert_allclose(task.observe(ours), theirs.obs, rtol=1e-4, atol=1e-5)
         assert (float(reward), bool(over)) == (float(theirs.reward), bool(theirs.done))
