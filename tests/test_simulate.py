@@ -63,3 +63,14 @@ def test_contract():
 def test_bad_input(problem, make, message):
     with pytest.raises(ValueError, match=message):
         make(problem)
+
+
+def test_only_holds_the_others_where_it_is_told_to():
+    def system(features, key):
+        return vj.Trace({"x": (features["a"] + features["w"])[None]}, dt=1.0)
+
+    space = {"a": vj.Box(0, 1), "w": vj.Box(-1, 1)}
+    problem = vj.Problem("held", space, system, "x <= 9", nominal={"a": 0.5, "w": 0.0})
+    held = problem.only("a", nominal={"w": 0.25})
+    assert held.nominal == {"a": 0.5, "w": 0.25}
+    assert set(vj.falsify(held, "uniform", 4, batch=4).table.all["w"]) == {0.25}

@@ -137,7 +137,8 @@ class Problem:
         **Raises:** `ValueError` for an unknown feature, or one to be fixed without a nominal value.
         """
         fixed = {**(self.nominal or {}), **(nominal or {})}
-        return replace(self, space=self.space.only(*features, nominal=fixed))
+        own = None if self.nominal is None else fixed
+        return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
 
     def check(self) -> None:
         """Trace the system and its monitor abstractly: no simulation, nothing compiles.
