@@ -153,6 +153,7 @@ def test_the_summary_says_what_was_found_and_at_what_price(small):
     assert "0 of 512 simulations fail: between 0 % and 0.72 %" in text
     assert "learning_rate=0.001, discount=0.99, width=16, algorithm=ppo" in text
     assert "cost 2,000 environment steps in 1.5 s of a core, then 512 simulations" in text
+    assert "1 configuration is safe with all seeds; the best is 2: nominal return 50" in text
     assert "1 not finite; 1 error, the first in row 10: clip must be positive" in text
     assert "stopped 1 training before the end" in text
     assert "all intervals hold together at 95 % confidence" in text

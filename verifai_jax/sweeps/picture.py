@@ -167,38 +167,53 @@ def _worth_drawing(sweep: "Sweep") -> list[int]:
     table = sweep.table
     if not len(order := chosen_first(table)):
         return []
-    best = int(table.index[order[0]])
-    last = last_snapshots(table)
-    # The whole curve of the best training says more than that up to its snapshot.
-    same = (last["configuration"] == table.loc[best, "configuration"]) & (
-        last["seed"] == table.loc[best, "seed"]
-    )
-    rows = [int(last.index[same][0]) if same.any() else best]
-    unsafe = last.loc[last["verdict"] == "unsafe"]
+    rows = [int(table.index[order[0]])]
+    others = last_snapshots(table)
+    others = others.loc[~_same_training(others, table.loc[rows[0]])]
+    unsafe = others.loc[others["verdict"] == "unsafe"]
     unsafe = unsafe.loc[unsafe["nominal_return"] >= least_full_return(table)]
     if len(unsafe):
         rows.append(int(unsafe["failure_rate"].idxmax()))  # pyright: ignore[reportArgumentType]
-    return [row for row in dict.fromkeys(rows) if np.isfinite(sweep._points(row)[1]).any()]
+    return [row for row in rows if np.isfinite(sweep._points(row)[1]).any()]
+
+
+def _same_training(table: "pd.DataFrame", row: Any) -> Any:
+    """Which rows are snapshots of the training that a row is of."""
+    return (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
 
 
 def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
-    """The learning curves of some rows over environment steps."""
+    """The learning curves of some rows over environment steps; the whole training of each."""
+    last = last_snapshots(sweep.table)
     for row in rows:
-        entry = sweep.table.loc[row]
+        entry: Any = sweep.table.loc[row]
         verdict = str(entry["verdict"])
         colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
-        trace = sweep.curve(row)
-        clock = np.asarray(trace.clock()) / 1000
+        end = int(last.index[_same_training(last, entry)][0])
+        trace, steps = sweep.curve(end), int(entry["steps"])
+        clock, values = np.asarray(trace.clock()), np.asarray(trace["return"])
         axes.plot(
-            clock,
-            np.asarray(trace["return"]),
+            clock / 1000,
+            values,
             color=colour,
             marker=marker,
             markevery=max(1, len(clock) // 8),
-            markersize=5,
+            markersize=4,
             linewidth=1.5,
             label=f"row {row}, {verdict}: {_failures(entry)}",
         )
+        if end != row:
+            at = min(int(np.searchsorted(clock, steps)), len(clock) - 1)
+            axes.plot(
+                clock[at] / 1000,
+                values[at],
+                color=colour,
+                marker="*",
+                markersize=12,
+                markeredgecolor=BOUND,
+                linestyle="none",
+                label=f"row {row}: snapshot at {steps:,} steps",
+            )
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")
     axes.set_title("How they learnt", fontsize=10)

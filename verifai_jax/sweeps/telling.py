@@ -37,6 +37,8 @@ def summary(sweep: "Sweep") -> str:
         lines.append(f"  policies        {verdict_counts(table)}; each seed and snapshot is one")
     if len(chosen_first(table)):
         lines += _best(sweep)
+    if len(groups) and (groups["seeds"] > 1).any():
+        lines += _every_seed(sweep)
     if lost := _lost(table):
         lines.append(f"  without policy  {lost}")
     if stopped := int((table["status"].astype(str) == "stopped").sum()):
@@ -189,6 +191,23 @@ def _best(sweep: "Sweep") -> list[str]:
         price += f", then {plural(int(best['simulations']), 'simulation')} for the certificate"
     lines.append(f"                  cost {price}")
     return lines
+
+
+def _every_seed(sweep: "Sweep") -> list[str]:
+    """The configurations that are safe whatever the training seed; one row may be luck."""
+    groups: Any = sweep.configurations
+    safe = groups.loc[is_safe(groups)].sort_values(
+        ["nominal_return", "failure_high"], ascending=[False, True], kind="stable"
+    )
+    if not len(safe):
+        return ["  every seed      no configuration is safe with all of its seeds"]
+    best = safe.iloc[0]
+    are = "are" if len(safe) > 1 else "is"
+    return [
+        f"  every seed      {plural(len(safe), 'configuration')} {are} safe with all seeds; the "
+        f"best is {best.name}: nominal return {number(best['nominal_return'])}",
+        f"                  {values_of(sweep, best)}",
+    ]
 
 
 def _lost(table: Any) -> str:
