@@ -119,7 +119,7 @@ def certify(
         budget=budget,
         stopped=stopped,
         seconds=time.perf_counter() - started,
-        notes=tuple(pieces.notes),
+        notes=pieces.notes,
     )
 
 

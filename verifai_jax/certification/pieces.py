@@ -81,7 +81,7 @@ class Pieces:
         devices: Sequence[Any] | None = None,
     ) -> None:
         self.lanes = lanes
-        self.notes: list[str] = []
+        self._notes: list[str] = []
         self.simulated = 0
         self._remember = just_compute if remember is None else remember
         self._simulators: list[tuple[Simulator, dict[int, int]]] = []
@@ -123,6 +123,20 @@ class Pieces:
         self._samples = _Samples(self.space, points_key)
         self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
         self._about = _about(first, seed, lanes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was decided, or went wrong, and would surprise."""
+        notes = list(self._notes)
+        for simulator, places in self._simulators:
+            if isinstance(simulator, Alone):
+                told = simulator.messages
+                notes += [
+                    f"a simulation of policy {number} raised {told[place]}"
+                    for number, place in places.items()
+                    if place in told
+                ]
+        return tuple(notes)
 
     def certificate(
         self, asked: Sequence[tuple[int, int]]
@@ -207,9 +221,9 @@ class Pieces:
         except Exception as error:
             # With the numbers themselves it worked.
             told = str(error).strip().split("\n")[0]
-            self.notes.append(
-                f"policies {_listed(numbers)} were compiled one by one, since JAX could not trace "
-                f"problem_of in their numbers: {type(error).__name__}: {told[:120]}"
+            self._notes.append(
+                f"compiled one by one: {_listed(numbers)}; JAX could not trace problem_of in the "
+                f"policy's numbers ({type(error).__name__}: {told[:120]})"
             )
             return False
         return True
@@ -279,5 +293,5 @@ def _filled(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:8]))
-    return shown + (", ..." if len(numbers) > 8 else "")
+    shown = ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")
+    return f"{'policy' if len(numbers) == 1 else 'policies'} {shown}"

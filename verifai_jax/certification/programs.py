@@ -256,6 +256,7 @@ class Alone:
 
     def __init__(self, problems: Sequence[Problem], lanes: int) -> None:
         self.lanes = lanes
+        self.messages: dict[int, str] = {}  # Of each policy the first that a simulation left.
         self._problems = problems
         self._evaluators: dict[int, Evaluator] = {}
 
@@ -271,6 +272,9 @@ class Alone:
             found = engine.evaluate(u, key, int(number))
             broken = violated(engine, found, u, key, int(number))
             proper = found.status == Status.OK
+            told = next((message for message in found.messages or () if message), None)
+            if told is not None:
+                self.messages.setdefault(member, told)
             least = np.where(proper, np.min(found.rho, axis=1), np.nan).astype(np.float32)
             outcomes.append(Outcome(least, broken & proper, proper))
         return outcomes
