@@ -2,15 +2,17 @@
 
     verifai-jax falsify specs/mountain_car.py:climb
     verifai-jax falsify specs/mountain_car.py:climb_continuous --search cross_entropy
+    verifai-jax sweep specs/mountain_car.py:safe_training --search grid --configurations 6
 
 The car starts anywhere on the left of the valley's slopes, slow or fast, with an engine and a
 gravity that differ from those the controller was made for. A step of the car counts as a second.
 """
 
 import verifai_jax as vj
-from envs.mountain_car import Controller, mountain_car, neural
+from envs.mountain_car import Controller, MountainCarTask, mountain_car, neural
 from envs.mountain_car_drawing import draw
-from verifai_jax.rl import Continuous, Policy
+from verifai_jax.rl import PPO, Continuous, Policy
+from verifai_jax.rl.pqn import PQN
 
 NOMINAL = {"position0": -0.5, "velocity0": 0.0, "gravity": 0.0025, "velocity_bias": 0.0}
 starts = {"position0": vj.Box(-1.0, 0.2), "velocity0": vj.Box(-0.03, 0.03)}
@@ -68,3 +70,41 @@ def climb_with(policy: Policy) -> vj.Problem:
     """
     make = _continuous if isinstance(policy.action, Continuous) else _discrete
     return make(neural(policy))
+
+
+def trained_on(size: float) -> MountainCarTask:
+    """The task that trainings see: other starts, engines and gravities too, and shaped rewards."""
+    return MountainCarTask(potential=size, start_range=0.4, power_range=0.2, gravity_range=0.1)
+
+
+# The paper's study: which algorithm, and how large a training set, gives a network that climbs the
+# hill? The sizes are snapshots of one training, so they cost nothing beside the largest.
+safe_training = vj.Study(
+    "safe_training",
+    vj.FeatureSpace(
+        {
+            "algorithm": vj.Categorical("ppo", "pqn"),
+            "potential": vj.Categorical(1.0, 10.0, 100.0),
+        }
+    ),
+    vj.Trainer(
+        trained_on(10.0),
+        {
+            "ppo": PPO(
+                learning_rate=3e-3,
+                environments=16,
+                hidden=(32, 32),
+                value_hidden=(32, 32),
+                normalise=True,
+                anneal=False,
+            ),
+            "pqn": PQN(hold=10.0, hidden=(32, 32), anneal=False),
+        },
+        steps=131_072,
+    ),
+    climb_with,
+    snapshots=(8_192, 16_384, 32_768, 65_536),
+    seeds=2,
+    p=0.01,
+    description="which algorithm, shaping and training-set size give a policy that climbs the hill",
+)
