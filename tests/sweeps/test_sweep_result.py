@@ -304,6 +304,12 @@ def test_loaded_without_its_study_everything_but_simulations_works(small, tmp_pa
     assert len(loaded.counterexamples(2)) == 1
     with pytest.raises(ValueError, match=r"without its study.*load_sweep\(path, study\)"):
         loaded.problem(2)
+    named = replace(small.record, options={**small.record.options, "target": "specs/toy.py:toy"})
+    loaded = load_sweep(Sweep(named).save(tmp_path))
+    with pytest.raises(ValueError, match=r"give it: load_sweep\(path, 'specs/toy.py:toy'\)"):
+        loaded.problem(2)
+    with pytest.raises(ValueError, match=r"no file specs/toy.py"):
+        load_sweep(tmp_path, "specs/toy.py:toy")
 
 
 def test_folders_that_hold_no_such_sweep(small, tmp_path):

@@ -72,10 +72,11 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     return folder
 
 
-def load_sweep(path: str | Path, study: "Study | None" = None) -> Sweep:
+def load_sweep(path: str | Path, study: "Study | str | None" = None) -> Sweep:
     """Read a sweep back from the folder that `Sweep.save` wrote.
 
-    - `study`: needed for `.problem(i)` and new counterexamples; a file names no code to run.
+    - `study`: or its name, such as `"specs/cartpole.py:safe_training"`; needed for `.problem(i)`
+      and new counterexamples. The file says which it was, and names no code to run.
 
     The certificates are those of the table, and what the policies failed with; the object that
     made them is not saved.
@@ -93,6 +94,10 @@ def load_sweep(path: str | Path, study: "Study | None" = None) -> Sweep:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else None
         raise SweepFileError(f"{folder / RECORD} has format {found!r}; this version reads {FORMAT}")
+    if isinstance(study, str):
+        from verifai_jax.targets import load_study
+
+        study = load_study(study)
     if study is not None:
         _check_same(folder, data, study)
     try:
