@@ -101,6 +101,7 @@ safe_training = vj.Study(
             "pqn": PQN(hold=10.0, hidden=(32, 32), anneal=False),
         },
         steps=131_072,
+        nominal=MountainCarTask(),
     ),
     climb_with,
     snapshots=(8_192, 16_384, 32_768, 65_536),

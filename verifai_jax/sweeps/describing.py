@@ -23,6 +23,7 @@ def describe(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
         "space": {name: _told(domain) for name, domain in study.space.domains.items()},
         "constrained": study.space.where is not None,
         "task": _described(study.trainer.task),
+        "nominal": _described(study.trainer.measured_on),
         "algorithms": {
             name: _described(algorithm) for name, algorithm in study.trainer.by_name.items()
         },

@@ -257,7 +257,7 @@ class _Sweeping:
                 else:
                     self.returns[lesson, rung] = float(work["return"])
         policies = [self._policy(place) for place in missing]
-        task = self.study.trainer.task
+        task = self.study.trainer.measured_on
         for some, values in each_return(task, policies, episodes=self.options["episodes"]):
             work = {}
             for i, value in zip(some, values, strict=True):

@@ -57,14 +57,17 @@ class Trainer:
     - `task`: what to learn, see `rl.Task`. If it is a dataclass its fields may be swept.
     - `algorithms`: an algorithm, or several by name, with the values of what is not swept.
     - `steps`: environment steps of a training, rounded up to whole updates.
+    - `nominal`: the task that nominal returns are measured on, such as the same one without
+      randomisation and shaping; `task` itself when left out.
 
-    **Raises:** `StudyError` for no algorithm, something that is none, or a number of steps that is
-    not positive.
+    **Raises:** `StudyError` for no algorithm, something that is none, a number of steps that is not
+    positive, or a nominal task with other actions or observations.
     """
 
     task: Task
     algorithms: Algorithm | Mapping[str, Algorithm] = field(default_factory=PPO)
     steps: int = 32_768
+    nominal: Task | None = None
 
     def __post_init__(self) -> None:
         given: Any = self.algorithms
@@ -77,16 +80,28 @@ class Trainer:
                 raise StudyError(
                     f"algorithm {name!r} must be an algorithm such as PPO(); got {algorithm!r}"
                 )
-        if not isinstance(self.task, Task):
-            lacks = [n for n in _TASK if not hasattr(self.task, n)]
+        for name, task in (("task", self.task), ("nominal", self.measured_on)):
+            if not isinstance(task, Task):
+                lacks = [n for n in _TASK if not hasattr(task, n)]
+                raise StudyError(
+                    f"{name} must have {', '.join(_TASK)}; {type(task).__name__} lacks "
+                    f"{', '.join(lacks)}"
+                )
+        forms = [(task.action, _observed(task)) for task in (self.task, self.measured_on)]
+        if forms[0] != forms[1]:
             raise StudyError(
-                f"task must have {', '.join(_TASK)}; {type(self.task).__name__} lacks "
-                f"{', '.join(lacks)}"
+                f"nominal must have the actions and observations of task, {forms[0]}; "
+                f"got {forms[1]}"
             )
         object.__setattr__(self, "algorithms", dict(given))
         object.__setattr__(self, "steps", _whole(self.steps, STEPS))
         if self.steps < 1:
             raise StudyError(f"steps must be at least 1; got {self.steps}")
+
+    @property
+    def measured_on(self) -> Task:
+        """The task that nominal returns are measured on."""
+        return self.task if self.nominal is None else self.nominal
 
     @property
     def by_name(self) -> dict[str, Algorithm]:
@@ -234,6 +249,14 @@ class Trainer:
             except (ValueError, TypeError) as error:
                 last = error
         raise StudyError(f"algorithm {algorithm!r}: {last}")
+
+
+def _observed(task: Task) -> tuple[int, ...]:
+    """The shape of what a policy sees."""
+    form = jax.eval_shape(
+        lambda key: task.observe(task.reset(key)), jax.eval_shape(lambda: jax.random.key(0))
+    )
+    return form.shape
 
 
 _TASK = ("action", "time_limit", "reset", "step", "observe")
