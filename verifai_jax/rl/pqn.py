@@ -56,7 +56,7 @@ class PQN:
 
     actions: ClassVar[tuple[type, ...]] = (Discrete,)
 
-    learning_rate: Number = 1e-3
+    learning_rate: Number = 2e-3
     discount: Number = 0.99
     q_lambda: Number = 0.9
     epsilon_start: Number = 1.0

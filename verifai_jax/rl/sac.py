@@ -50,7 +50,8 @@ class SAC:
     - `correlation`: of the noise between one step and the next, in `[0, 1)`; 0 is white noise.
       0.9 and more reach what single random steps never do (the hill of mountain car).
     - `warmup`: environment steps before any learning.
-    - `reward_scale`: rewards are multiplied by it.
+    - `reward_scale`: rewards are multiplied by it; values of a few units are learnt best, and the
+      first temperature is one for these.
     - `environments`, `horizon`: steps of experience in an update, wide and long.
     - `learnings`: steps of learning after each step of all environments, from `batch` transitions.
     - `capacity`: transitions that are remembered, a multiple of `environments`.
@@ -68,7 +69,7 @@ class SAC:
     target_entropy: Number = -1.0
     correlation: Number = 0.0
     warmup: int | Int[Array, ""] = 1_000
-    reward_scale: Number = 1.0
+    reward_scale: Number = 0.1
     environments: int = shape(8)
     horizon: int = shape(32)
     learnings: int = shape(1)
