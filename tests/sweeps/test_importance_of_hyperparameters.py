@@ -7,6 +7,7 @@ from sklearn.ensemble import ExtraTreesRegressor
 
 import verifai_jax as vj
 from verifai_jax.sweeps.importance import hyperparameter_importance
+from verifai_jax.sweeps.trends import trends
 from verifai_jax.sweeps.variance import Boxes, boxes_of, variance_shares
 
 SPACE = vj.FeatureSpace(
@@ -104,8 +105,39 @@ def test_noise_is_not_explained():
     table = made(40, lambda u, steps: noise.random(), lambda u, steps: 500.0)
     found = hyperparameter_importance(table, list(SPACE.domains), SPACE)
     assert not found.trusted("failure_rate")
-    assert "what matters cannot be told from 40 configurations" in str(found)
+    assert "failing: a model of these 40 configurations does not predict others" in str(found)
+    assert "alone none goes with it more than by chance" in str(found)
     assert "return: it is 500 for every policy" in str(found)
+
+
+def test_a_trend_shows_where_no_model_can_be_learned():
+    noise = np.random.default_rng(1)
+    table = made(30, lambda u, steps: 0.6 * u[1] + noise.random(), lambda u, steps: -u[0])
+    found = hyperparameter_importance(table, list(SPACE.domains), SPACE, repeats=2)
+    assert found.scores["failure_rate"] < 0.4
+    found.scores["failure_rate"] = 0.0
+    assert found.table.loc["discount", "failure_rate_trend"] > found.chance["failure_rate"]
+    assert "where beyond chance: discount (+0." in str(found)
+    assert found.table.loc["learning_rate", "nominal_return_trend"] == pytest.approx(-1.0)
+    assert np.isnan(found.table.loc["algorithm", "nominal_return_trend"])
+
+
+def test_trends_are_those_of_scipy_and_chance_is_rarely_beaten():
+    from scipy.stats import spearmanr
+
+    rng = np.random.default_rng(0)
+    x, y = rng.integers(0, 5, (40, 3)).astype(float), rng.integers(0, 9, 40).astype(float)
+    found = trends(x, y, np.arange(40))
+    assert found.correlation == pytest.approx([spearmanr(c, y).statistic for c in x.T])
+    # Rows of a group count once.
+    again = trends(np.repeat(x, 2, 0), np.repeat(y, 2), np.repeat(np.arange(40), 2))
+    assert again.correlation == pytest.approx(found.correlation)
+    assert np.isnan(trends(np.ones((9, 1)), y[:9], np.arange(9)).correlation).all()
+    beaten = []
+    for _ in range(100):
+        unrelated = trends(rng.random((20, 5)), rng.random(20), np.arange(20))
+        beaten.append(np.abs(unrelated.correlation).max() > unrelated.chance)
+    assert np.sum(beaten) <= 11  # 5 are expected; more than 11 come in 1 of 200.
 
 
 def test_too_few_configurations_are_admitted():

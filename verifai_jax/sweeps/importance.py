@@ -25,6 +25,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.analysis.pca import Components, pca
 from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.sweeps.trends import trends
 from verifai_jax.sweeps.variance import boxes_of, variance_shares
 
 if TYPE_CHECKING:
@@ -54,14 +55,16 @@ class HyperparameterImportance:
     `failure_rate` and `nominal_return`: the loss in R^2, on configurations that the model has not
     seen, when the column is shuffled, with `_low` and `_high` two standard deviations of the
     repetitions away; `_first` and `_total`, shares of the model's variance that it explains alone
-    and with all its interactions. NaN where there is no model. `scores`: R^2 of the models;
-    `missing`: why there is no model; `unsafe` and `safe`: principal components of these
-    configurations, None where there are fewer than five; `configurations`: how many there are;
-    `name` of the study.
+    and with all its interactions; `_trend`, its rank correlation by itself (NaN for choices). NaN
+    where there is no model. `scores`: R^2 of the models; `chance`: what the greatest trend of
+    unrelated ones stays below, 95 %; `missing`: why there is no model; `unsafe` and `safe`:
+    principal components of these configurations, None where there are fewer than five;
+    `configurations`: how many there are; `name` of the study.
     """
 
     table: "pd.DataFrame"
     scores: Mapping[str, float]
+    chance: Mapping[str, float]
     missing: Mapping[str, str]
     unsafe: Components | None
     safe: Components | None
@@ -78,14 +81,18 @@ class HyperparameterImportance:
         return [str(name) for name in self.table.index]
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the losses as bars; returns the figure. **Raises:** `ValueError` without a model."""
+        """Draw the shares of the variance, or the trends where no model can be trusted.
+
+        **Raises:** `ValueError` with too few configurations.
+        """
         from verifai_jax.report.style import new_figure, show_or_save
-        from verifai_jax.sweeps.picture import draw_importance
+        from verifai_jax.sweeps.picture import draw_importance, draw_trends
 
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
         figure = new_figure(figsize=(6.4, 1.6 + 0.42 * len(self.table)))
-        draw_importance(figure.subplots(), self)
+        draw = draw_importance if any(map(self.trusted, self.scores)) else draw_trends
+        draw(figure.subplots(), self)
         return show_or_save(figure, path)
 
     def __repr__(self) -> str:
@@ -103,8 +110,8 @@ class HyperparameterImportance:
             score = f"R^2 {self.scores[target]:.2f} on configurations kept aside"
             if not self.trusted(target):
                 lines.append(
-                    f"{what}: what matters cannot be told from {self.configurations} "
-                    f"configurations, a model of some does not predict the others ({score})"
+                    f"{what}: a model of these {self.configurations} configurations does not "
+                    f"predict others ({score}); {self._trends(target)}"
                 )
                 continue
             losses = self.table[target].to_numpy(float)
@@ -115,6 +122,22 @@ class HyperparameterImportance:
                 for j in order[:MOST_NAMED]
             )
             lines.append(f"{what} depends on {listed or 'no single one'}; {score}")
+        lines += self._directions()
+        return lines
+
+    def _trends(self, target: str) -> str:
+        """Which go with the target by themselves, beyond chance."""
+        trends = self.table[f"{target}_trend"].dropna()
+        trends = trends.loc[trends.abs() > self.chance[target]]
+        if not len(trends):
+            return "alone none goes with it more than by chance"
+        order = trends.abs().sort_values(ascending=False).index[:MOST_NAMED]
+        listed = ", ".join(f"{name} ({trends[name]:+.2f})" for name in order)
+        return f"its rank correlation with each alone, where beyond chance: {listed}"
+
+    def _directions(self) -> list[str]:
+        """Along what the unsafe and the safe configurations vary most."""
+        lines = []
         for what, components in (("unsafe", self.unsafe), ("safe", self.safe)):
             if components is not None and len(components.directions):
                 direction, names = components.directions[0], components.names
@@ -166,6 +189,7 @@ def hyperparameter_importance(
     groups = table["configuration"].to_numpy()
     columns: dict[str, Any] = {}
     scores: dict[str, float] = {}
+    chance: dict[str, float] = {}
     missing: dict[str, str] = {}
     for target in TARGETS:
         values = table[target].to_numpy(np.float64)
@@ -179,6 +203,10 @@ def hyperparameter_importance(
         forest = _forest(matrix.shape[1], seed).fit(matrix, values[usable])
         shares = variance_shares(boxes_of(forest, [one.edges for one in inputs]))
         scores[target] = score
+        trend = trends(matrix, values[usable], groups[usable], seed)
+        chance[target] = trend.chance
+        ordered = np.array([one.ordered for one in inputs])
+        columns[f"{target}_trend"] = np.where(ordered, trend.correlation, np.nan)
         columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
         columns |= {f"{target}_first": shares.first, f"{target}_total": shares.total}
     found = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
@@ -187,7 +215,7 @@ def hyperparameter_importance(
         found = found.sort_values(by, ascending=False, kind="stable")
     unsafe, safe = (_components(table, inputs, kind) for kind in ("counterexamples", "safe"))
     return HyperparameterImportance(
-        found, scores, missing, unsafe, safe, len(np.unique(groups)), name
+        found, scores, chance, missing, unsafe, safe, len(np.unique(groups)), name
     )
 
 

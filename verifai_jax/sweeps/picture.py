@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 LOOKS = {"safe": (SAFE, "o"), "undecided": (WITHOUT_VERDICT, "D"), "unsafe": (FAILING, "X")}
 """Colour and marker of each verdict."""
 RETURN = "#31688e"
+BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
+"""Colour, name and hatching of what depends on hyper-parameters."""
 MOST_BARS = 8
 
 
@@ -34,7 +36,7 @@ def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
     """Draw the three panels; the second and third only where there is something to show."""
     curves = _worth_drawing(sweep)
     importance = sweep.importance()
-    bars = any(importance.trusted(target) for target in importance.scores)
+    bars = bool(importance.scores)
     widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
     figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
     panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
@@ -42,7 +44,8 @@ def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
     if curves:
         draw_curves(panels.pop(0), sweep, curves)
     if bars:
-        draw_importance(panels.pop(0), importance)
+        trusted = any(importance.trusted(target) for target in importance.scores)
+        (draw_importance if trusted else draw_trends)(panels.pop(0), importance)
     title = f"{shortened(sweep.name, 40)}: {lead(sweep)}"
     if len(title) > 10 * figure.get_figwidth():
         title = title.replace("; ", "\n", 1)
@@ -59,7 +62,7 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
         axes.set_axis_off()
         return
     crowded = len(table) > 60
-    least = _least_shown(table)
+    least = _least_shown(table, sweep.p)
     shown = _spread(table, least)
     final = shown.index.isin(last_snapshots(sweep.table).index)
     for verdict, (colour, marker) in LOOKS.items():
@@ -93,7 +96,7 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
         label=f"Pareto front ({len(front)})",
         zorder=4,
     )
-    # Linear up to the least rate that can be told from none, logarithmic from there on.
+    # Linear up to the least rate, so that none at all has a place; logarithmic from there on.
     axes.set_yscale("symlog", linthresh=least, linscale=0.6)
     axes.set_ylim(-0.25 * least, 1.6)
     ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
@@ -136,11 +139,11 @@ def _legend_below(axes: Any, columns: int) -> None:
     )
 
 
-def _least_shown(table: "pd.DataFrame") -> float:
-    """The power of ten below which the axis is linear: a single failure lies above it."""
-    counts = table["simulations"].to_numpy(np.float64)
-    most = float(np.nanmax(np.where(counts > 0, counts, np.nan))) if (counts > 0).any() else 1000.0
-    return float(10.0 ** np.floor(np.log10(1 / most)))
+def _least_shown(table: "pd.DataFrame", wanted: float | None) -> float:
+    """The power of ten below which the axis is linear: the least rate of any lies above it."""
+    rates = table["failure_rate"].to_numpy(np.float64)
+    least = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
+    return float(10.0 ** np.floor(np.log10(least)))
 
 
 def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
@@ -231,10 +234,9 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
     """The share of the variance of failing and of the return that each hyper-parameter explains."""
     targets = [target for target in found.scores if found.trusted(target)] or list(found.scores)
     shown = found.table.head(MOST_BARS)
-    looks = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
     height, place = 0.76 / len(targets), np.arange(len(shown))
     for k, target in enumerate(targets):
-        colour, what, hatch = looks[target]
+        colour, what, hatch = BARS[target]
         at = place + (k - (len(targets) - 1) / 2) * height
         axes.barh(
             at,
@@ -264,3 +266,35 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
     tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 1)
+
+
+def draw_trends(axes: Any, found: HyperparameterImportance) -> None:
+    """Rank correlations of single hyper-parameters, and how great they get by chance."""
+    names = [f"{target}_trend" for target in found.scores]
+    shown = found.table.loc[found.table[names].notna().any(axis=1)]
+    order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
+    shown = shown.loc[order[:MOST_BARS]]
+    height, place = 0.76 / len(names), np.arange(len(shown))
+    chance = max(found.chance.values())
+    axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
+    for k, target in enumerate(found.scores):
+        colour, what, hatch = BARS[target]
+        axes.barh(
+            place + (k - (len(names) - 1) / 2) * height,
+            shown[f"{target}_trend"].to_numpy(float),
+            height * 0.9,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0,
+            label=what,
+        )
+    axes.axvline(0, color=BOUND, linewidth=0.8)
+    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.invert_yaxis()
+    axes.set_xlim(-1, 1)
+    axes.set_xlabel("rank correlation with each alone")
+    axes.set_title("What goes along (no model predicts)", fontsize=10)
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+    _legend_below(axes, 3)

@@ -108,7 +108,7 @@ def load_sweep(path: str | Path, study: "Study | str | None" = None) -> Sweep:
         raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
     except (KeyError, TypeError, ValueError, OSError) as error:
         raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
-    used = {name: tuple(has) for name, has in data["used"].items()}
+    used = {name: tuple(has) for name, has in data.get("used", {}).items()}
     return Sweep(record, study, None if study is not None else space, folder, failing, used)
 
 
@@ -133,7 +133,7 @@ def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
             f"the sweep in {folder} is damaged: {len(frame)} rows in {TABLE}, "
             f"{data['rows']} in {RECORD}"
         )
-    for name in data["mixed"]:
+    for name in data.get("mixed", ()):
         frame[name] = pd.Series([json.loads(v) for v in frame[name]], frame.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
     with np.load(folder / CURVES, allow_pickle=False) as arrays:
