@@ -60,7 +60,6 @@ def sweep(
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify what they learn."""
     from verifai_jax.sweeps.driver import sweep as run_sweep
-    from verifai_jax.sweeps.store import Store
     from verifai_jax.targets import load_study
 
     if resume is not None:
@@ -85,8 +84,7 @@ def sweep(
     folder = out or _next_folder(study.name)
     how = _understood(asked, options)
     memory = folder if store is None else store
-    # What a later --resume needs to know; before anything else, since this may be killed.
-    study.check()
+    # What a later --resume needs to know.
     note = {
         "target": target,
         "configurations": configurations,
@@ -94,11 +92,13 @@ def sweep(
         "options": list(options),
         "nominal": list(nominal),
     }
-    with Store(memory) as kept:
-        if kept.note("command") is None or resume is not None:
-            kept.note("command", note)
     found = run_sweep(
-        study, configurations=configurations, store=memory, max_seconds=max_seconds, **how
+        study,
+        configurations=configurations,
+        store=memory,
+        max_seconds=max_seconds,
+        note=note,
+        **how,
     )
     record = replace(found.record, options={**found.record.options, "target": target})
     found = replace(found, record=record)

@@ -8,7 +8,7 @@ to a snapshot, the return of a policy, a part of a certification. Killed at any 
 again with the same store, it finds what was finished, computes the rest, and gives the same table.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ def sweep(
     store: str | Path | None = None,
     max_seconds: float | None = None,
     progress: bool | None = True,
+    note: Mapping[str, Any] | None = None,
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify the policies they learn.
 
@@ -80,6 +81,7 @@ def sweep(
       sweep it goes on.
     - `max_seconds`: after two thirds of which no training begins, and after which nothing does.
     - `progress`: False draws no bars.
+    - `note`: plain data that the store keeps beside the work.
 
     **Raises:** before anything trains, what `Study.check` does; `ValueError` for options out of
     range and for a search that needs gradients; `UnknownNameError` for an unknown search or option;
@@ -104,6 +106,8 @@ def sweep(
         options |= {"configurations": configurations, "batch": asker.batch}
     with Store(store) as memory, Watch(study.name, max_seconds, progress) as watch:
         memory.belongs(describe(study, options))
+        if note is not None:
+            memory.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         sweeping = _Sweeping(study, options, memory, watch, halving, attacker)
