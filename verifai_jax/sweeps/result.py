@@ -18,10 +18,11 @@ import numpy as np
 from verifai_jax.errors import suggests_options
 from verifai_jax.falsify import falsify
 from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import Formula
 from verifai_jax.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.curves import curve_trace
+from verifai_jax.sweeps.curves import check_curve, curve_trace, judge_curve
 from verifai_jax.sweeps.importance import HyperparameterImportance, hyperparameter_importance
 from verifai_jax.sweeps.ranking import by_configuration, chosen_first, is_safe, pareto_fronts
 from verifai_jax.sweeps.record import SweepRecord
@@ -252,6 +253,17 @@ class Sweep:
         **Raises:** `IndexError` as `policy`; `ValueError` where no episode ended.
         """
         return curve_trace(*self._points(self._row(i)))
+
+    def judge_curves(self, formula: Formula | str) -> "pd.Series":
+        """Robustness of a formula on the learning curve up to each row; see `judge_curve`.
+
+        **Raises:** as `judge_curve`.
+        """
+        import pandas as pd
+
+        formula = check_curve(formula)
+        judged = {i: judge_curve(formula, *self._points(i)) for i in self.table.index}
+        return pd.Series(judged, name=str(formula), dtype=float)
 
     def _points(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Steps and returns of the updates behind a row; empty where it never trained."""
