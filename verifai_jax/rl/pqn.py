@@ -110,7 +110,7 @@ class PQN:
             moments=_optimizer(self).init(layers),
             seen=Seen.nothing(size),
             episodes=episodes,
-            held=jnp.full(self.environments, -1),
+            held=jnp.full(self.environments, -1, jnp.int32),
             key=key,
             done=jnp.int32(0),
             updates=jnp.int32(updates),
