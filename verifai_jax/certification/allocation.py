@@ -84,7 +84,8 @@ class Allocation:
       leaves: among near ties its posterior chance is a little too high.
     - `samples`: of each policy at least; `block`: of one policy in one piece.
     - `budget`: samples of all policies together, at most.
-    - `tie`: rates that differ by less count as equal; `p / 10` when left out.
+    - `tie`: rates that differ by less count as equal. A leader without a failure is settled in
+      about `2.5 / tie` samples.
     - `verdicts`, `safest`: what is to be decided.
     """
 
@@ -93,7 +94,7 @@ class Allocation:
     samples: int = 512
     budget: int = 65_536
     block: int = 64
-    tie: float | None = None
+    tie: float = 0.001
     verdicts: bool = True
     safest: bool = True
 
@@ -101,11 +102,6 @@ class Allocation:
     def sure(self) -> float:
         """The chance at which the safest is named."""
         return (1 + self.confidence) / 2
-
-    @property
-    def tolerance(self) -> float:
-        """Rates that differ by less count as equal."""
-        return self.p / 10 if self.tie is None else self.tie
 
     def next(
         self,
@@ -150,7 +146,7 @@ class Allocation:
     ) -> Int[np.ndarray, " n"]:
         """Blocks of the leader and of its likeliest rivals."""
         blocks = np.zeros(len(n), np.int64)
-        now = standing(k, n, self.tolerance, margins)
+        now = standing(k, n, self.tie, margins)
         if now.chance >= self.sure:
             return blocks
         rivals = np.flatnonzero(now.rivals >= 0.5 * now.rivals.max())

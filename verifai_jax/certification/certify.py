@@ -24,6 +24,8 @@ from verifai_jax.search import Search
 
 LANES = 64
 """Samples of a policy in one block."""
+SETTLED = 3.0
+"""Over `tie`: about as many samples as name a leader that never fails."""
 MOST_KEPT = 1000
 """Counterexamples of a policy that are kept, the worst ones."""
 ROWS = 256
@@ -66,7 +68,8 @@ def certify(
       is beyond the least goes to policies whose verdict is open, and to the possibly safest.
     - `search`, `attack`: what looks for failures first, and in how many simulations of each
       policy, rounded up to blocks; 0 for no attack. What it finds is in no rate.
-    - `tie`: failure rates that differ by less count as equally safe; `p / 10` when left out.
+    - `tie`: failure rates that differ by less count as equally safe. When left out, `p / 10` or
+      less: as fine as takes about as many samples again as all policies have at least.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
       gives, or gave under this key.
     - `progress(done, total, text)`: called with the simulations so far. `total` may not be reached.
@@ -89,6 +92,8 @@ def certify(
     pieces.space.check_where()
     attacker = usable_search(pieces.problem, search)
     rounds = -(-attack // lanes)
+    if tie is None:
+        tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
     sampled = [Seen() for _ in policies]
     attacked = [Seen() for _ in policies]
@@ -105,7 +110,7 @@ def certify(
         for number in range(len(policies))
     )
     known = all(row.simulations for row in rows)
-    now = standing(*_counts(sampled), allocation.tolerance, margins) if known else None
+    now = standing(*_counts(sampled), tie, margins) if known else None
     return Certificates(
         rows=rows,
         problem=pieces.problem.name,
@@ -113,7 +118,7 @@ def certify(
         confidence=confidence,
         safest=None if now is None else now.leader,
         chance=None if now is None else now.chance,
-        tie=allocation.tolerance,
+        tie=tie,
         seed=seed,
         samples=samples,
         budget=budget,
