@@ -100,6 +100,15 @@ def test_snapshots_count_as_training_set_size():
     assert found.table.loc["steps", "failure_rate_total"] > 0.9
 
 
+def test_lengths_of_trainings_may_be_swept_with_snapshots_before_their_ends():
+    space = vj.FeatureSpace({**SPACE.domains, "steps": vj.Categorical(2000, 4000)})
+    table = made(
+        12, lambda u, steps: u[0], lambda u, steps: steps / 10, snapshots=(1000, 2000, 4000)
+    )
+    found = hyperparameter_importance(table, list(space.domains), space, repeats=2)
+    assert found.table["nominal_return"].idxmax() == "steps"
+
+
 def test_noise_is_not_explained():
     noise = np.random.default_rng(5)
     table = made(40, lambda u, steps: noise.random(), lambda u, steps: 500.0)

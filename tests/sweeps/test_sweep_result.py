@@ -89,6 +89,22 @@ def test_without_any_certificate_there_is_no_best():
     sweep.plot()
 
 
+def test_a_sweep_that_was_stopped_at_once_is_empty(tmp_path):
+    columns = {name: np.array(column)[:0] for name, column in record_of(ROWS).columns.items()}
+    record = replace(
+        record_of(ROWS), columns=columns, policies=(), worst=(), curves={}, certified=()
+    )
+    sweep = Sweep(replace(record, complete=False), ToyStudy())
+    assert sweep.summary().startswith("toy: no configuration was trained\n  NOT FINISHED")
+    assert sweep.configurations.empty
+    assert sweep.safe.empty
+    assert sweep.pareto().empty
+    assert "no hyper-parameter varies" in str(sweep.importance())
+    assert sweep._repr_html_()
+    sweep.plot()
+    assert load_sweep(sweep.save(tmp_path)).summary() == sweep.summary()
+
+
 def test_configurations_are_the_worst_of_their_seeds(small):
     groups = small.configurations
     assert list(groups["verdict"]) == ["undecided", "unsafe", "safe@0.01", "unsafe", ""]

@@ -289,7 +289,8 @@ def _inputs(
         if entries.nunique(dropna=True) < 2:
             continue
         number = pd.api.types.is_numeric_dtype(entries) and not pd.api.types.is_bool_dtype(entries)
-        domain = domains.get(name)
+        # Snapshots need not lie in the domain of the lengths of trainings.
+        domain = None if name == "steps" else domains.get(name)
         if domain is not None and domain.size == 1 and not isinstance(domain, Constant):
             present = entries.dropna().unique().tolist()
             place = {
@@ -305,7 +306,7 @@ def _inputs(
             real = entries.to_numpy(np.float64)
             values, edges = (real - np.nanmin(real)) / np.ptp(real[~np.isnan(real)]), None
         else:
-            # Snapshots, and columns of which nothing is known: by their order.
+            # Lengths of trainings, and columns of which nothing is known: by their order.
             codes, kinds = pd.factorize(entries, sort=True)
             values = np.where(codes < 0, np.nan, (codes + 0.5) / len(kinds))
             edges = np.linspace(0, 1, len(kinds) + 1)
