@@ -78,8 +78,9 @@ def told(name, rates, runs, draw_of=bernoulli, tie=0.001):
     uniform = uniform_need(rates) * len(rates)
     right, near, cost = races(rates, runs, draw_of, tie)
     print(
-        f"{name:20s} tie {tie:g}  uniform {uniform:9,d}  race {cost.mean():8,.0f} (at most {cost.max():,})  "
-        f"share {cost.mean() / uniform:.3f}  safest named {right:.3f}, up to the tie {near:.3f}",
+        f"{name:20s} tie {tie:g}  uniform {uniform:9,d}  race {cost.mean():8,.0f} "
+        f"(at most {cost.max():,})  share {cost.mean() / uniform:.3f}  "
+        f"safest named {right:.3f}, up to the tie {near:.3f}",
         flush=True,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.certification import certify
+from verifai_jax.certification import certify, programs
 from verifai_jax.certification.families import digest, families, padded
 from verifai_jax.certification.pieces import Pieces
 from verifai_jax.errors import UnknownNameError
@@ -119,6 +119,19 @@ def test_order_company_and_devices_change_nothing(certificates):
     table = other.table().assign(policy=order).sort_values("policy").reset_index(drop=True)
     assert table.equals(certificates.table())
     assert order[other.safest] == certificates.safest
+
+
+def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
+    monkeypatch.setattr(programs, "_one_by_one", lambda devices: False)
+    monkeypatch.setattr(programs, "MOST_BLOCKS", 4)
+    other = certify(
+        lambda policy: problem_of(policy), POLICIES, p=0.1, samples=128, seed=3, attack=0
+    )  # fmt: skip
+    columns = ["failures", "not_finite"]
+    first = other.table()[columns][other.table()["simulations"] == 128]
+    expected = certificates.table()[columns].loc[first.index]
+    assert len(first) >= 2
+    assert first.equals(expected)
 
 
 def test_policies_of_one_structure_share_a_program():

@@ -4,9 +4,10 @@
     simulator([0, 0, 1], points, first)         # three blocks: policies 0, 0, 1 of the family
 
 A block is one policy in some tens of samples, side by side, so that its weights are shared by one
-matrix product. Blocks are worked through one after another, spread over the devices, in a program
-that is compiled once for a structure: how many there are is an argument. What a block gives depends
-on its policy and samples alone, bit for bit, not on the other blocks or the number of devices.
+matrix product. Blocks are worked through one after another (on an accelerator all at once), spread
+over the devices, in a program that is compiled once for a structure: how many there are is an
+argument. What a block gives depends on its policy and samples alone, bit for bit on one machine,
+not on the other blocks or the number of devices.
 """
 
 import time
@@ -156,6 +157,8 @@ class _Program:
 
     def together(self) -> int:
         """Blocks in a call that lasts about `SLICE_SECONDS`; few at first."""
+        if not _one_by_one(self.devices):
+            return self.capacity * len(self.devices)
         if self._seconds is None:
             return len(self.devices)
         each = max(1, min(self.capacity, int(SLICE_SECONDS / max(self._seconds, 1e-9))))
@@ -219,6 +222,8 @@ class _Program:
                 keys = jax.vmap(partial(simulation_key, key))(numbers)
                 return jax.vmap(row(problem_with(self.problem_of, policy)))(u[i], keys)
 
+            if not _one_by_one(self.devices):
+                return jax.vmap(block)(jnp.arange(self.capacity))
             form = jax.eval_shape(block, jnp.int32(0))
             results = jax.tree.map(
                 lambda leaf: jnp.zeros((self.capacity, *leaf.shape), leaf.dtype), form
@@ -240,6 +245,11 @@ class _Program:
             # A user's scan need not say that its carry differs between devices.
             check_vma=False,
         )
+
+
+def _one_by_one(devices: Sequence[Any]) -> bool:
+    """Whether a block keeps a device busy. An accelerator works on all blocks of a call at once."""
+    return devices[0].platform == "cpu"
 
 
 def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
