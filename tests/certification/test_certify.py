@@ -273,10 +273,10 @@ def test_it_reads_well(certificates):
     text = str(certificates)
     assert text.startswith(
         "certificates of 5 policies for threshold: 3 safe@0.1, 2 unsafe, 0 undecided "
-        "(95 % that all are right)\n  safest: policy 0, "
+        "(all are right with 95 %)\n  safest: policy 0, "
     )
     assert "the same number for every policy would be" in text
-    assert str(certificates[4]).startswith("policy 4: unsafe, 128 of 128 fail: 100 %")
+    assert str(certificates[4]).startswith("policy 4: unsafe, 128 of 128 fail, between 9")
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,9 @@ class Certificate:
         if self.rate is None:
             text = "no sample yet"
         else:
-            text = f"{self.failures + self.not_finite} of {self.simulations} fail: {self.rate}"
+            failing = self.failures + self.not_finite
+            low, high = _percent(self.rate.low), _percent(self.rate.high)
+            text = f"{failing} of {self.simulations} fail, between {low} and {high}"
         if self.not_finite:
             text += f"; {self.not_finite} of them gave no verdict"
         if np.isfinite(self.worst_robustness):
@@ -152,12 +154,12 @@ class Certificates:
         lines = [
             f"certificates of {len(self.rows)} policies for {self.problem}: {len(self.safe)} "
             f"{safe_at(self.p)}, {len(self.unsafe)} unsafe, {open_} undecided "
-            f"({self.confidence * 100:g} % that all are right)"
+            f"(all are right with {self.confidence * 100:g} %)"
         ]
         if self.safest is not None and self.chance is not None:
             lines.append(
                 f"  safest: policy {self.safest}, {self._chance(self.chance)} that none is better "
-                f"by more than {self.tie:g}"
+                f"by more than {self.tie:.2g}"
             )
         # The safe ones first, then the least failing.
         order = sorted(self.rows, key=lambda row: (_rank(row, self.p), row.number))
@@ -180,6 +182,11 @@ class Certificates:
     @staticmethod
     def _chance(chance: float) -> str:
         return "almost certain" if chance > 0.9995 else f"chance {100 * chance:.1f} %"
+
+
+def _percent(rate: float) -> str:
+    percent = 100 * rate
+    return f"{percent:.1f} %" if percent == 0 or percent >= 10 else f"{percent:.2g} %"
 
 
 def _rank(row: Certificate, p: float) -> float:
