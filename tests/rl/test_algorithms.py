@@ -1,12 +1,17 @@
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from benchmarks.control_tasks import Acrobot, Pendulum
 from verifai_jax.errors import UnknownNameError
-from verifai_jax.rl import PPO, Continuous, Discrete
+from verifai_jax.rl import PPO, Configuration, Continuous, Discrete, Trainings, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.algorithms import ALGORITHMS, algorithm_named, fitting
 from verifai_jax.rl.pqn import PQN
+from verifai_jax.rl.sac import SAC
 
 
 def test_algorithms_by_name():
@@ -53,3 +58,56 @@ def test_a_policy_acts_on_what_the_task_shows(name):
 
     action = jax.eval_shape(acts, jax.eval_shape(lambda: jax.random.key(0)))
     assert action.shape == ((1,) if name == "sac" else ())
+
+
+SMALL = {
+    "ppo": PPO(hidden=(8,), value_hidden=(8,), environments=4, horizon=32),
+    "pqn": PQN(hidden=(8,), environments=4),
+    "sac": SAC(
+        hidden=(8,), value_hidden=(8,), environments=4, capacity=4_000, warmup=200, batch=32
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_in_a_group_and_under_vmap_as_alone(name):
+    task, steps = Pendulum() if name == "sac" else Acrobot(), 1_024
+    group = [
+        Configuration(task, replace(SMALL[name], learning_rate=rate), steps, seed=3)
+        for rate in (1e-3, 3e-3, 1e-2)
+    ]
+
+    def trained(configurations, **options):
+        one = jax.local_devices()[:1]
+        trainings = Trainings(configurations, devices=one, **options)
+        for steps_so_far in (256, steps):
+            list(trainings.advance(dict.fromkeys(range(len(configurations)), steps_so_far)))
+        return [jax.tree.leaves(trainings.policy(n)) for n in range(len(configurations))]
+
+    policies = trained(group)
+    for ours, alone in zip(policies[1], trained(group[1:2])[0], strict=True):
+        np.testing.assert_array_equal(ours, alone)
+    for one, other in zip(policies, trained(group, together=3), strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-3)
+    assert np.any(policies[0][0] != policies[1][0])
+
+
+class Broken(Pendulum):
+    """Its rewards are no numbers where the pendulum is fast."""
+
+    def step(self, key, state, action):
+        state, reward, over = super().step(key, state, action)
+        return state, jnp.where(jnp.abs(state.rate) > 4, jnp.nan, reward), over
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", fitting(Pendulum().action))
+def test_what_is_no_number_is_told_and_stops_nothing(name):
+    trained = train(Broken(), SMALL[name], steps=4_096)
+    assert len(trained.mean_return) == len(trained.steps)
+    assert np.isnan(trained.mean_return).any()
+    assert not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(trained.policy))
+    action = trained.policy.act(jnp.zeros(3))
+    assert action.shape == (1,)
