@@ -17,6 +17,7 @@ Source: Moore, Efficient memory-based learning for robot control (1990), chapter
 those of Gymnasium 1.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -97,9 +98,18 @@ def observed(state: State) -> Float[Array, "2"]:
     return jnp.stack([(state.position - middle) / half, state.velocity / MAX_SPEED])
 
 
-def along() -> Controller:
-    """Full throttle the way the car rolls, to the right from rest: what climbs the hill."""
-    return lambda time, state, features: jnp.where(state.velocity < 0, -1.0, 1.0)
+def along(enough: float = math.inf) -> Controller:
+    """Full throttle the way the car rolls, to the right from rest: what climbs the hill.
+
+    - `enough`: of `energy`, from which on it rolls back without throttle. 0.4 keeps it clear of the
+      wall on the left, where Gymnasium's car would hit it.
+    """
+
+    def control(time: Scalar, state: State, features: Features) -> Scalar:
+        back = jnp.where(energy(state) < enough, -1.0, 0.0)
+        return jnp.where(state.velocity < 0, back, 1.0)
+
+    return control
 
 
 def neural(

@@ -2,6 +2,7 @@
 
     verifai-jax falsify specs/mountain_car.py:climb
     verifai-jax falsify specs/mountain_car.py:climb_continuous --search cross_entropy
+    verifai-jax falsify specs/mountain_car.py:careful
     verifai-jax sweep specs/mountain_car.py:safe_training --search grid --configurations 6
 
 The car starts anywhere on the left of the valley's slopes, slow or fast, with an engine and a
@@ -9,7 +10,7 @@ gravity that differ from those the controller was made for. A step of the car co
 """
 
 import verifai_jax as vj
-from envs.mountain_car import Controller, MountainCarTask, mountain_car, neural
+from envs.mountain_car import Controller, MountainCarTask, along, mountain_car, neural
 from envs.mountain_car_drawing import draw
 from verifai_jax.rl import PPO, Continuous, Policy
 from verifai_jax.rl.pqn import PQN
@@ -59,8 +60,32 @@ def _continuous(controller: Controller | None = None) -> vj.Problem:
     )
 
 
+def _careful(controller: Controller) -> vj.Problem:
+    return vj.Problem(
+        "careful",
+        vj.FeatureSpace(
+            {
+                **continuous.domains,
+                "position0": vj.Box(-0.9, 0.0),
+                "velocity0": vj.Box(-0.02, 0.02),
+            }
+        ),
+        mountain_car(controller, continuous=True, steps=300),
+        {
+            "clear": "always[0, 300] position >= -1.19",
+            "slow": "always[0, 300] abs(velocity) <= 0.068",
+            "climbs": "eventually[0, 300] position >= 0.45",
+        },
+        priority=["clear", "slow", "climbs"],
+        nominal={**NOMINAL, "power": 0.0015},
+        description="never hit the wall on the left, never be too fast, and reach the flag",
+        draw=draw,
+    )
+
+
 climb = _discrete()
 climb_continuous = _continuous()
+careful = _careful(along(enough=0.4))
 
 
 def climb_with(policy: Policy) -> vj.Problem:
@@ -70,6 +95,11 @@ def climb_with(policy: Policy) -> vj.Problem:
     """
     make = _continuous if isinstance(policy.action, Continuous) else _discrete
     return make(neural(policy))
+
+
+def careful_with(policy: Policy) -> vj.Problem:
+    """`careful` under a policy with either kind of action; JAX may trace its weights."""
+    return _careful(neural(policy))
 
 
 def trained_on(size: float) -> MountainCarTask:

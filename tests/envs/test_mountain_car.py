@@ -151,6 +151,12 @@ def test_rolling_along_climbs_the_hill_and_full_throttle_does_not():
     stuck = mc.mountain_car(lambda time, state, features: 1.0)({}, KEY)
     assert float(climbs["position"][-1]) >= 0.5
     assert float(jnp.max(stuck["position"])) < 0.0
+    # It coasts back once that is enough, clear of the wall that it would hit.
+    gentle = mc.mountain_car(mc.along(enough=0.4), continuous=True)({}, KEY)
+    harsh = mc.mountain_car(continuous=True)({}, KEY)
+    assert float(jnp.min(gentle["position"])) > -1.1
+    assert float(jnp.min(harsh["position"])) == pytest.approx(mc.LEFT)
+    assert float(gentle["position"][-1]) >= 0.45
     # A sensor that shows a roll to the right where there is none turns the engine too early.
     misled = mc.mountain_car()({"velocity_bias": 0.02}, KEY)
     assert float(jnp.max(misled["position"])) < 0.0
