@@ -338,6 +338,24 @@ def test_out_of_time_is_what_there_is():
     assert len(found.table) in range(1, 4 * 3)
 
 
+def test_what_was_trained_in_time_is_certified(monkeypatch):
+    monkeypatch.setattr(driver, "_FOR_TRAINING", 1e-9)
+    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1000.0)
+    assert not found.record.complete
+    assert len(found.table) in range(1, 4 * 3)
+    assert (found.table["simulations"] == 8).all()
+    assert found.table["nominal_return"].notna().all()
+
+
+def test_a_budget_is_for_all_policies():
+    study = drifting(seeds=2)
+    for how, least in (({}, 7 * 3 * 2 * 8), ({"halving": Halving(2)}, (7 + 4 + 2) * 2 * 8)):
+        with pytest.raises(ValueError, match=f"need a budget of at least {least}; got {least - 1}"):
+            sweep(study, configurations=7, samples=8, budget=least - 1, **how)
+        found = sweep(study, configurations=7, samples=8, budget=least, **how)
+        assert len(found.table) * 8 == least
+
+
 def test_options_are_refused_first(monkeypatch):
     monkeypatch.setattr(driver, "Lessons", None)
     for how, error, told in (
@@ -349,6 +367,9 @@ def test_options_are_refused_first(monkeypatch):
         ({"search": 3}, TypeError, "search must be a name, a Search or an OptunaSampler; got 3"),
         ({"halving": 3}, TypeError, "halving must be a Halving; got 3"),
         ({"sampels": 3}, UnknownNameError, "did you mean 'samples'"),
+        ({"seed": -1}, ValueError, "seed must be a whole number of at least 0; got -1"),
+        ({"attacker": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
+        ({"attacker": "gradient"}, ValueError, "follows slopes"),
     ):
         with pytest.raises(error, match=told):
             sweep(drifting(), **how)

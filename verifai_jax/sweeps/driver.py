@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from verifai_jax import __version__
+from verifai_jax.certification.refuting import usable_search
 from verifai_jax.errors import suggests_options
+from verifai_jax.sweeps.asked import check_asked
 from verifai_jax.sweeps.certifying import QUICK, Judged, Judgement, certify_policies
 from verifai_jax.sweeps.describing import describe
 from verifai_jax.sweeps.halving import SAFETY, Halving
@@ -27,8 +29,7 @@ from verifai_jax.sweeps.returns import EPISODES, each_return
 from verifai_jax.sweeps.rows import Row, tabulated
 from verifai_jax.sweeps.searching import WORST, Asker, Values, asker_for, badness
 from verifai_jax.sweeps.store import Store
-from verifai_jax.sweeps.study import Study, StudyError
-from verifai_jax.sweeps.trainer import STEPS
+from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.watch import CERTIFYING, TRAINING, OutOfTime, Watch
 
 _BARREN = 64
@@ -87,8 +88,21 @@ def sweep(
     range and for a search that needs gradients; `UnknownNameError` for an unknown search or option;
     `StoreError` for a store that is damaged, foreign, or of another sweep.
     """
-    _check(study, configurations, samples, confidence, halving, batch, episodes, max_seconds)
+    check_asked(
+        study,
+        configurations=configurations,
+        seed=seed,
+        samples=samples,
+        confidence=confidence,
+        budget=budget,
+        attack=attack,
+        halving=halving,
+        batch=batch,
+        episodes=episodes,
+        max_seconds=max_seconds,
+    )
     study.check()
+    usable_search(study.untrained_problem(), attacker)
     asker = asker_for(search, study.space, configurations=configurations, seed=seed, batch=batch)
     options = {
         "search": asker.described(),
@@ -112,44 +126,6 @@ def sweep(
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         sweeping = _Sweeping(study, options, memory, watch, halving, attacker)
         return Sweep(sweeping.run(asker), study)
-
-
-def _check(
-    study: Any,
-    configurations: int,
-    samples: int,
-    confidence: float,
-    halving: Any,
-    batch: int | None,
-    episodes: int,
-    max_seconds: float | None,
-) -> None:
-    if not isinstance(study, Study):
-        raise TypeError(f"sweep needs a Study; got {study!r}")
-    counts = {"configurations": configurations, "samples": samples, "episodes": episodes}
-    if batch is not None:
-        counts["batch"] = batch
-    for name, value in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ValueError(f"{name} must be a whole number of at least 1; got {value!r}")
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
-    if max_seconds is not None and not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive; got {max_seconds}")
-    if halving is None:
-        return
-    if not isinstance(halving, Halving):
-        raise TypeError(f"halving must be a Halving; got {halving!r}")
-    if STEPS in study.space.domains:
-        raise StudyError(
-            "halving compares trainings of one length at their snapshots; "
-            "take steps out of the space"
-        )
-    if not [at for at in study.snapshots if at < study.trainer.steps]:
-        raise StudyError(
-            "halving stops trainings at snapshots; the study has none before the end at "
-            f"{study.trainer.steps} steps"
-        )
 
 
 @dataclass(eq=False)
@@ -361,10 +337,10 @@ class _Sweeping:
         ]
         if not places:
             return None
-        # A training may have ended before its returns were measured.
-        self._measure(dict.fromkeys(lesson for lesson, _ in places))  # pyright: ignore[reportArgumentType]
         total = len(places) * self.options["samples"]
         with self.watch.stage(CERTIFYING, total, "simulations"):
+            # Training may have been out of time before returns were measured.
+            self._measure(list(dict.fromkeys(lesson for lesson, _ in places)))
             made = self._certified(
                 [self._policy(place) for place in places],
                 samples=self.options["samples"],

@@ -38,11 +38,15 @@ class Halving:
             raise ValueError(f"reduction must be greater than 1; got {self.reduction!r}")
         check_names("criterion of halving", [self.by], (RETURN, SAFETY))
 
+    def count(self, configurations: int) -> int:
+        """How many of so many go on."""
+        return math.ceil(configurations / self.reduction)
+
     def kept(self, badness: Mapping[int, float]) -> list[int]:
         """The configurations that go on, in the order of their numbers; ties go to the first.
 
         - `badness`: of each configuration, the less the better; NaN is worse than anything.
         """
-        count = math.ceil(len(badness) / self.reduction)
+        count = self.count(len(badness))
         bad = {n: math.inf if math.isnan(b) else b for n, b in badness.items()}
         return sorted(sorted(bad, key=lambda n: (bad[n], n))[:count])

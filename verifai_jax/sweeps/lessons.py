@@ -75,6 +75,7 @@ class Lessons:
         self.errors: dict[int, str] = {}
         self._reached: dict[tuple[int, int], Reached] = {}
         self._forms: dict[Hashable, Any] = {}
+        self._trained: set[Hashable] = set()
         self._homes: dict[int, tuple[Trainings, int]] = {}
 
     def add(self, values: Mapping[str, Any], seed: int) -> int:
@@ -154,6 +155,9 @@ class Lessons:
 
     def _portion(self, numbers: list[int], rung: int, further: bool) -> None:
         """Train those of one portion from snapshot to snapshot, keeping each as it is reached."""
+        structure = self.structure(numbers[0])
+        self.watch.advance(0, "" if structure in self._trained else "compiling")
+        self._trained.add(structure)
         try:
             self._advance(numbers, rung)
         except (OutOfTime, MemoryError, StoreError):
@@ -231,7 +235,7 @@ class Lessons:
 
 def digest(value: Mapping[str, Any]) -> str:
     """A short name for plain data."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:20]
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=repr).encode()).hexdigest()[:20]
 
 
 def _kept(policy: Policy, curve: Curve, seconds: float) -> Work:

@@ -151,7 +151,7 @@ class Store:
             found = self._decoded(name, *_encoded(made))
         return found
 
-    def names(self) -> Iterable[str]:
+    def names(self) -> list[str]:
         """What is finished."""
         return [row[0] for row in self._base.execute("SELECT name FROM work ORDER BY name")]
 

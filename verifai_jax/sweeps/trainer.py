@@ -323,7 +323,9 @@ def probes(domain: Domain) -> list[tuple[Any, str]]:
 def _company(space: FeatureSpace) -> list[dict[str, Any]]:
     """Points all over the space, the middle first, as companions of a value to check."""
     rng = np.random.default_rng(0)
-    points = np.concatenate([np.full((1, space.dim), 0.5), rng.random((_COMPANY, space.dim))])
+    # A constraint may make values possible that are rare without it.
+    count = _COMPANY if space.where is None else 16 * _COMPANY
+    points = np.concatenate([np.full((1, space.dim), 0.5), rng.random((count, space.dim))])
     return labelled(space, points)
 
 
