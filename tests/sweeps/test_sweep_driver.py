@@ -206,7 +206,7 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
     with Store(tmp_path / "through") as kept:
         pieces = len(kept.names())
     monkeypatch.setattr(driver, "Store", Stopped)
-    for after in (1, 4, pieces // 2, pieces - 2):
+    for after in (1, pieces // 2, pieces - 2):
         monkeypatch.setattr(Stopped, "after", after)
         some = sweep(study, store=tmp_path / str(after), **how)
         assert not some.record.complete
@@ -322,6 +322,10 @@ def test_optuna_proposes_and_is_told(tmp_path):
     same_tables(sweep(study, search=OptunaSampler("tpe"), **how), one)
     with pytest.raises(UnknownNameError, match="unknown sampler of Optuna 'tp'; did you mean"):
         sweep(study, search="optuna:tp")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'multivarate'"):
+        sweep(study, search=OptunaSampler("tpe", {"multivarate": True}))
+    with pytest.raises(ValueError, match=r"is the sweep's: sweep\(..., seed=...\)"):
+        OptunaSampler("tpe", {"seed": 3})
 
 
 def test_without_optuna_it_says_how_to_get_it(monkeypatch):

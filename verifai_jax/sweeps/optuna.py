@@ -3,6 +3,8 @@
 Needs the extra `optuna`. Seeded, so that a resumed sweep asks for the same configurations.
 """
 
+import importlib.util
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.errors import check_names, require, unknown_name
+from verifai_jax.errors import MissingExtra, require, unknown_name
 from verifai_jax.features import (
     Box,
     Categorical,
@@ -43,7 +45,7 @@ class OptunaSampler:
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
     - `options`: keywords of the sampler's class; the seed is the sweep's.
 
-    **Raises:** `UnknownNameError` for another name or option.
+    **Raises:** `UnknownNameError` for another name; `ValueError` for a seed among the options.
     """
 
     name: str = "tpe"
@@ -52,15 +54,22 @@ class OptunaSampler:
     def __post_init__(self) -> None:
         if self.name not in _SAMPLERS:
             raise unknown_name("sampler of Optuna", self.name, _SAMPLERS)
-        check_names("option of Optuna's sampler", ["seed"] * ("seed" in self.options), ())
+        if "seed" in self.options:
+            raise ValueError("the seed of Optuna's sampler is the sweep's: sweep(..., seed=...)")
 
     def asker(self, space: FeatureSpace, seed: int, batch: int) -> "OptunaAsker":
         """What asks this sampler.
 
-        **Raises:** `MissingExtra` without Optuna; what Optuna says of its options.
+        **Raises:** `MissingExtra` without Optuna, or what the sampler needs; `TypeError` for
+        options that the sampler does not have.
         """
         optuna = require("optuna", "optuna")
-        made = getattr(optuna.samplers, _SAMPLERS[self.name])(seed=seed, **self.options)
+        if self.name == "cmaes" and importlib.util.find_spec("cmaes") is None:
+            raise MissingExtra("Optuna's sampler cmaes needs a package: pip install cmaes")
+        with warnings.catch_warnings():
+            # Optuna calls some of its samplers experimental; who names one has chosen it.
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            made = getattr(optuna.samplers, _SAMPLERS[self.name])(seed=seed, **self.options)
         return OptunaAsker(self, made, space, batch)
 
 
