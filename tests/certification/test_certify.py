@@ -228,10 +228,10 @@ def outside(policy):
 
 
 def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
-    some = [POLICIES[2], threshold(0.5, 8)]
-    options = {"p": 0.05, "samples": 64, "budget": 128, "attack": 64}
+    some = [POLICIES[2]]
+    options = {"p": 0.05, "samples": 64, "budget": 64, "attack": 64}
     expected = certify(problem_of, some, **options).table()
-    for make, told in [(untraceable, "compiled one by one: policies 0, 1; JAX"), (outside, None)]:
+    for make, told in [(untraceable, "compiled one by one: policy 0; JAX"), (outside, None)]:
         found = certify(make, some, **options)
         assert found.table()["failures"].tolist() == expected["failures"].tolist()
         assert [note[: len(told)] for note in found.notes] == [told] if told else not found.notes

@@ -13,10 +13,10 @@ of it, has grown to the reciprocal of the error allowed. For another rate `t`, t
 sample, `t/q` for a failure and `(1-t)/(1-q)` for none, has expectation 1 if `q` is the true rate.
 So a mixture over any fixed distribution of `t` is a nonnegative martingale that starts at 1, and by
 Ville's inequality it ever reaches `1 / error` with probability `error` at most. The bound holds at
-all sample sizes together, whatever decided them (Robbins, Statistical methods related to the law of
-the iterated logarithm, Annals of Mathematical Statistics 41, 1970; Howard, Ramdas, McAuliffe and
-Sekhon, Time-uniform, nonparametric, nonasymptotic confidence sequences, Annals of Statistics 49,
-2021).
+all sample sizes together, whatever decided them, be it other policies' outcomes in the very samples
+to come (Robbins, Statistical methods related to the law of the iterated logarithm, Annals of
+Mathematical Statistics 41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Time-uniform, nonparametric,
+nonasymptotic confidence sequences, Annals of Statistics 49, 2021).
 
 The mixture for upper bounds has an atom at rate 0, which safe policies often have: without a
 failure it costs `ln(1/ATOM) / q` samples more than the exact bound of a fixed number of samples,

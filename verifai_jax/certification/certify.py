@@ -75,8 +75,8 @@ def certify(
     - `progress(done, total, text)`: called with the simulations so far. `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
 
-    Ctrl-C returns what is known. The same seed gives the same certificates whatever the order of
-    the policies, the number of devices or what a memo holds.
+    Ctrl-C returns what is known. The same seed gives the same certificates, bit for bit on one
+    machine, whatever the order of the policies, the number of devices or what a memo holds.
 
     **Raises:** before anything compiles, `ValueError` for numbers out of range, a search that
     cannot attack, or policies with different features; `ProblemError` and what the monitor raises
@@ -89,7 +89,6 @@ def certify(
     pieces = Pieces(
         problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
     )
-    pieces.space.check_where()
     attacker = usable_search(pieces.problem, search)
     rounds = -(-attack // lanes)
     if tie is None:
@@ -150,7 +149,9 @@ def _sample(
         for (number, block), outcome in pieces.certificate(asked):
             sampled[number].add(pieces.points(block), outcome)
             report.sampled(pieces.lanes, undecided)
-    return "budget" if allocation.undecided(failures, simulations).any() else "decided"
+    open_ = allocation.undecided(failures, simulations).any()
+    named = standing(failures, simulations, allocation.tie, margins).chance >= allocation.sure
+    return "decided" if named and not open_ else "budget"
 
 
 def _counts(seen: list[Seen]) -> tuple[np.ndarray, np.ndarray]:

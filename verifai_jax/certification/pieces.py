@@ -1,7 +1,8 @@
 """Blocks of simulations by name: computed together, remembered one by one.
 
     pieces = Pieces(problem_of, policies, seed=0, lanes=64, remember=store.remember)
-    for asked, outcome in pieces.certificate([(0, 0), (0, 1), (5, 0)]): ...      # (policy, block)
+    for (policy, block), outcome in pieces.certificate([(0, 0), (0, 1), (5, 0)]):
+        ...
 
 A piece is one policy in one block of samples. Its name holds all that its numbers depend on, so
 whatever is asked for, in whatever order, a memo gives what a simulation would.

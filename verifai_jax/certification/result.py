@@ -69,9 +69,9 @@ class Certificates:
     **Fields:** `p` and `confidence` of the verdicts: with this probability no interval of any
     policy, and so no verdict, is wrong; `safest`: number of the policy that fails least often, None
     before all have been sampled; `chance`: its posterior probability to be the safest up to `tie`
-    (an estimate, no bound); `budget` of samples; `blocks`: samples simulated together;
-    `stopped`: `"decided"`, `"budget"` (verdicts are open and the budget, or what is left of it, is
-    too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name.
+    (an estimate, no bound); `samples` of each policy at least and `budget` of all;
+    `stopped`: `"decided"`, `"budget"` (a verdict or the safest is open, and the budget or what is
+    left of it too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name.
     """
 
     rows: tuple[Certificate, ...] = field(repr=False)
@@ -186,7 +186,7 @@ class Certificates:
 
 def _percent(rate: float) -> str:
     percent = 100 * rate
-    return f"{percent:.1f} %" if percent == 0 or percent >= 10 else f"{percent:.2g} %"
+    return f"{percent:.1f} %" if percent >= 10 else f"{percent:.2g} %"
 
 
 def _rank(row: Certificate, p: float) -> float:
