@@ -2,12 +2,19 @@
 
 from verifai_jax.rl.algorithm import Algorithm as Algorithm
 from verifai_jax.rl.algorithm import Progress as Progress
+from verifai_jax.rl.algorithms import ALGORITHMS as ALGORITHMS
+from verifai_jax.rl.brax_task import brax_task as brax_task
+from verifai_jax.rl.gymnax_task import gymnax_task as gymnax_task
+from verifai_jax.rl.mjx_task import mjx_task as mjx_task
+from verifai_jax.rl.ode_task import ode_task as ode_task
 from verifai_jax.rl.policy import Policy as Policy
 from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
 from verifai_jax.rl.policy import load_policy as load_policy
 from verifai_jax.rl.policy import policy_notes as policy_notes
 from verifai_jax.rl.policy import save_policy as save_policy
 from verifai_jax.rl.ppo import PPO as PPO
+from verifai_jax.rl.pqn import PQN as PQN
+from verifai_jax.rl.sac import SAC as SAC
 from verifai_jax.rl.task import Continuous as Continuous
 from verifai_jax.rl.task import Discrete as Discrete
 from verifai_jax.rl.task import Task as Task
