@@ -99,7 +99,7 @@ WRONG = {
         {"algorithm": vj.Categorical("drft", "ppo")}, Trainer(Point(), TWO)
     ),
     r"algorithm 'picks': Picks learns discrete actions; Point has Continuous\(.*\). "
-    "Those that fit: ": lambda: study(trainer=Trainer(Point(), Picks())),
+    "Those that fit: ppo, sac": lambda: study(trainer=Trainer(Point(), Picks())),
     "snapshots must lie between 1 and steps = 128; got 200": lambda: study(snapshots=(64, 200)),
     "problem must return a Problem for a policy; it returned int": lambda: study(
         problem=lambda policy: 3

@@ -59,6 +59,7 @@ class Study:
     description: str = ""
     training_seeds: tuple[int, ...] = field(init=False, repr=False)
     curve_formula: Formula | None = field(init=False, repr=False, default=None)
+    _problems: dict[str, Problem] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
@@ -131,6 +132,11 @@ class Study:
         return replace(self, space=self.space.only(*names, nominal=nominal))
 
     def _problem_of(self, algorithm: str) -> Problem:
+        if algorithm not in self._problems:
+            self._problems[algorithm] = self._made_problem(algorithm)
+        return self._problems[algorithm]
+
+    def _made_problem(self, algorithm: str) -> Problem:
         policy = self.trainer.untrained(algorithm)
         try:
             problem = self.problem(policy)

@@ -28,6 +28,7 @@ from verifai_jax.features import (
     TruncatedNormal,
 )
 from verifai_jax.features.domain import Domain
+from verifai_jax.rl import algorithms
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.ppo import PPO
@@ -215,7 +216,7 @@ class Trainer:
         if isinstance(self.task.action, algorithm.actions):
             return
         fitting = [n for n, a in self.by_name.items() if isinstance(self.task.action, a.actions)]
-        fitting += [n for n in _registered(self.task) if n not in fitting]
+        fitting += [n for n in algorithms.fitting(self.task.action) if n not in fitting]
         kinds = " or ".join(kind.__name__.lower() for kind in algorithm.actions)
         raise StudyError(
             f"algorithm {name!r}: {type(algorithm).__name__} learns {kinds} actions; "
@@ -344,16 +345,6 @@ def _layers(owner: Any) -> tuple[str, ...]:
         and isinstance(owner, Algorithm)
         and all(isinstance(width, int) for width in value)
     )
-
-
-def _registered(task: Task) -> list[str]:
-    """The algorithms of the library that learn such actions, by name."""
-    try:
-        from verifai_jax.rl import algorithms  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError:
-        return []
-    registry: Any = getattr(algorithms, "ALGORITHMS", {})
-    return [n for n, kind in registry.items() if isinstance(task.action, kind.actions)]
 
 
 def _like(present: Any, value: Any, name: str) -> Any:
