@@ -17,6 +17,7 @@ from verifai_jax.certification.bounds import bounded, verdict
 from verifai_jax.certification.pieces import Pieces, Remember
 from verifai_jax.certification.refuting import Seen, refute, usable_search
 from verifai_jax.certification.result import Certificate, Certificates
+from verifai_jax.devices import enable_compile_cache
 from verifai_jax.errors import suggests_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem import Problem
@@ -86,6 +87,7 @@ def certify(
     policies = list(policies)
     budget = _check(policies, p, confidence, samples, seed, budget, attack, tie)
     lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
+    enable_compile_cache()  # Before the search compiles, too.
     pieces = Pieces(
         problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
     )
