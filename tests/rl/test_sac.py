@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verifai_jax.rl import Continuous, Discrete, evaluate, train
+from verifai_jax.rl import Configuration, Continuous, Discrete, Trainings, evaluate, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.replay_buffer import Remembered, draw, empty, remember, split
 from verifai_jax.rl.sac import SAC, _act, _loss, squash_log_prob
@@ -207,3 +207,11 @@ def test_it_is_an_algorithm_for_continuous_actions():
 def test_hyper_parameters_that_cannot_train_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         train(Aim(), SAC(**options), steps=10)
+
+
+@pytest.mark.slow
+def test_trains_on_all_devices_at_once():
+    # Decompositions of several matrices at once once waited for each other for ever here.
+    group = [Configuration(Aim(), SAC(), steps=2_000, seed=seed) for seed in range(4)]
+    trainings = Trainings(group)
+    assert list(trainings.advance(dict.fromkeys(range(4), 2_000))) == [0, 1, 2, 3]
