@@ -21,9 +21,13 @@ def test_five_seeds_reach_the_known_return(curve):
 
 
 def stepped(task, states, actions):
-    one = jax.jit(jax.vmap(lambda s, a: task.step(jax.random.key(0), s, a)))
-    after, reward, over = one(states, actions)
-    seen = jax.vmap(task.observe)(after)
+    @jax.jit
+    @jax.vmap
+    def one(state, action):
+        after, reward, over = task.step(jax.random.key(0), state, action)
+        return task.observe(after), reward, over
+
+    seen, reward, over = one(states, actions)
     return np.asarray(seen), np.asarray(reward), np.asarray(over)
 
 
@@ -47,13 +51,13 @@ def test_acrobot_is_gymnasiums_step_for_step():
     env = gymnasium.make("Acrobot-v1").unwrapped
     env.reset(seed=0)
     draw = np.random.default_rng(0)
-    states = draw.uniform([-3, -3, -4, -6], [3, 3, 4, 6], (200, 4))
-    action = draw.integers(0, 3, 200)
+    states = draw.uniform([-3, -3, -4, -6], [3, 3, 4, 6], (60, 4))
+    action = draw.integers(0, 3, 60)
     start = Angles(*jnp.asarray(states.T))
     seen, reward, over = stepped(Acrobot(), start, jnp.asarray(action, jnp.int32))
-    for i in range(200):
+    for i in range(60):
         env.state = states[i]
         observation, expected, terminated, *_ = env.step(int(action[i]))
         np.testing.assert_allclose(seen[i], observation, atol=5e-4)
         assert (reward[i], over[i]) == (expected, terminated)
-    assert 20 < over.sum() < 180
+    assert 5 <= over.sum() <= 55

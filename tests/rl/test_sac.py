@@ -59,13 +59,15 @@ def test_density_of_squashed_actions():
     u = mean + std * noise
     # Change of variables in float64, an action at a time.
     expected = stats.norm(mean, std).logpdf(u) - np.log1p(-np.square(np.tanh(u)))
-    got = squash_log_prob(jnp.asarray(mean), jnp.log(jnp.asarray(std)), jnp.asarray(noise))
+    got = jax.jit(squash_log_prob)(jnp.asarray(mean), jnp.log(jnp.asarray(std)), jnp.asarray(noise))
     np.testing.assert_allclose(got, expected.sum(axis=1), rtol=2e-3, atol=2e-4)
 
 
 def test_density_integrates_to_one():
     noise = np.linspace(-6, 6, 20_001)[:, None]
-    log_prob = squash_log_prob(jnp.array([0.4]), jnp.log(jnp.array([0.8])), jnp.asarray(noise))
+    log_prob = jax.jit(squash_log_prob)(
+        jnp.array([0.4]), jnp.log(jnp.array([0.8])), jnp.asarray(noise)
+    )
     action = np.tanh(0.4 + 0.8 * noise[:, 0])
     assert np.trapezoid(np.exp(np.asarray(log_prob, np.float64)), action) == pytest.approx(
         1.0, abs=1e-3
@@ -77,7 +79,7 @@ def test_density_and_its_slope_stay_finite_at_the_ends():
         return squash_log_prob(mean[None], jnp.array([2.0]), jnp.array([3.0]))
 
     means = jnp.array([-60.0, 0.0, 60.0])
-    assert np.all(np.isfinite(jax.vmap(jax.value_and_grad(density))(means)))
+    assert np.all(np.isfinite(jax.jit(jax.vmap(jax.value_and_grad(density)))(means)))
 
 
 def rows(values):
@@ -85,13 +87,21 @@ def rows(values):
     return Remembered(column, column + 0.5, 10 * column, -column[:, 0], column[:, 0] > 3)
 
 
+filled = jax.jit(remember)
+
+
+@jax.jit
+def drawn_of(buffer):
+    return draw(buffer, jax.random.key(0), 600, actions=1)
+
+
 def test_buffer_is_a_ring_and_gives_back_whole_transitions():
-    buffer, fill = empty(6, size=1, actions=1), jax.jit(remember)
+    buffer = empty(6, size=1, actions=1)
     for start in (0, 2, 4, 6):
-        buffer = fill(buffer, rows([start, start + 1]))
+        buffer = filled(buffer, rows([start, start + 1]))
     assert (int(buffer.filled), int(buffer.place)) == (6, 2)
     np.testing.assert_array_equal(buffer.rows[:, 0], [6, 7, 2, 3, 4, 5])
-    drawn = draw(buffer, jax.random.key(0), 600, actions=1)
+    drawn = drawn_of(buffer)
     assert set(np.asarray(drawn.observation[:, 0])) == {2, 3, 4, 5, 6, 7}
     np.testing.assert_array_equal(drawn.next_observation, drawn.observation + 0.5)
     np.testing.assert_array_equal(drawn.action, 10 * drawn.observation)
@@ -100,8 +110,8 @@ def test_buffer_is_a_ring_and_gives_back_whole_transitions():
 
 
 def test_only_what_happened_is_drawn():
-    buffer = remember(empty(1000, size=1, actions=1), rows([7, 8]))
-    drawn = draw(buffer, jax.random.key(0), 100, actions=1)
+    buffer = filled(empty(6, size=1, actions=1), rows([7, 8]))
+    drawn = drawn_of(buffer)
     assert set(np.asarray(drawn.observation[:, 0])) == {7, 8}
 
 
