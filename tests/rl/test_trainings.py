@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -61,3 +63,19 @@ def test_going_on_is_the_same_as_going_through(group, policies):
         for a, b in zip(leaves(trainings.policy(n)), policies[n], strict=True):
             np.testing.assert_array_equal(a, b)
     assert trainings.seconds(0) > 0
+
+
+def test_what_goes_on_in_other_company_compiles_nothing_new(group, policies, compiled):
+    other = [replace(c, algorithm=replace(c.algorithm, horizon=64)) for c in group]
+    list(Trainings(other).advance({0: 256}))
+    assert "jit(_reach)" in compiled
+    trainings = Trainings([*group, *group])
+    list(trainings.advance(dict.fromkeys(range(6), 256)))
+    compiled.clear()
+    # The last one goes on alone, the others in new pairs.
+    list(trainings.advance({0: 512, 2: 512, 5: STEPS}))
+    list(trainings.advance(dict.fromkeys((3, 0, 2), STEPS)))
+    assert "jit(_reach)" not in compiled
+    for n, wanted in ((0, 0), (2, 2), (3, 0), (5, 2)):
+        for a, b in zip(leaves(trainings.policy(n)), policies[wanted], strict=True):
+            np.testing.assert_array_equal(a, b)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
 from verifai_jax.devices import enable_compile_cache
@@ -66,14 +66,21 @@ class Configuration:
             raise ValueError(f"steps must be at least 1; got {self.steps}")
 
 
+class _Together(NamedTuple):
+    """Trainings that went on side by side, still in one piece."""
+
+    states: Any
+    curves: Float[Array, "lanes capacity"]
+
+
 @dataclass(eq=False)
 class _Lane:
-    """Where one training stands."""
+    """Where one training stands: its place among those that it went on with."""
 
-    state: Any
-    curve: Float[Array, " capacity"]
-    done: int = 0
-    seconds: float = 0.0
+    together: _Together
+    place: int
+    done: int
+    seconds: float
 
 
 class _Structure(NamedTuple):
@@ -136,10 +143,9 @@ class Trainings:
 
     def policy(self, number: int) -> Policy:
         """The policy that a training has reached, on the host, without exploration."""
-        configuration = self.configurations[number]
-        return jax.device_get(
-            _policy(configuration.algorithm, Known(configuration.task), self._lanes[number].state)
-        )
+        configuration, lane = self.configurations[number], self._lanes[number]
+        known, place = Known(configuration.task), np.int32(lane.place)
+        return jax.device_get(_policy(configuration.algorithm, known, lane.together.states, place))
 
     def curve(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Environment steps taken by the end of each update so far, and the mean return in it.
@@ -149,7 +155,7 @@ class Trainings:
         lane = self._lanes[number]
         per_update = self.configurations[number].algorithm.steps_per_update
         steps = np.arange(1, lane.done + 1) * per_update
-        return steps, np.asarray(lane.curve)[: lane.done]
+        return steps, np.asarray(lane.together.curves)[lane.place, : lane.done]
 
     def seconds(self, number: int) -> float:
         """Seconds of a core that a training has taken so far, compilation not counted."""
@@ -161,8 +167,10 @@ class Trainings:
 
     def _advance(self, structure: _Structure, numbers: list[int], done: int, until: int) -> None:
         enable_compile_cache()
-        devices = self.devices[: max(1, min(len(self.devices), len(numbers)))]
-        lanes = len(devices) * (self.together if self.together > 1 else 1)
+        # As many devices for the last few as for all others: they would compile anew for fewer.
+        alike = self._structures.count(structure)
+        devices = self.devices[: max(1, min(len(self.devices), alike))]
+        lanes = len(devices) * self.together
         filled = numbers + [numbers[-1]] * (lanes - len(numbers))
         layout = _Layout(structure, devices, self.together)
         first = self.configurations[numbers[0]]
@@ -171,8 +179,7 @@ class Trainings:
         tasks = _stacked([leaves_of(self.configurations[n].task)[0] for n in filled])
         arguments = (layout, known, jax.tree.structure(first.algorithm), tasks, algorithms)
         if all(n in self._lanes for n in numbers):
-            states = _stacked([self._lanes[n].state for n in filled])
-            curves = jnp.stack([self._lanes[n].curve for n in filled])
+            states, curves = self._gathered(filled, devices)
         else:
             seeds = np.array([self.configurations[n].seed for n in filled], np.uint32)
             updates = np.array([self.configurations[n].updates for n in filled], np.int32)
@@ -193,15 +200,34 @@ class Trainings:
             self._rates[structure] = took / some
             seconds += took
             done += some
-        for lane, number in enumerate(numbers):
+        share = seconds / max(1, -(-len(numbers) // len(devices)))
+        for place, number in enumerate(numbers):
             before = self._lanes.get(number)
-            share = seconds / max(1, -(-len(numbers) // len(devices)))
-            self._lanes[number] = _Lane(
-                state=jax.tree.map(lambda leaf, lane=lane: leaf[lane], states),
-                curve=curves[lane],
-                done=done,
-                seconds=share + (before.seconds if before else 0.0),
+            earlier = before.seconds if before else 0.0
+            together = _Together(states, curves)
+            self._lanes[number] = _Lane(together, place, done, share + earlier)
+
+    def _gathered(self, numbers: list[int], devices: tuple[Any, ...]) -> _Together:
+        """The states of trainings that go on side by side from now on."""
+        lanes = [self._lanes[n] for n in numbers]
+        first = lanes[0].together
+        width = len(first.curves)
+        if len(lanes) == width and all(
+            lane.together.curves is first.curves and lane.place == place
+            for place, lane in enumerate(lanes)
+        ):
+            return first
+        picked = _Together(
+            *_picked(
+                tuple(tuple(lane.together) for lane in lanes),
+                np.array([lane.place for lane in lanes], np.int32),
             )
+        )
+        if len(devices) > 1:
+            # Where the program expects them; it would be compiled again for another place.
+            spread = NamedSharding(Mesh(np.array(devices), ("lane",)), PartitionSpec("lane"))
+            return jax.device_put(picked, spread)
+        return picked
 
 
 class Known:
@@ -329,12 +355,16 @@ def _reach(
     return spread(tasks, algorithms, states, curves, done, until)
 
 
+@jax.jit
+def _picked(together: Any, places: Int[Array, " lanes"]) -> Any:
+    """One lane of each of these, side by side. In one program, not one for each shape."""
+    lanes = [jax.tree.map(lambda leaf, i=i: leaf[places[i]], one) for i, one in enumerate(together)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
+
+
 @partial(jax.jit, static_argnums=1)
-def _policy(algorithm: Any, known: Known, state: Any) -> Policy:
+def _policy(algorithm: Any, known: Known, states: Any, place: Int[Array, ""]) -> Policy:
     # What a policy is made of does not depend on the task's numbers.
-    task = (
-        known.task
-        if known.opaque
-        else jax.tree.unflatten(known.structure, [0.0] * known.structure.num_leaves)
-    )
-    return algorithm.policy(task, state)
+    numbers = [0.0] * known.structure.num_leaves
+    state = jax.tree.map(lambda leaf: leaf[place], states)
+    return algorithm.policy(known.with_leaves(numbers), state)
