@@ -13,6 +13,7 @@ import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -121,7 +122,12 @@ def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers
     for i, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
         scale = gain if i == len(sizes) - 2 else 2**0.5
         draw = jax.nn.initializers.orthogonal(scale)
-        weight = draw(jax.random.fold_in(key, i), (inputs, outputs), jnp.float32)
+        # One after the other under `vmap`: QR decompositions of several matrices at once, on
+        # several devices of a CPU, wait for each other for ever (jaxlib 0.10.2).
+        one = jax.custom_batching.sequential_vmap(
+            partial(draw, shape=(inputs, outputs), dtype=jnp.float32)
+        )
+        weight = one(jax.random.fold_in(key, i))
         layers.append((weight, jnp.zeros(outputs)))
     return tuple(layers)
 

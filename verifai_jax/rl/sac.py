@@ -122,11 +122,7 @@ class SAC:
         weights = Weights(
             # Mean 0 and deviation 1 at first: under tanh nearly uniform over the range.
             policy=new_layers(policy_key, (size, *self.hidden, 2 * actions), gain=0.01),
-            # Not under `vmap`: QR decompositions of several matrices at once, on several devices
-            # of a CPU, wait for each other for ever (jaxlib 0.10.2).
-            critics=jax.tree.map(
-                lambda *pair: jnp.stack(pair), *map(critic, jax.random.split(critic_key, 2))
-            ),
+            critics=jax.vmap(critic)(jax.random.split(critic_key, 2)),
             log_temperature=jnp.log(jnp.asarray(self.temperature, jnp.float32)),
         )
         return Training(
