@@ -162,9 +162,10 @@ for _command in (confirm, estimate, explain, repair, shrink, sweep, synthesize):
 @main.command(name="list")
 @click.argument("place", default="specs")
 def list_problems(place: str) -> None:
-    """List the problems of a file or folder (PLACE, by default specs/), and the searches."""
+    """List the problems and studies of a file or folder (PLACE, by default specs/)."""
+    from verifai_jax.problem import Problem
     from verifai_jax.search import names
-    from verifai_jax.targets import TargetError, problems_in
+    from verifai_jax.targets import TargetError, defined_in
 
     path = Path(place)
     files = sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
@@ -172,15 +173,19 @@ def list_problems(place: str) -> None:
         raise TargetError(f"{place}/ has no Python file with problems")
     for file in files:
         try:
-            found = problems_in(str(file))
+            found = defined_in(str(file))
         except MissingExtra as error:
             click.echo(f"{file}: {error}")
             continue
-        for name, problem in found.items():
-            click.echo(f"{file}:{name}  {problem.description}")
-            for formula in problem.formulas.values():
+        for name, target in found.items():
+            click.echo(f"{file}:{name}  {target.description}")
+            varied = ", ".join(target.space.domains)
+            if not isinstance(target, Problem):
+                click.echo(f"    a study of trainings, for sweep, over {varied}")
+                continue
+            for formula in target.formulas.values():
                 click.echo(f"    {formula}")
-            click.echo(f"    over {', '.join(problem.space.domains)}")
+            click.echo(f"    over {varied}")
     for folder in sorted(path.iterdir()) if path.is_dir() else []:
         if any(folder.glob("[!_]*.py")):
             click.echo(f"more in {folder}/: verifai-jax list {folder}")

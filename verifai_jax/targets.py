@@ -39,6 +39,16 @@ def studies_in(place: str) -> "dict[str, Study]":
     return _defined(place, Study, "Study")
 
 
+def defined_in(place: str) -> "dict[str, Problem | Study]":
+    """Problems and studies of a file or module, by name.
+
+    **Raises:** as `problems_in`, where there is neither.
+    """
+    from verifai_jax.sweeps.study import Study
+
+    return _defined(place, (Problem, Study), "Problem and no Study")
+
+
 def load_target(target: str) -> Problem:
     """The problem named by `FILE.py:NAME` or `MODULE:NAME`; NAME may be left out if it is alone.
 
@@ -55,7 +65,7 @@ def load_study(target: str) -> "Study":
     return _named(target, studies_in, "study")
 
 
-def _defined(place: str, kind: type, called: str) -> dict[str, Any]:
+def _defined(place: str, kind: Any, called: str) -> dict[str, Any]:
     module = _import(place)
     found = {p.name: p for p in vars(module).values() if isinstance(p, kind)}
     if not found:

@@ -163,3 +163,10 @@ def test_studies_are_found_as_problems_are(call):
     Path("specs/empty.py").write_text("x = 1\n")
     with pytest.raises(TargetError, match=r"specs/empty.py defines no Study"):
         load_study("specs/empty.py")
+
+
+def test_list_names_studies_beside_problems(call):
+    listed = CliRunner().invoke(main, ["list"])
+    assert listed.exit_code == 0, listed.output
+    assert "specs/drift.py:safe  drifts that stay" in listed.output
+    assert "a study of trainings, for sweep, over rate, noise" in listed.output
