@@ -226,9 +226,11 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
     def control(time: Scalar, state: State, features: Features) -> Scalar:
         sees = observation(measured(time, state, features))
         if small:
-            (unit,) = written_out(layers, sees)
+            (unit,) = written_out(layers, sees, policy.activation)
         else:
-            (unit,) = network(layers, jnp.stack(sees))
+            (unit,) = network(layers, jnp.stack(sees), policy.activation)
+        if policy.squash:
+            unit = jnp.tanh(unit)
         return STEER_LIMIT * jnp.clip(unit, -1.0, 1.0)
 
     return control

@@ -7,7 +7,7 @@ import pytest
 
 from envs.cartpole import CartPoleTask
 from verifai_jax.rl import PPO, Continuous, Discrete, Task, evaluate, train
-from verifai_jax.rl.ppo import Seen, _watch
+from verifai_jax.rl.observations import Seen, watch
 
 
 @dataclass(frozen=True)
@@ -114,9 +114,9 @@ def test_episodes_are_cut_off_and_counted():
 
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
-    seen = Seen(jnp.zeros(()), jnp.zeros(2), jnp.ones(2))
+    seen = Seen.nothing(2)
     for batch in rows:
-        seen = _watch(seen, jnp.asarray(batch))
+        seen = watch(seen, jnp.asarray(batch))
     np.testing.assert_allclose(seen.mean, rows.reshape(-1, 2).mean(axis=0), rtol=1e-5)
     np.testing.assert_allclose(seen.variance, rows.reshape(-1, 2).var(axis=0), rtol=1e-4)
 

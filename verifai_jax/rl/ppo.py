@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.rl.advantage import Ends, advantages
 from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
+from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
 from verifai_jax.rl.shuffling import permutation
 from verifai_jax.rl.task import Action, Continuous, Discrete, Task
@@ -95,7 +96,7 @@ class PPO:
         return Training(
             weights=weights,
             moments=_optimizer(self).init(weights),
-            seen=Seen(jnp.zeros(()), jnp.zeros(size), jnp.ones(size)),
+            seen=Seen.nothing(size),
             episodes=Episodes(
                 state, jnp.zeros(self.environments, jnp.int32), jnp.zeros(self.environments)
             ),
@@ -108,7 +109,7 @@ class PPO:
         """Collect `horizon` steps of each environment and learn from them."""
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         episodes, experience = _collect(self, task, state, collect_key)
-        seen = _watch(state.seen, experience.observation) if self.normalise else state.seen
+        seen = watch(state.seen, experience.observation) if self.normalise else state.seen
         weights, moments = _learn(self, task, state, experience, learn_key)
         over = experience.ends.terminated | experience.ends.truncated
         count = jnp.sum(over)
@@ -119,7 +120,7 @@ class PPO:
 
     def policy(self, task: Task, state: "Training") -> Policy:
         """The policy as learnt so far, without exploration."""
-        mean, scale = _normaliser(state.seen) if self.normalise else (None, None)
+        mean, scale = normaliser(state.seen) if self.normalise else (None, None)
         return Policy(state.weights.policy, mean, scale, state.weights.log_std, task.action)
 
 
@@ -131,14 +132,6 @@ class Weights:
     policy: Layers
     critic: Layers
     log_std: Float[Array, " size"] | None
-
-
-class Seen(NamedTuple):
-    """Running statistics of the observations."""
-
-    count: Float[Array, ""]
-    mean: Float[Array, " k"]
-    variance: Float[Array, " k"]
 
 
 class Episodes(NamedTuple):
@@ -183,7 +176,9 @@ def _collect(
         state, age, total = carry
         noise, step_key, reset_key = drawn
         observation = task.observe(state)
-        outputs = network(training.weights.policy, _look(ppo, training.seen, observation))
+        outputs = network(
+            training.weights.policy, normalised(training.seen, observation, ppo.normalise)
+        )
         action = _explore(task.action, outputs, log_std, noise)
         taken = action if isinstance(task.action, Discrete) else in_range(task.action, action)
         after, reward, terminated = task.step(step_key, state, taken)
@@ -222,7 +217,7 @@ def _learn(
     ppo: PPO, task: Task, training: Training, experience: Experience, key: Key[Array, ""]
 ) -> tuple[Weights, Any]:
     """A few epochs of clipped policy and value steps on one stretch of experience."""
-    look = jax.vmap(jax.vmap(lambda o: _look(ppo, training.seen, o)))
+    look = jax.vmap(jax.vmap(lambda o: normalised(training.seen, o, ppo.normalise)))
     observation, next_observation = look(experience.observation), look(experience.next_observation)
     critic = jax.vmap(jax.vmap(lambda o: network(training.weights.critic, o)[0]))
     value = critic(observation)
@@ -322,26 +317,3 @@ def _entropy(action: Action, outputs: Array, log_std: Any) -> Array:
         return jnp.sum(log_std + (jnp.log(2 * jnp.pi) + 1) / 2)
     log_probability = jax.nn.log_softmax(outputs)
     return -jnp.sum(jnp.exp(log_probability) * log_probability)
-
-
-def _look(ppo: PPO, seen: Seen, observation: Array) -> Array:
-    if not ppo.normalise:
-        return observation
-    mean, scale = _normaliser(seen)
-    return (observation - mean) / scale
-
-
-def _normaliser(seen: Seen) -> tuple[Array, Array]:
-    return seen.mean, jnp.sqrt(seen.variance + 1e-8)
-
-
-def _watch(seen: Seen, observation: Float[Array, "environments horizon k"]) -> Seen:
-    """Merge the statistics of a batch: Chan, Golub and LeVeque (1979), eqs. 2.1."""
-    rows = observation.reshape(-1, observation.shape[-1])
-    count = jnp.float32(rows.shape[0])
-    mean, variance = jnp.mean(rows, axis=0), jnp.var(rows, axis=0)
-    total = seen.count + count
-    shift = mean - seen.mean
-    squares = seen.variance * seen.count + variance * count
-    squares = squares + shift**2 * seen.count * count / total
-    return Seen(total, seen.mean + shift * count / total, squares / total)
