@@ -40,7 +40,14 @@ def end_of_a_round(run, least):
     return int(begins[begins >= least][0])
 
 
-@pytest.mark.parametrize("name", ["uniform", "cross_entropy", "gradient", "portfolio"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "uniform",
+        "portfolio",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("cross_entropy", "gradient")),
+    ],
+)
 def test_in_memory(problem, name):
     whole = vj.falsify(problem, name, 96, batch=16)
     first = end_of_a_round(whole, 32)

@@ -205,6 +205,7 @@ def test_task_refuses_numbers_out_of_range():
         cp.CartPoleTask(length_range=-1)
 
 
+@pytest.mark.slow
 def test_argmax_pushes_with_full_force_and_has_the_derivative_of_the_mean_force():
     hard, smooth = cp.neural(), cp.neural(action="expected")
     blind = cp.neural(straight_through=False)

@@ -45,6 +45,7 @@ def test_a_training_does_not_depend_on_its_company(group, policies):
     assert any(np.any(a != b) for a, b in zip(policies[0], policies[1], strict=True))
 
 
+@pytest.mark.slow
 def test_under_one_vmap_the_same_to_rounding(group, policies):
     together = trained(group, devices=jax.local_devices()[:1], together=3)
     for one, other in zip(policies, together, strict=True):

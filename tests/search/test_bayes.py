@@ -62,7 +62,13 @@ def asked(search, cube, rho, rounds, batch=8, counted=True):
 
 @pytest.mark.parametrize(
     ("value", "counted"),
-    [(1.0, True), (-1.0, True), (np.inf, True), (np.nan, True), (np.nan, False)],
+    [
+        (np.nan, True),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [(1.0, True), (-1.0, True), (np.inf, True), (np.nan, False)]
+        ),
+    ],
 )
 def test_the_same_robustness_everywhere_gives_the_prior(value, counted):
     u, _ = asked(SMALL, Cube((0, 3)), lambda u: np.full(8, value), 3, counted=counted)

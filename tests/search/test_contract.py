@@ -44,9 +44,7 @@ EACH = [
         search,
         cube,
         id=f"{search!r}-{name}",
-        marks=pytest.mark.slow
-        if type(search).__name__ in LARGE and name not in ("empty", "mixed")
-        else (),
+        marks=pytest.mark.slow if type(search).__name__ in LARGE and name != "empty" else (),
     )
     for search in SEARCHES
     for name, cube in CUBES.items()

@@ -163,6 +163,7 @@ def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     assert float(seen.rho[3]) == np.float32(0.3)
 
 
+@pytest.mark.slow
 def test_the_gradient_is_that_of_the_raised_robustness():
     cube, search = Cube((0, 0, 0)), Diverse(Descent(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)

@@ -53,7 +53,14 @@ def test_the_failure_rates_are_as_stated(name):
     assert abs(failures - share * 2**18) < 5 * math.sqrt(share * 2**18)
 
 
-@pytest.mark.parametrize("name", [name for name in FLAT + MIXED if name != "needle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in MIXED else ())
+        for name in FLAT + MIXED
+        if name != "needle"
+    ],
+)
 @EACH
 def test_beats_uniform(search, name):
     if (type(search), name) in POINTLESS:
@@ -104,6 +111,7 @@ def test_cross_entropy_explores_evenly():
     assert np.all(np.abs(late.mean(axis=1) - 0.5) < 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", [CrossEntropy(), CMAES()], ids=["cross_entropy", "cmaes"])
 def test_learns_in_large_batches_too(search):
     _, (value,) = play(search, ("ball",), 512, 6, 4)
