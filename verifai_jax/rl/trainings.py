@@ -281,8 +281,8 @@ def _structure(configuration: Configuration) -> _Structure:
     return _Structure(Known(configuration.task), algorithm[1], shapes, capacity)
 
 
-def _stacked(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+def _stacked(trees: Sequence[list[np.ndarray]]) -> list[np.ndarray]:
+    return [np.stack(leaves) for leaves in zip(*trees, strict=True)]
 
 
 def _over_lanes(layout: _Layout, one: Any, shared: int) -> Any:
