@@ -72,6 +72,7 @@ def test_front_of_one_formula_is_its_worst_row(plain):
     assert len(vj.falsify(kept, "uniform", 16, batch=16).front) == 0
 
 
+@pytest.mark.slow
 def test_resuming_keeps_the_gravest(ordered):
     whole = vj.falsify(ordered, budget=96, batch=16)
     part = vj.falsify(ordered, budget=48, batch=16)

@@ -19,7 +19,9 @@ def problem():
     return vj.Problem("hill", SPACE, hill, "x >= 0.05")
 
 
-@pytest.mark.parametrize("name", ["uniform", "cross_entropy", "gradient"])
+@pytest.mark.parametrize(
+    "name", ["uniform", "cross_entropy", pytest.param("gradient", marks=pytest.mark.slow)]
+)
 def test_agrees_with_runs_of_the_same_seeds(problem, name):
     trials = vj.repeat(problem, name, 96, batch=16, seeds=[0, 3, 5], stop_early=False)
     assert trials.rho.shape == (3, 96)

@@ -154,6 +154,7 @@ def test_choices_and_neighbours():
     assert np.mean(np.all(cells == 2, axis=1)) < 0.25
 
 
+@pytest.mark.slow
 def test_batches_of_one():
     check_search(Annealing(), Cube((0, 3)), batch=3, rounds=8)
     u, _ = run(Annealing(), Cube((0, 0)), 1, lambda u: jnp.sum(u, axis=1), 300)

@@ -76,6 +76,7 @@ def test_the_same_robustness_everywhere_gives_the_prior(value, counted):
     np.testing.assert_allclose(u, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_space_of_few_points_is_searched_through():
     # Eleven of twelve choices are tried before any is tried again, but for exploration.
     cube = Cube((4, 3), ordered=(False, False))

@@ -30,7 +30,7 @@ CUBE = Cube(
     "search",
     [
         split({"cars": "halton"}),
-        split({"x": "gradient", "cars": "cross_entropy"}),
+        pytest.param(split({"x": "gradient", "cars": "cross_entropy"}), marks=pytest.mark.slow),
         split({"x, colour, cars": "cross_entropy"}),
     ],
     ids=repr,
