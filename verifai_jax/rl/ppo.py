@@ -16,6 +16,13 @@ from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.rl.advantage import Ends, advantages
 from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
+from verifai_jax.rl.experience import (
+    Episodes,
+    Transition,
+    begin,
+    observation_size,
+    progress,
+)
 from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
 from verifai_jax.rl.shuffling import permutation
@@ -83,8 +90,8 @@ class PPO:
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "Training":
         """The state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
-        state = jax.vmap(task.reset)(jax.random.split(reset_key, self.environments))
-        size = jax.eval_shape(jax.vmap(task.observe), state).shape[-1]
+        episodes = begin(task, reset_key, self.environments)
+        size = observation_size(task, episodes)
         discrete = isinstance(task.action, Discrete)
         outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
         weights = Weights(
@@ -97,9 +104,7 @@ class PPO:
             weights=weights,
             moments=_optimizer(self).init(weights),
             seen=Seen.nothing(size),
-            episodes=Episodes(
-                state, jnp.zeros(self.environments, jnp.int32), jnp.zeros(self.environments)
-            ),
+            episodes=episodes,
             key=key,
             done=jnp.int32(0),
             updates=jnp.int32(updates),
@@ -111,12 +116,8 @@ class PPO:
         episodes, experience = _collect(self, task, state, collect_key)
         seen = watch(state.seen, experience.observation) if self.normalise else state.seen
         weights, moments = _learn(self, task, state, experience, learn_key)
-        over = experience.ends.terminated | experience.ends.truncated
-        count = jnp.sum(over)
-        total = jnp.sum(jnp.where(over, experience.finished_return, 0.0))
-        progress = Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)
         after = Training(weights, moments, seen, episodes, key, state.done + 1, state.updates)
-        return after, progress
+        return after, progress(experience.transition)
 
     def policy(self, task: Task, state: "Training") -> Policy:
         """The policy as learnt so far, without exploration."""
@@ -132,14 +133,6 @@ class Weights:
     policy: Layers
     critic: Layers
     log_std: Float[Array, " size"] | None
-
-
-class Episodes(NamedTuple):
-    """Where each environment stands."""
-
-    state: Any
-    age: Int[Array, " environments"]
-    total: Float[Array, " environments"]
 
 
 class Training(NamedTuple):
@@ -160,10 +153,7 @@ class Experience(NamedTuple):
     observation: Float[Array, " k"]
     action: Array
     outputs: Float[Array, " outputs"]
-    reward: Float[Array, ""]
-    next_observation: Float[Array, " k"]
-    ends: Ends
-    finished_return: Float[Array, ""]
+    transition: Transition
 
 
 def _collect(
@@ -189,10 +179,9 @@ def _collect(
             observation=observation,
             action=action,
             outputs=outputs,
-            reward=jnp.asarray(reward, jnp.float32),
-            next_observation=task.observe(after),
-            ends=ends,
-            finished_return=total,
+            transition=Transition(
+                jnp.asarray(reward, jnp.float32), task.observe(after), ends, total
+            ),
         )
         fresh = (task.reset(reset_key), jnp.int32(0), jnp.zeros(()))
         return jax.tree.map(
@@ -218,15 +207,16 @@ def _learn(
 ) -> tuple[Weights, Any]:
     """A few epochs of clipped policy and value steps on one stretch of experience."""
     look = jax.vmap(jax.vmap(lambda o: normalised(training.seen, o, ppo.normalise)))
-    observation, next_observation = look(experience.observation), look(experience.next_observation)
+    transition = experience.transition
+    observation, next_observation = look(experience.observation), look(transition.next_observation)
     critic = jax.vmap(jax.vmap(lambda o: network(training.weights.critic, o)[0]))
     value = critic(observation)
     estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
     advantage = estimate(
-        experience.reward,
+        transition.reward,
         value,
         critic(next_observation),
-        experience.ends,
+        transition.ends,
         ppo.discount,
         ppo.gae_lambda,
     )

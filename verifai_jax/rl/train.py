@@ -71,10 +71,11 @@ def train(
     algorithm = PPO() if algorithm is None else algorithm
     trainings = Trainings([Configuration(task, algorithm, steps, seed)])
     kept = []
-    for at in sorted(set(snapshots)):
+    ordered = sorted(set(snapshots))
+    for at in ordered:
         if not 1 <= at <= steps:
             raise ValueError(f"snapshots must lie between 1 and steps = {steps}; got {at}")
-    for at in sorted(set(snapshots)):
+    for at in ordered:
         for number in trainings.advance({0: at}):
             kept.append(Snapshot(int(trainings.curve(number)[0][-1]), trainings.policy(number)))
     for _ in trainings.advance({0: steps}):

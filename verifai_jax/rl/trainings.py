@@ -273,12 +273,17 @@ def _number(leaf: Any) -> np.ndarray:
     return array.astype(np.float32 if array.dtype.kind == "f" else np.int32)
 
 
-def _structure(configuration: Configuration) -> _Structure:
+def form_of(configuration: Configuration) -> tuple[Hashable, Hashable, tuple[Any, ...]]:
+    """What is equal for trainings whose policies have one form: task, algorithm, and shapes."""
     task, algorithm = leaves_of(configuration.task), leaves_of(configuration.algorithm)
     shapes = tuple((leaf.shape, leaf.dtype.str) for leaf in task[0] + algorithm[0])
+    return Known(configuration.task), algorithm[1], shapes
+
+
+def _structure(configuration: Configuration) -> _Structure:
     # A power of two: trainings of other lengths share the program.
     capacity = 1 << max(6, (configuration.updates - 1).bit_length())
-    return _Structure(Known(configuration.task), algorithm[1], shapes, capacity)
+    return _Structure(*form_of(configuration), capacity)
 
 
 def _stacked(trees: Sequence[list[np.ndarray]]) -> list[np.ndarray]:

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from verifai_jax.rl.policy import Policy
-from verifai_jax.rl.trainings import Configuration, Known, Trainings, leaves_of
+from verifai_jax.rl.trainings import Configuration, Trainings, form_of
 from verifai_jax.sweeps.record import Curve
 from verifai_jax.sweeps.store import Store, StoreError, Work
 from verifai_jax.sweeps.study import Study
@@ -108,9 +108,7 @@ class Lessons:
         """What is equal for trainings whose policies have one form and share a program."""
         configuration = self.lessons[number].configuration
         assert configuration is not None
-        task, algorithm = leaves_of(configuration.task), leaves_of(configuration.algorithm)
-        shapes = tuple((leaf.shape, leaf.dtype.str) for leaf in task[0] + algorithm[0])
-        return (Known(configuration.task), algorithm[1], shapes)
+        return form_of(configuration)
 
     def reach(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
         """Take these trainings to a snapshot, or to their last if they have fewer.
