@@ -19,7 +19,7 @@ import numpy as np
 
 from verifai_jax.certification import certify, race
 from verifai_jax.certification.allocation import Allocation
-from verifai_jax.certification.bounds import bounded, verdict
+from verifai_jax.statistics.confidence_sequences import bounded, verdict
 
 PROFILES = {
     "facts": np.r_[0, 0, 0.004, 0.035, 0.299, 0.357, np.linspace(0.05, 0.9, 58)],
@@ -143,7 +143,7 @@ def trained(configurations):
 
 def policies(configurations, runs, heavy):
     from specs.cartpole import balance_with
-    from verifai_jax.certification.pieces import Pieces
+    from verifai_jax.certification.blocks import Pieces
 
     some = trained(configurations)
     for kind in ("first", "again"):

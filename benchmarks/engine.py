@@ -31,11 +31,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import verifai_jax as vj
 from envs import cartpole
 from specs import ball, hopper, mujoco_cartpole
-from verifai_jax.backends import resolved
-from verifai_jax.engine import Engine, engine_for, judge, simulation_key
-from verifai_jax.gradients import Derivative
-from verifai_jax.host import HostEngine
-from verifai_jax.run import run_keys
+from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.differentiation import Derivative
+from verifai_jax.evaluation.engine import Engine, engine_for, judge
+from verifai_jax.evaluation.host_engine import HostEngine
 
 KEY = run_keys(0)[1]
 BATCHES = (1, 64, 1024, 4096)

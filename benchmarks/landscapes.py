@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.search import Cube
+from verifai_jax.core.cube import Cube
 
 
 class Landscape(NamedTuple):

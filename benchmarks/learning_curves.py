@@ -24,7 +24,7 @@ from envs.mountain_car import ContinuousMountainCarTask, MountainCarTask
 from verifai_jax.rl import PPO, evaluate
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
-from verifai_jax.rl.task import Task
+from verifai_jax.rl.task.task import Task
 from verifai_jax.rl.trainings import Configuration, Trainings
 
 

@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 import verifai_jax as vj
-from verifai_jax.mtl.robustness import LANES
+from verifai_jax.mtl._robustness import LANES
 
 SHAPES = {
     "G p": "G (p > 0)",
@@ -35,7 +35,7 @@ SHAPES = {
     "p U q": "(p > 0) U (q > 0)",
     "G(p U[5,50] q)": "G ((p > 0) U[5,50] (q > 0))",
 }
-SEMANTICS = {"hard": vj.hard, "smooth": vj.smooth(0.1)}
+SEMANTICS = {"hard": vj.mtl.hard, "smooth": vj.mtl.smooth(0.1)}
 
 #: Goals at T=1000 and batch 256, as multiples of `np.min(axis=0)`.
 GOALS = {

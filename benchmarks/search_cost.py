@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
-from verifai_jax.search import Cube, Evaluated
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Evaluated
 
 CUBE = Cube((0, 0, 0, 0))
 

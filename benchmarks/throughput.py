@@ -18,8 +18,8 @@ import numpy as np
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.engine import engine_for
-from verifai_jax.run import run_keys
+from verifai_jax.core.keys import run_keys
+from verifai_jax.evaluation.engine import engine_for
 
 STEPS, PERIOD = 200, 0.02
 X_LIMIT, THETA_LIMIT = 2.4, 12 * 2 * np.pi / 360

@@ -15,9 +15,9 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from verifai_jax.errors import check_names
-from verifai_jax.systems.mujoco_loop import State
-from verifai_jax.systems.mujoco_system import MuJoCo, mujoco
+from verifai_jax.core.errors import check_names
+from verifai_jax.systems.mujoco.loop import State
+from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 MODEL = Path(__file__).with_name("ball.xml")
 RAIL = 2.0

@@ -27,12 +27,12 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from envs.randomisation import check_ranges, factor
-from verifai_jax.errors import unknown_name
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
 from verifai_jax.rl.algorithm import Number
 from verifai_jax.rl.policy import Layers, written_out
-from verifai_jax.systems import Ode, ode, sin_cos
-from verifai_jax.systems.integrators import euler
+from verifai_jax.systems.ode import Ode, ode, sin_cos
+from verifai_jax.systems.ode.integrators import euler
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.errors import check_names, require
+from verifai_jax.core.errors import check_names, require
 from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.systems.mujoco_bindings import scaled
-from verifai_jax.systems.mujoco_system import MuJoCo, mujoco
+from verifai_jax.systems.mujoco.bindings import scaled
+from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Scalar = Float[Array, ""]
 Controller = Callable[..., Float[Array, "3"]]

@@ -26,11 +26,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.core.waveform import Waveform
 from verifai_jax.rl import Continuous, Policy, load_policy
 from verifai_jax.rl.policy import network, written_out
-from verifai_jax.systems import Ode, ode, sin_cos
-from verifai_jax.systems.integrators import rk4
-from verifai_jax.waveform import Waveform
+from verifai_jax.systems.ode import Ode, ode, sin_cos
+from verifai_jax.systems.ode.integrators import rk4
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

@@ -32,7 +32,7 @@ from envs.arch.stepped import Stepped, real, value
 from envs.randomisation import check_ranges, factor
 from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
 from verifai_jax.rl.algorithm import Number
-from verifai_jax.systems import sin_cos
+from verifai_jax.systems.ode import sin_cos
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

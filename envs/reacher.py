@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.errors import check_names
+from verifai_jax.core.errors import check_names
 from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.rl.mjx_task import MjxTask, mjx_task
-from verifai_jax.systems.mujoco_bindings import scaled
-from verifai_jax.systems.mujoco_system import MuJoCo, mujoco
+from verifai_jax.rl.task.mjx import MjxTask, mjx_task
+from verifai_jax.systems.mujoco.bindings import scaled
+from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Controller = Callable[..., Float[Array, "2"]]
 

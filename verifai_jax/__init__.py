@@ -1,99 +1,224 @@
 """verifai_jax: find inputs that make a closed-loop system break a temporal-logic property."""
 
-__version__ = "0.1.0"
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from verifai_jax import analysis as analysis
-from verifai_jax import mtl as mtl
-from verifai_jax import rl as rl
-from verifai_jax import search as search
-from verifai_jax.certification import Certificates as Certificates
-from verifai_jax.certification import certify as certify
-from verifai_jax.counterexample import Confirmation as Confirmation
-from verifai_jax.counterexample import Confirmations as Confirmations
-from verifai_jax.counterexample import confirm as confirm
-from verifai_jax.counterexample import explain as explain
-from verifai_jax.counterexample import shrink as shrink
-from verifai_jax.devices import claim_cores as _claim_cores
-from verifai_jax.estimation import Estimate as Estimate
-from verifai_jax.estimation import estimate as estimate
-from verifai_jax.falsify import RunError as RunError
-from verifai_jax.falsify import falsify as falsify
-from verifai_jax.falsify import resume as resume
-from verifai_jax.falsify import simulate as simulate
-from verifai_jax.features import Array as Array
-from verifai_jax.features import Box as Box
-from verifai_jax.features import Categorical as Categorical
-from verifai_jax.features import Constant as Constant
-from verifai_jax.features import DiscreteBox as DiscreteBox
-from verifai_jax.features import Distribution as Distribution
-from verifai_jax.features import FeatureSpace as FeatureSpace
-from verifai_jax.features import LogUniform as LogUniform
-from verifai_jax.features import Normal as Normal
-from verifai_jax.features import Signal as Signal
-from verifai_jax.features import Struct as Struct
-from verifai_jax.features import TruncatedNormal as TruncatedNormal
-from verifai_jax.mtl import FALSE as FALSE
-from verifai_jax.mtl import TRUE as TRUE
-from verifai_jax.mtl import Formula as Formula
-from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
-from verifai_jax.mtl import always as always
-from verifai_jax.mtl import boolean as boolean
-from verifai_jax.mtl import eventually as eventually
-from verifai_jax.mtl import hard as hard
-from verifai_jax.mtl import historically as historically
-from verifai_jax.mtl import next_ as next_
-from verifai_jax.mtl import once as once
-from verifai_jax.mtl import online as online
-from verifai_jax.mtl import parse as parse
-from verifai_jax.mtl import prev as prev
-from verifai_jax.mtl import robustness as robustness
-from verifai_jax.mtl import robustness_signal as robustness_signal
-from verifai_jax.mtl import satisfied as satisfied
-from verifai_jax.mtl import signal as signal
-from verifai_jax.mtl import since as since
-from verifai_jax.mtl import smooth as smooth
-from verifai_jax.mtl import until as until
-from verifai_jax.problem import Problem as Problem
-from verifai_jax.problem import ProblemError as ProblemError
-from verifai_jax.rates import Decided as Decided
-from verifai_jax.rates import Rate as Rate
-from verifai_jax.rates import Within as Within
-from verifai_jax.rates import at_any_time as at_any_time
-from verifai_jax.rates import clopper_pearson as clopper_pearson
-from verifai_jax.rates import simulations_without_failure as simulations_without_failure
-from verifai_jax.rulebook import Rulebook as Rulebook
-from verifai_jax.run import Replay as Replay
-from verifai_jax.run import Run as Run
-from verifai_jax.run import load as load
-from verifai_jax.sweeps import Halving as Halving
-from verifai_jax.sweeps import OptunaSampler as OptunaSampler
-from verifai_jax.sweeps import Study as Study
-from verifai_jax.sweeps import StudyError as StudyError
-from verifai_jax.sweeps import Sweep as Sweep
-from verifai_jax.sweeps import Trainer as Trainer
-from verifai_jax.sweeps import load_sweep as load_sweep
-from verifai_jax.sweeps import sweep as sweep
-from verifai_jax.synthesis import Repair as Repair
-from verifai_jax.synthesis import Synthesis as Synthesis
-from verifai_jax.synthesis import repair as repair
-from verifai_jax.synthesis import synthesize as synthesize
-from verifai_jax.systems import blackbox as blackbox
-from verifai_jax.systems import brax as brax
-from verifai_jax.systems import gymnasium as gymnasium
-from verifai_jax.systems import gymnax as gymnax
-from verifai_jax.systems import mjx as mjx
-from verifai_jax.systems import mujoco as mujoco
-from verifai_jax.systems import native as native
-from verifai_jax.systems import ode as ode
-from verifai_jax.systems import remote as remote
-from verifai_jax.systems import scaled as scaled
-from verifai_jax.systems import sin_cos as sin_cos
-from verifai_jax.systems import stacked as stacked
-from verifai_jax.table import ErrorTable as ErrorTable
-from verifai_jax.trace import Status as Status
-from verifai_jax.trace import Trace as Trace
-from verifai_jax.trials import Trials as Trials
-from verifai_jax.trials import repeat as repeat
-from verifai_jax.waveform import Waveform as Waveform
+from verifai_jax._version import __version__ as __version__
+from verifai_jax.core.cores import claim_cores as _claim_cores
+
+if TYPE_CHECKING:
+    from verifai_jax import analysis as analysis
+    from verifai_jax import mtl as mtl
+    from verifai_jax import rl as rl
+    from verifai_jax import search as search
+    from verifai_jax.certification import Certificates as Certificates
+    from verifai_jax.certification import certify as certify
+    from verifai_jax.core.trace import Status as Status
+    from verifai_jax.core.trace import Trace as Trace
+    from verifai_jax.core.waveform import Waveform as Waveform
+    from verifai_jax.counterexamples import Confirmation as Confirmation
+    from verifai_jax.counterexamples import Confirmations as Confirmations
+    from verifai_jax.counterexamples import confirm as confirm
+    from verifai_jax.counterexamples import explain as explain
+    from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.estimation import Estimate as Estimate
+    from verifai_jax.estimation import estimate as estimate
+    from verifai_jax.falsification import ErrorTable as ErrorTable
+    from verifai_jax.falsification import Replay as Replay
+    from verifai_jax.falsification import Run as Run
+    from verifai_jax.falsification import RunError as RunError
+    from verifai_jax.falsification import Trials as Trials
+    from verifai_jax.falsification import falsify as falsify
+    from verifai_jax.falsification import load as load
+    from verifai_jax.falsification import repeat as repeat
+    from verifai_jax.falsification import resume as resume
+    from verifai_jax.falsification import simulate as simulate
+    from verifai_jax.features import Array as Array
+    from verifai_jax.features import Box as Box
+    from verifai_jax.features import Categorical as Categorical
+    from verifai_jax.features import Constant as Constant
+    from verifai_jax.features import DiscreteBox as DiscreteBox
+    from verifai_jax.features import Distribution as Distribution
+    from verifai_jax.features import FeatureSpace as FeatureSpace
+    from verifai_jax.features import LogUniform as LogUniform
+    from verifai_jax.features import Normal as Normal
+    from verifai_jax.features import Signal as Signal
+    from verifai_jax.features import Struct as Struct
+    from verifai_jax.features import TruncatedNormal as TruncatedNormal
+    from verifai_jax.mtl import Formula as Formula
+    from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
+    from verifai_jax.mtl import always as always
+    from verifai_jax.mtl import eventually as eventually
+    from verifai_jax.mtl import parse as parse
+    from verifai_jax.mtl import robustness as robustness
+    from verifai_jax.mtl import signal as signal
+    from verifai_jax.mtl import until as until
+    from verifai_jax.problem import Problem as Problem
+    from verifai_jax.problem import ProblemError as ProblemError
+    from verifai_jax.problem import Rulebook as Rulebook
+    from verifai_jax.statistics.binomial import Decided as Decided
+    from verifai_jax.statistics.binomial import Rate as Rate
+    from verifai_jax.statistics.binomial import Within as Within
+    from verifai_jax.statistics.binomial import at_any_time as at_any_time
+    from verifai_jax.statistics.binomial import clopper_pearson as clopper_pearson
+    from verifai_jax.statistics.binomial import (
+        simulations_without_failure as simulations_without_failure,
+    )
+    from verifai_jax.sweeps import Halving as Halving
+    from verifai_jax.sweeps import OptunaSampler as OptunaSampler
+    from verifai_jax.sweeps import Study as Study
+    from verifai_jax.sweeps import StudyError as StudyError
+    from verifai_jax.sweeps import Sweep as Sweep
+    from verifai_jax.sweeps import Trainer as Trainer
+    from verifai_jax.sweeps import load_sweep as load_sweep
+    from verifai_jax.sweeps import sweep as sweep
+    from verifai_jax.synthesis import Repair as Repair
+    from verifai_jax.synthesis import Synthesis as Synthesis
+    from verifai_jax.synthesis import repair as repair
+    from verifai_jax.synthesis import synthesize as synthesize
+    from verifai_jax.systems.blackbox import blackbox as blackbox
+    from verifai_jax.systems.blackbox import stacked as stacked
+    from verifai_jax.systems.environments import brax as brax
+    from verifai_jax.systems.environments import gymnasium as gymnasium
+    from verifai_jax.systems.environments import gymnax as gymnax
+    from verifai_jax.systems.mujoco import mjx as mjx
+    from verifai_jax.systems.mujoco import mujoco as mujoco
+    from verifai_jax.systems.mujoco import native as native
+    from verifai_jax.systems.mujoco import scaled as scaled
+    from verifai_jax.systems.ode import ode as ode
+    from verifai_jax.systems.ode import sin_cos as sin_cos
+    from verifai_jax.systems.remote import remote as remote
+
+_ROOMS = ("analysis", "mtl", "rl", "search")
+
+# Imported when first used (PEP 562), so that importing this package takes milliseconds.
+_NAMES = {
+    "certification": (
+        "Certificates",
+        "certify",
+    ),
+    "core.trace": (
+        "Status",
+        "Trace",
+    ),
+    "core.waveform": ("Waveform",),
+    "counterexamples": (
+        "Confirmation",
+        "Confirmations",
+        "confirm",
+        "explain",
+        "shrink",
+    ),
+    "estimation": (
+        "Estimate",
+        "estimate",
+    ),
+    "falsification": (
+        "ErrorTable",
+        "Replay",
+        "Run",
+        "RunError",
+        "Trials",
+        "falsify",
+        "load",
+        "repeat",
+        "resume",
+        "simulate",
+    ),
+    "features": (
+        "Array",
+        "Box",
+        "Categorical",
+        "Constant",
+        "DiscreteBox",
+        "Distribution",
+        "FeatureSpace",
+        "LogUniform",
+        "Normal",
+        "Signal",
+        "Struct",
+        "TruncatedNormal",
+    ),
+    "mtl": (
+        "Formula",
+        "FormulaSyntaxError",
+        "always",
+        "eventually",
+        "parse",
+        "robustness",
+        "signal",
+        "until",
+    ),
+    "problem": (
+        "Problem",
+        "ProblemError",
+        "Rulebook",
+    ),
+    "statistics.binomial": (
+        "Decided",
+        "Rate",
+        "Within",
+        "at_any_time",
+        "clopper_pearson",
+        "simulations_without_failure",
+    ),
+    "sweeps": (
+        "Halving",
+        "OptunaSampler",
+        "Study",
+        "StudyError",
+        "Sweep",
+        "Trainer",
+        "load_sweep",
+        "sweep",
+    ),
+    "synthesis": (
+        "Repair",
+        "Synthesis",
+        "repair",
+        "synthesize",
+    ),
+    "systems.blackbox": (
+        "blackbox",
+        "stacked",
+    ),
+    "systems.environments": (
+        "brax",
+        "gymnasium",
+        "gymnax",
+    ),
+    "systems.mujoco": (
+        "mjx",
+        "mujoco",
+        "native",
+        "scaled",
+    ),
+    "systems.ode": (
+        "ode",
+        "sin_cos",
+    ),
+    "systems.remote": ("remote",),
+}
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = ["__version__", *_ROOMS, *_MODULE_OF]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        value: Any = importlib.import_module(f"verifai_jax.{name}")
+    elif name in _MODULE_OF:
+        value = getattr(importlib.import_module(f"verifai_jax.{_MODULE_OF[name]}"), name)
+    else:
+        from verifai_jax.core.errors import nearest_names
+
+        raise AttributeError(f"verifai_jax has no {name!r}{nearest_names(name, __all__)}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
 
 _claim_cores()

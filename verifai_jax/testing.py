@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.cube import Cube
+from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl.clauses import ABSENT, CLAUSES
-from verifai_jax.search import Cube, Evaluated, Search
-from verifai_jax.systems.blackbox import plain_leaves
-from verifai_jax.trace import Status, Trace
+from verifai_jax.search import Evaluated, Search
+from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 
 def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:

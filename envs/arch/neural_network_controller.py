@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from envs.arch.stepped import Features, Scalar, Stepped, real, repeated, value, whole
-from verifai_jax.systems.integrators import rk4
+from verifai_jax.systems.ode.integrators import rk4
 
 DT = 0.01
 NOMINAL = {"Ref": 2.0}

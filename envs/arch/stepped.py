@@ -3,7 +3,7 @@
     Stepped(initial, advance, signals, dt=0.01, steps=3000, nominal={"throttle": 50.0})
 
 The benchmark models prescribe solvers, and let discrete logic run at instants of its own, which
-`verifai_jax.systems.ode` has no words for.
+`verifai_jax.systems.ode._ode` has no words for.
 """
 
 import math
@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.errors import check_names
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.waveform import bound
 from verifai_jax.systems.horizon import checkpointed_scan
-from verifai_jax.systems.integrators import check_factor
-from verifai_jax.trace import Status, Trace
-from verifai_jax.waveform import bound
+from verifai_jax.systems.ode.integrators import check_factor
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

@@ -7,7 +7,7 @@ are cores.
 """
 
 import verifai_jax as vj
-from verifai_jax.systems.remote import remote
+from verifai_jax.systems.remote._remote import remote
 
 swing = vj.Problem(
     "swing",

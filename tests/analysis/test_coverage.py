@@ -8,10 +8,10 @@ import pytest
 from scipy.stats import norm, qmc
 
 import verifai_jax as vj
-from verifai_jax.analysis.cells import pair_counts
-from verifai_jax.analysis.coverage import coverage
-from verifai_jax.analysis.marginals import marginals
-from verifai_jax.analysis.samples import Samples
+from verifai_jax.analysis._coverage import coverage
+from verifai_jax.analysis.data.cells import pair_counts
+from verifai_jax.analysis.data.marginals import marginals
+from verifai_jax.analysis.data.samples import Samples
 
 
 def judged(**columns):

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from verifai_jax.analysis.diverse import diverse
-from verifai_jax.analysis.samples import Samples
+from verifai_jax.analysis._diverse import diverse
+from verifai_jax.analysis.data.samples import Samples
 
 
 def mixed(n=60, seed=0):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from failing_table import failing_table
 
-from verifai_jax.analysis.importance import importance
+from verifai_jax.analysis._importance import importance
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,9 @@ import pandas as pd
 import pytest
 
 from verifai_jax.analysis import tightest as module
+from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import k_closest, nearest, random_rows
-from verifai_jax.analysis.samples import Samples
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
 
 
 def table(kind, n=120, seed=0):

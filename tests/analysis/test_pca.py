@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 from sklearn.decomposition import PCA
 
-from verifai_jax.analysis.pca import pca
-from verifai_jax.analysis.samples import Samples
+from verifai_jax.analysis._pca import pca
+from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace
 
 SPACE = FeatureSpace(

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from verifai_jax.analysis.recurrent import recurrent
+from verifai_jax.analysis.frequent_patterns import recurrent
 from verifai_jax.features import Box, Categorical, DiscreteBox, FeatureSpace
 
 SPACE = FeatureSpace(
@@ -168,7 +168,7 @@ def test_refused(monkeypatch):
     with pytest.raises(ValueError, match="against must be 'auto', 'table' or 'prior'; got 'safe'"):
         recurrent(frame, against="safe")  # pyright: ignore[reportArgumentType]
     # The package has a function of that name.
-    module = importlib.import_module("verifai_jax.analysis.recurrent")
+    module = importlib.import_module("verifai_jax.analysis.frequent_patterns")
     monkeypatch.setattr(module, "MOST_COMBINATIONS", 5)
     with pytest.raises(ValueError, match=r"more than 5 combinations of up to 2 values .*raise min"):
         recurrent(frame, minimum=0.01)

@@ -6,9 +6,9 @@ import pytest
 from scipy.stats import binomtest
 
 import verifai_jax as vj
-from verifai_jax.analysis.columns import Column
+from verifai_jax.analysis._rules import _aside, rules
 from verifai_jax.analysis.conditions import Between, OneOf, Region, short_number
-from verifai_jax.analysis.rules import _aside, rules
+from verifai_jax.analysis.data.columns import Column
 
 
 def frame(n=4000, seed=0):

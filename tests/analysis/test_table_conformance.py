@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from verifai_jax.analysis._pca import pca
+from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.neighbours import k_closest, random_rows
-from verifai_jax.analysis.pca import pca
-from verifai_jax.analysis.samples import Samples
 from verifai_jax.features import Box, Categorical, FeatureSpace
 
 SPACE = FeatureSpace({"c": Categorical("r", "g", "b"), "x": Box(0, 10), "y": Box(0, 1)})

@@ -6,7 +6,7 @@ from scipy.stats import beta
 
 from verifai_jax.certification import race
 from verifai_jax.certification.allocation import Allocation, standing
-from verifai_jax.certification.bounds import bounded, verdict
+from verifai_jax.statistics.confidence_sequences import bounded, verdict
 
 # Failure rates of 64 policies: the six of `facts` that reached full return, the others worse.
 FACTS = np.concatenate([[0, 0, 0.004, 0.035, 0.299, 0.357], np.linspace(0.05, 0.9, 58)])

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.certification import certify, programs
-from verifai_jax.certification.families import digest, families, padded
-from verifai_jax.certification.pieces import Pieces
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.certification import certify
+from verifai_jax.certification import simulators as programs
+from verifai_jax.certification.blocks import Pieces
+from verifai_jax.certification.policy_groups import digest, families, padded
+from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.rl import Continuous, Policy
 
 X = vj.FeatureSpace({"x": vj.Box(0.0, 1.0), "z": vj.Box(0.0, 1.0)})

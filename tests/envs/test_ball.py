@@ -7,8 +7,8 @@ import pytest
 
 from envs import ball
 from specs import ball as specs
-from verifai_jax.errors import UnknownNameError
-from verifai_jax.host import HostEngine
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.evaluation.host_engine import HostEngine
 
 
 def rows(problem, n, seed=3):

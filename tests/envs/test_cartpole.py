@@ -8,11 +8,11 @@ import pytest
 
 from envs import cartpole as cp
 from specs.cartpole import balance_with
-from verifai_jax.engine import judge
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.engine import judge
 from verifai_jax.rl import Discrete, Policy, evaluate, load_policy
 from verifai_jax.rl.policy import new_layers
-from verifai_jax.trace import Status
 
 KEY = jax.random.key(0)
 

@@ -12,9 +12,9 @@ import verifai_jax as vj
 from envs import hopper as h
 from envs import train_hopper, training
 from specs import hopper as specs
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.falsification.run import replay
 from verifai_jax.rl import Discrete, Trained, evaluate, load_policy, policy_notes
-from verifai_jax.run import replay
 
 KEY = jax.random.key(0)
 PROBLEMS = ("upright", "gusts", "advances")  # that of "familiar" is that of "upright"

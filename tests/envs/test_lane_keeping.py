@@ -9,11 +9,11 @@ import verifai_jax as vj
 from envs import lane_keeping as lk
 from envs.lane_keeping_drawing import draw
 from specs import lane_keeping as specs
-from verifai_jax.report.style import new_figure
+from verifai_jax.core.waveform import Waveform
+from verifai_jax.plotting.style import new_figure
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.search import Listed
-from verifai_jax.waveform import Waveform
 
 KEY = jax.random.key(0)
 PROBLEMS = {name: p for name in dir(specs) if isinstance(p := getattr(specs, name), vj.Problem)}

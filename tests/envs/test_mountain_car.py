@@ -9,7 +9,7 @@ from gymnasium.envs.classic_control import continuous_mountain_car
 
 from envs import mountain_car as mc
 from specs.mountain_car import climb, climb_continuous, climb_with
-from verifai_jax.engine import judge
+from verifai_jax.evaluation.engine import judge
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate
 
 KEY = jax.random.key(0)

@@ -12,10 +12,10 @@ from envs import cartpole as analytic
 from envs import mujoco_cartpole
 from specs import cartpole as paper
 from specs import mujoco_cartpole as specs
-from verifai_jax.engine import judge
-from verifai_jax.errors import UnknownNameError
-from verifai_jax.host import HostEngine
-from verifai_jax.trace import Status
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.engine import judge
+from verifai_jax.evaluation.host_engine import HostEngine
 
 ROWS = 256
 

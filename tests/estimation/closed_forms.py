@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import chi2, norm
 
-from verifai_jax.estimation.judging import Judge
+from verifai_jax.estimation.normal_space import Judge
 
 
 def judged(robustness, dim, budget, **options):

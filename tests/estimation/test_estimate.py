@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from scipy.stats import norm
 
 import verifai_jax as vj
-from verifai_jax.commands.estimate import estimate as command
+from verifai_jax.cli.estimate import estimate as command
 from verifai_jax.estimation import estimate
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closed_forms import CASES, half_space, judged, normal
 
-from verifai_jax.estimation.estimate import _one_thread
+from verifai_jax.estimation._estimate import _one_thread
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
@@ -141,7 +141,7 @@ def test_interruption_keeps_what_is_finished():
         rho = robustness(u)
         return rho, rho < 0, np.ones(len(u), bool)
 
-    from verifai_jax.estimation.judging import Judge
+    from verifai_jax.estimation.normal_space import Judge
 
     judge = Judge(evaluate, 2, 50_000, batch=1000)
     plan = Plan(0.95, 32, np.zeros(2, bool))

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from verifai_jax.core.waveform import Waveform
 from verifai_jax.features import (
     Array,
     Box,
@@ -17,9 +18,8 @@ from verifai_jax.features import (
     Signal,
     Struct,
 )
-from verifai_jax.systems import ode
+from verifai_jax.systems.ode import ode
 from verifai_jax.testing import check_domain
-from verifai_jax.waveform import Waveform
 
 SIGNALS = [
     Signal(Box(-1, 1), knots=4),

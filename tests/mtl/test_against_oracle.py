@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mtl_oracle import DT, Oracle, formulas, recordings
 
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import (
     boolean,
     certificate,
@@ -18,7 +19,6 @@ from verifai_jax.mtl import (
     simplify,
     smooth,
 )
-from verifai_jax.trace import Trace
 
 # Every example is another program: compiling them would take far longer than running them.
 UNCOMPILED = settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])

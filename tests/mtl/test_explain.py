@@ -8,9 +8,9 @@ import pytest
 from matplotlib.figure import Figure
 from mtl_oracle import DT, Oracle
 
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import draw, explain, parse
 from verifai_jax.mtl import formula as ast
-from verifai_jax.trace import Trace
 
 FORMULAS = [
     "G[0,4] (abs(x) <= 1.5 & abs(y) <= 1.2)",

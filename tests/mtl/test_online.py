@@ -7,9 +7,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from mtl_oracle import DT, Oracle, formulas, recordings
 
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import IntervalError, online, robustness
-from verifai_jax.trace import Trace
 
 UNCOMPILED = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 

@@ -5,9 +5,9 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import read, resample, robustness
-from verifai_jax.trace import Trace
 
 
 @pytest.fixture

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import (
     HorizonError,
     IntervalError,
@@ -22,7 +23,6 @@ from verifai_jax.mtl import (
     smooth,
 )
 from verifai_jax.mtl import formula as ast
-from verifai_jax.trace import Trace
 
 NESTED = parse("G[0,2] (x > 0 -> F[0,1] ((y > 0) U[0.1,0.5] (x < y)))")
 

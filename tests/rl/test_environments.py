@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from envs import cartpole as cp
-from verifai_jax.errors import UnknownNameError
-from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, evaluate, train
-from verifai_jax.rl.mjx_task import mjx_task
-from verifai_jax.rl.ode_task import ode_task
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, evaluate
+from verifai_jax.rl import _train as train
 from verifai_jax.rl.policy import new_layers
-from verifai_jax.systems import ode
+from verifai_jax.rl.task.mjx import mjx_task
+from verifai_jax.rl.task.ode import ode_task
+from verifai_jax.systems.ode import ode
 
 KEY = jax.random.key(5)
 
@@ -53,7 +54,7 @@ def gymnax():
 
 
 def gymnax_task(*arguments, **options):
-    from verifai_jax.rl.gymnax_task import gymnax_task
+    from verifai_jax.rl.task.gymnax import gymnax_task
 
     return gymnax_task(*arguments, **options)
 
@@ -183,7 +184,7 @@ def brax():
 
 
 def brax_task(*arguments, **options):
-    from verifai_jax.rl.brax_task import brax_task
+    from verifai_jax.rl.task.brax import brax_task
 
     return brax_task(*arguments, **options)
 

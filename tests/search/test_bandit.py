@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import Cube, Evaluated
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Evaluated
 from verifai_jax.search.bandit import Bandit, _draw, _fill
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from playing import gain, play
 
-from verifai_jax.search import Cube, Evaluated
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Evaluated
 from verifai_jax.search.bayes import Bayes
 from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search

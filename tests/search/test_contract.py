@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 from playing import tell_of
 
-from verifai_jax.search import (
-    CrossEntropy,
-    Cube,
-    Gradient,
-    Halton,
-    Mutation,
-    Uniform,
-    named,
-    names,
-)
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import CrossEntropy, Gradient, Halton, Mutation, Uniform, named, names
 from verifai_jax.testing import check_batch_independence, check_search
 
 # A small model says the same of the contract and compiles sooner.

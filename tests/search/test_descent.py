@@ -8,8 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
-from verifai_jax.search import Cube, Evaluated, Gradient, Portfolio
+from verifai_jax.search import Evaluated, Gradient, Portfolio
 from verifai_jax.search.gradient import _least
 
 D, K = 5, 4

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import CrossEntropy, Cube, Evaluated, Gradient, Search, Uniform
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import CrossEntropy, Evaluated, Gradient, Search, Uniform
 from verifai_jax.search.diverse import Diverse, apart, distinct
 from verifai_jax.testing import check_search
 

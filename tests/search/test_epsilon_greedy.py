@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import Cube, Evaluated
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Evaluated
 from verifai_jax.search.epsilon_greedy import EpsilonGreedy
 
 

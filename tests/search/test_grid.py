@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import Cube
+from verifai_jax.core.cube import Cube
 from verifai_jax.search.grid import Grid
 from verifai_jax.testing import check_batch_independence, check_search
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verifai_jax.search import Cube, Halton, Uniform
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Halton, Uniform
 from verifai_jax.search.halton import halton_points, primes
 
 

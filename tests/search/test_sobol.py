@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verifai_jax.search import Cube
+from verifai_jax.core.cube import Cube
 from verifai_jax.search.sobol import Sobol
 from verifai_jax.testing import check_batch_independence, check_search
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from playing import tell_of
 
+from verifai_jax.core.cube import Cube
 from verifai_jax.search import (
     CrossEntropy,
-    Cube,
     Gradient,
     Halton,
     Split,

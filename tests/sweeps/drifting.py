@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import verifai_jax as vj
-from verifai_jax.rates import clopper_pearson
 from verifai_jax.rl import Continuous, Discrete, Policy, Progress
 from verifai_jax.rl.algorithm import check_values, shape
-from verifai_jax.sweeps.certifying import Judged, Judgement
+from verifai_jax.statistics.binomial import clopper_pearson
+from verifai_jax.sweeps.safety import Judged, Judgement
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import Trainer
 

@@ -6,9 +6,9 @@ import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
 import verifai_jax as vj
+from verifai_jax.sweeps.fanova import Boxes, boxes_of, variance_shares
 from verifai_jax.sweeps.importance import hyperparameter_importance
 from verifai_jax.sweeps.trends import trends
-from verifai_jax.sweeps.variance import Boxes, boxes_of, variance_shares
 
 SPACE = vj.FeatureSpace(
     {

@@ -5,7 +5,7 @@ import pytest
 from drifting import Drift, Picks, Point, closed_loop, drifting
 
 import verifai_jax as vj
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.features import Constant, FeatureSpace
 from verifai_jax.rl import PPO
 from verifai_jax.sweeps.study import Study

@@ -8,16 +8,18 @@ import pytest
 from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
-from verifai_jax.errors import MissingExtra, UnknownNameError
-from verifai_jax.rl import evaluate, train
-from verifai_jax.sweeps import driver, lessons
-from verifai_jax.sweeps.driver import sweep
+from verifai_jax.core.errors import MissingExtra, UnknownNameError
+from verifai_jax.rl import _train as train
+from verifai_jax.rl import evaluate
+from verifai_jax.rl.policy_evaluation import nominal_returns
+from verifai_jax.sweeps import _sweep as driver
+from verifai_jax.sweeps import training_runs as lessons
+from verifai_jax.sweeps._sweep import sweep
+from verifai_jax.sweeps.cache import Store, StoreError
 from verifai_jax.sweeps.halving import Halving
 from verifai_jax.sweeps.optuna import OptunaSampler
+from verifai_jax.sweeps.proposers import WORST, CubeAsker, badness
 from verifai_jax.sweeps.record import AFTER, BEFORE
-from verifai_jax.sweeps.returns import nominal_returns
-from verifai_jax.sweeps.searching import WORST, CubeAsker, badness
-from verifai_jax.sweeps.store import Store, StoreError
 from verifai_jax.sweeps.trainer import StudyError
 
 

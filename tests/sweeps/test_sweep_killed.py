@@ -16,8 +16,8 @@ import sys
 import numpy as np
 import verifai_jax as vj
 from drifting import Drift, drifting
-from verifai_jax.sweeps import lessons
-from verifai_jax.sweeps.driver import sweep
+from verifai_jax.sweeps import training_runs as lessons
+from verifai_jax.sweeps._sweep import sweep
 from verifai_jax.sweeps.halving import Halving
 
 study = drifting({"rate": vj.LogUniform(0.01, 0.3), "width": vj.Categorical(3, 4)}, seeds=2)

@@ -10,13 +10,13 @@ import pytest
 from planted_sweep import SPACE, ToyStudy, curve_to, planted_rows, record_of
 
 import verifai_jax as vj
-from verifai_jax.errors import MissingExtra, UnknownNameError
+from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import load_policy
-from verifai_jax.sweeps.pareto import fronts
+from verifai_jax.statistics.pareto import fronts
 from verifai_jax.sweeps.record import AFTER, BEFORE
 from verifai_jax.sweeps.result import Sweep
-from verifai_jax.sweeps.saving import SweepFileError, load_sweep
-from verifai_jax.sweeps.telling import lead, values_of
+from verifai_jax.sweeps.storage import SweepFileError, load_sweep
+from verifai_jax.sweeps.summary import lead, values_of
 
 NOT_TRAINED = {
     "nominal_return": np.nan,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies
 
-from verifai_jax.sweeps.store import Store, StoreError
+from verifai_jax.sweeps.cache import Store, StoreError
 
 ABOUT = {"study": "s", "space": {"a": "Box(0, 1)"}, "seeds": [0, 1]}
 

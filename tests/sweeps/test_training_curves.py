@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.sweeps.curves import check_curve, curve_trace, judge_curve
 
 STEPS = 1000 * np.arange(1, 9)

@@ -12,7 +12,7 @@ import verifai_jax as vj
 from envs import cartpole
 from specs.cartpole import balance
 from specs.tuning import decay, first_order, gains
-from verifai_jax.commands.repair import repair as command
+from verifai_jax.cli.repair import repair as command
 from verifai_jax.rl import load_policy
 from verifai_jax.synthesis import repair
 

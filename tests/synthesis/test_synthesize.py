@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from specs.tuning import decay, first_order
-from verifai_jax.commands.synthesize import synthesize as command
+from verifai_jax.cli.synthesize import synthesize as command
 from verifai_jax.synthesis import synthesize
 from verifai_jax.synthesis.parametric import FeatureParameters
 

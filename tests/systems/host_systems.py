@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from verifai_jax.trace import Trace
+from verifai_jax.core.trace import Trace
 
 
 def decay(features):

@@ -10,9 +10,9 @@ import pytest
 
 import verifai_jax as vj
 from envs import cartpole
-from verifai_jax.systems.simulations import Outcome
+from verifai_jax.core.trace import Trace
+from verifai_jax.systems.outcome import Outcome
 from verifai_jax.testing import check_system
-from verifai_jax.trace import Trace
 
 SPACE = vj.FeatureSpace({"x0": vj.Box(-1, 1), "theta0": vj.Box(-0.3, 0.3)})
 

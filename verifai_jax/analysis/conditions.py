@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.analysis.columns import Column
+from verifai_jax.analysis.data.columns import Column
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.analysis.marginals import Marginal
+from verifai_jax.analysis.data.marginals import Marginal
 
 PROBES = 4096
 REFINED = 4

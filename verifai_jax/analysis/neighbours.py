@@ -17,13 +17,21 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, Key
 
-from verifai_jax.analysis.drawing import draw_rows
-from verifai_jax.analysis.samples import Samples, Scale, Which, beside, distances, generator, whole
+from verifai_jax.analysis.data.samples import (
+    Samples,
+    Scale,
+    Which,
+    beside,
+    distances,
+    generator,
+    whole,
+)
 from verifai_jax.analysis.tightest import tightest
-from verifai_jax.errors import check_names
+from verifai_jax.core.errors import check_names
 from verifai_jax.features import FeatureSpace
-from verifai_jax.problem import Problem
-from verifai_jax.report.style import BOUND, new_figure, show_or_save, tidy
+from verifai_jax.plotting.rows import draw_rows
+from verifai_jax.plotting.style import BOUND, new_figure, show_or_save, tidy
+from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

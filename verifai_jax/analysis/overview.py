@@ -15,20 +15,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.analysis.clusters import clusters
-from verifai_jax.analysis.coverage import coverage
-from verifai_jax.analysis.importance import importance
-from verifai_jax.analysis.pca import pca
-from verifai_jax.analysis.recurrent import recurrent
-from verifai_jax.analysis.rules import rules
-from verifai_jax.analysis.samples import Samples
-from verifai_jax.errors import unknown_name
-from verifai_jax.run import Run, told
+from verifai_jax.analysis._coverage import coverage
+from verifai_jax.analysis._importance import importance
+from verifai_jax.analysis._pca import pca
+from verifai_jax.analysis._rules import rules
+from verifai_jax.analysis.clustering.clusters import clusters
+from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.analysis.frequent_patterns import recurrent
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.text import format_features
+from verifai_jax.falsification.run import Run
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.table import ErrorTable
+    from verifai_jax.falsification.table import ErrorTable
 
 FEWEST = 4
 MOST_TO_CLUSTER = 2000
@@ -100,7 +101,7 @@ class Analysis:
 
         With the boxes of the rules, the representatives of clusters, and the importances as bars.
         """
-        from verifai_jax.analysis.overview_plot import plot_overview
+        from verifai_jax.plotting.overview import plot_overview
 
         return plot_overview(self, path)
 
@@ -203,7 +204,7 @@ def _failures(source: Any, samples: Samples) -> str:
     if np.isfinite(samples.rho).any():
         place = samples.worst
         row = samples.frame.iloc[place]
-        where = told({name: row[name] for name in samples.names[:MOST_NAMED]})
+        where = format_features({name: row[name] for name in samples.names[:MOST_NAMED]})
         more = ", ..." if len(samples.names) > MOST_NAMED else ""
         lines.append(
             f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.analysis.columns import Column
 from verifai_jax.analysis.conditions import Region
+from verifai_jax.analysis.data.columns import Column
 
 MOST_ONE_HOT = 30
 MOST_ENTRIES = 500_000

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.certification.bounds import evidence_above, evidence_below, needed
+from verifai_jax.statistics.confidence_sequences import evidence_above, evidence_below, needed
 
 QUANTILES = 24
 """Points of the leader's posterior in the integral over it."""

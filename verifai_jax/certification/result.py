@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.certification.bounds import UNSAFE, safe_at
-from verifai_jax.rates import Rate
+from verifai_jax.statistics.binomial import Rate
+from verifai_jax.statistics.confidence_sequences import UNSAFE, safe_at
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.bounds import Weighted, skewed_interval, tail_index, weighted
-from verifai_jax.estimation.judging import Ended, Judge, Seen
+from verifai_jax.estimation.intervals import Weighted, skewed_interval, tail_index, weighted
 from verifai_jax.estimation.mixture import Mixture, fitted
+from verifai_jax.estimation.normal_space import Ended, Judge, Seen
 
 SHARE_OF_STAGE = 0.1
 """Of the simulations, for each stage that improves the proposal before it is frozen,"""

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from verifai_jax.estimation import importance, monte_carlo
-from verifai_jax.estimation.bounds import log_interval
-from verifai_jax.estimation.judging import Ended, Judge
+from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.monte_carlo import Counts
+from verifai_jax.estimation.normal_space import Ended, Judge
 from verifai_jax.estimation.splitting import Climb, explore, split
 
 COUNTED = 0.06

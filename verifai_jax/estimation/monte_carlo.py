@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from verifai_jax.estimation.bounds import upper_bound
-from verifai_jax.estimation.judging import Ended, Judge
-from verifai_jax.rates import clopper_pearson
+from verifai_jax.estimation.intervals import upper_bound
+from verifai_jax.estimation.normal_space import Ended, Judge
+from verifai_jax.statistics.binomial import clopper_pearson
 
 AT_ONCE = 8
 """Batches between two looks at the clock, after which nothing of them is lost."""

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import verifai_jax.estimation.bounds as bounds
+import verifai_jax.estimation.intervals as bounds
 
 METHODS = {
     "monte_carlo": "Monte Carlo",
@@ -139,7 +139,7 @@ class Estimate:
 
     def plot(self, path: Any = None) -> Any:
         """The interval, the levels of the splitting and the weights, as far as there are any."""
-        from verifai_jax.estimation.picture import draw
+        from verifai_jax.plotting.estimate import draw
 
         figure = draw(self)
         if path is not None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.judging import Ended, Judge
+from verifai_jax.estimation.normal_space import Ended, Judge
 
 ACCEPTED = 0.44
 """Share of moves that the scale of the moves aims at (Papaioannou et al., section 4.3)."""

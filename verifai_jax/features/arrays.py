@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.core.waveform import Waveform
 from verifai_jax.features.domain import Domain, as_numbers, cell, centre, dotted, indexed
-from verifai_jax.waveform import Waveform
 
 
 @dataclass(frozen=True, repr=False)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.errors import check_names
+from verifai_jax.core.errors import check_names
 from verifai_jax.features.box import Box
 from verifai_jax.features.domain import Domain, dotted
 

@@ -7,7 +7,7 @@ functions of a `Distribution`, is not data: it has to be given again by name.
 from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant

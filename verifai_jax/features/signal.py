@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.waveform import HOLDS, Waveform, is_waveform, seconds
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
 from verifai_jax.features.domain import Domain, as_numbers, indexed
-from verifai_jax.waveform import HOLDS, Waveform, is_waveform, seconds
 
 
 @dataclass(frozen=True)

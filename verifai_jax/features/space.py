@@ -12,20 +12,25 @@ import html
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.errors import check_names, unknown_name
+from verifai_jax.core.cube import Cube
+from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.domain import Domain, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
+from verifai_jax.features.points import features_of_rows, nudged
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class FeatureSpace:
@@ -119,6 +124,41 @@ class FeatureSpace:
         """
         return self.root.to_unit(self.root.coerce(self._completed(features)))
 
+    @cached_property
+    def cube(self) -> Cube:
+        """The unit cube of this space, as searches see it."""
+        return Cube(
+            levels=self.levels,
+            weights=self.weights,
+            ordered=self.ordered,
+            names=self.coordinates,
+            lengths=self.lengths,
+            signals=self.signals,
+        )
+
+    def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:
+        """Return the points of the unit cube that the rows of a table came from."""
+        records = rows.loc[:, list(self.columns)].to_dict("records")
+        features = [self.from_row(row) for row in records]
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *features)
+        return np.asarray(jax.jit(jax.vmap(self.flatten))(stacked))
+
+    def features_of(self, rows: Mapping[str, Any], precision: str = "float32") -> dict[str, Any]:
+        """Return the features `[n, ...]` that rows of a table hold: `from_row` of each, stacked.
+
+        **Arguments:**
+
+        - `rows`: columns `[n]` by name; others than those of features are ignored.
+        - `precision`: `"float32"` or `"float64"`, of their real numbers.
+
+        **Raises:** as `from_row`.
+        """
+        return features_of_rows(self.domains, rows, precision)
+
+    def nudged(self, features: Mapping[str, Any]) -> dict[str, Any]:
+        """Return features `[n, ...]` whose real numbers are one rounding of float32 away."""
+        return nudged(self.domains, features)
+
     def coerce(self, features: Mapping[str, Any]) -> dict[str, Any]:
         """Features that a person wrote (numbers, lists, choices), checked, as a system sees them.
 
@@ -148,6 +188,11 @@ class FeatureSpace:
     def accepts_points(self) -> Callable[[Any], Bool[Array, " n"]]:
         """Whether the constraint holds at points `[n, dim]` of the unit cube; compiled."""
         return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
+
+    @property
+    def constraint(self) -> Callable[[Any], Bool[Array, " n"]] | None:
+        """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
+        return None if self.where is None else self.accepts_points
 
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
         """The share of the prior that the constraint accepts, measured; 1 without one.

@@ -18,13 +18,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._robustness import prepared, robustness
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.robustness import prepared, robustness
+from verifai_jax.mtl.rewriting import expressions, nnf, rebuilt
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.services import expressions, nnf, rebuilt
-from verifai_jax.trace import Trace
 
 CLAUSES = 4
 """Clauses told apart at most; what a disjunction has beyond is the last one."""

@@ -273,7 +273,7 @@ class Formula:
 
     def signals(self) -> tuple[str, ...]:
         """Names of the signals it speaks of, in order of appearance."""
-        from verifai_jax.mtl.services import signals
+        from verifai_jax.mtl.rewriting import signals
 
         return signals(self)
 
@@ -282,7 +282,7 @@ class Formula:
 
         `next` reaches one sampling period `dt` ahead.
         """
-        from verifai_jax.mtl.services import horizon
+        from verifai_jax.mtl.rewriting import horizon
 
         return horizon(self, dt)
 

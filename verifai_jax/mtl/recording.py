@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from verifai_jax.errors import unknown_name
-from verifai_jax.mtl.robustness import seconds
-from verifai_jax.trace import Trace
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl._robustness import seconds
 
 Method = Literal["hold", "linear"]
 

@@ -1,12 +1,12 @@
 """Training of the policies whose closed loops are then tested."""
 
+from verifai_jax.rl._train import Snapshot as Snapshot
+from verifai_jax.rl._train import Trained as Trained
+from verifai_jax.rl._train import evaluate as evaluate
+from verifai_jax.rl._train import train as train
 from verifai_jax.rl.algorithm import Algorithm as Algorithm
 from verifai_jax.rl.algorithm import Progress as Progress
 from verifai_jax.rl.algorithms import ALGORITHMS as ALGORITHMS
-from verifai_jax.rl.brax_task import brax_task as brax_task
-from verifai_jax.rl.gymnax_task import gymnax_task as gymnax_task
-from verifai_jax.rl.mjx_task import mjx_task as mjx_task
-from verifai_jax.rl.ode_task import ode_task as ode_task
 from verifai_jax.rl.policy import Policy as Policy
 from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
 from verifai_jax.rl.policy import load_policy as load_policy
@@ -15,12 +15,12 @@ from verifai_jax.rl.policy import save_policy as save_policy
 from verifai_jax.rl.ppo import PPO as PPO
 from verifai_jax.rl.pqn import PQN as PQN
 from verifai_jax.rl.sac import SAC as SAC
-from verifai_jax.rl.task import Continuous as Continuous
-from verifai_jax.rl.task import Discrete as Discrete
-from verifai_jax.rl.task import Task as Task
-from verifai_jax.rl.train import Snapshot as Snapshot
-from verifai_jax.rl.train import Trained as Trained
-from verifai_jax.rl.train import evaluate as evaluate
-from verifai_jax.rl.train import train as train
+from verifai_jax.rl.task.brax import brax_task as brax_task
+from verifai_jax.rl.task.gymnax import gymnax_task as gymnax_task
+from verifai_jax.rl.task.mjx import mjx_task as mjx_task
+from verifai_jax.rl.task.ode import ode_task as ode_task
+from verifai_jax.rl.task.task import Continuous as Continuous
+from verifai_jax.rl.task.task import Discrete as Discrete
+from verifai_jax.rl.task.task import Task as Task
 from verifai_jax.rl.trainings import Configuration as Configuration
 from verifai_jax.rl.trainings import Trainings as Trainings

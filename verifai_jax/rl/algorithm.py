@@ -17,7 +17,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.rl.policy import Policy
-from verifai_jax.rl.task import Task
+from verifai_jax.rl.task.task import Task
 
 Number = Float[Array, ""] | float
 

@@ -6,12 +6,12 @@ fitting(Discrete(2))                      # ("ppo", "pqn")
 
 from typing import Any
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.ppo import PPO
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
-from verifai_jax.rl.task import Action
+from verifai_jax.rl.task.task import Action
 
 ALGORITHMS: dict[str, type[Any]] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
 

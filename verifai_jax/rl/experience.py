@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.rl.advantage import Ends
 from verifai_jax.rl.algorithm import Progress
-from verifai_jax.rl.task import Task
+from verifai_jax.rl.task.task import Task
 
 
 class Episodes(NamedTuple):

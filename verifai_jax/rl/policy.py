@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.errors import check_names
-from verifai_jax.rl.task import Action, Continuous, Discrete
+from verifai_jax.core.errors import check_names
+from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
 

@@ -26,7 +26,7 @@ from verifai_jax.rl.experience import (
 from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
 from verifai_jax.rl.shuffling import permutation
-from verifai_jax.rl.task import Action, Continuous, Discrete, Task
+from verifai_jax.rl.task.task import Action, Continuous, Discrete, Task
 
 
 @jax.tree_util.register_dataclass

@@ -32,7 +32,7 @@ from verifai_jax.rl.experience import (
 from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers
 from verifai_jax.rl.shuffling import permutation
-from verifai_jax.rl.task import Discrete, Task
+from verifai_jax.rl.task.task import Discrete, Task
 
 
 @jax.tree_util.register_dataclass

@@ -30,7 +30,7 @@ from verifai_jax.rl.experience import (
 from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, in_range, network, new_layers
 from verifai_jax.rl.replay_buffer import Remembered, ReplayBuffer, draw, empty, remember
-from verifai_jax.rl.task import Continuous, Task
+from verifai_jax.rl.task.task import Continuous, Task
 
 # Beyond these a Gaussian under tanh is a constant, or a coin that shows only the two ends.
 LOG_STD = (-10.0, 2.0)

@@ -23,10 +23,10 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.devices import enable_compile_cache
+from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.rl.algorithm import Algorithm, check_fit
 from verifai_jax.rl.policy import Policy
-from verifai_jax.rl.task import Task
+from verifai_jax.rl.task.task import Task
 
 # Under one `vmap` on an accelerator. On a CPU it gains nothing: the cores are busy with one each.
 TOGETHER = 64
@@ -302,16 +302,9 @@ def _over_lanes(layout: _Layout, one: Any, shared: int) -> Any:
         alone = [jax.tree.map(lambda leaf: leaf[0], a) for a in arguments[:split]]
         return jax.tree.map(lambda leaf: leaf[None], one(*alone, *arguments[split:]))
 
-    if len(layout.devices) == 1:
-        return on_device
-
     def spread(*arguments: Any) -> Any:
-        lane, whole = PartitionSpec("lane"), PartitionSpec()
-        specs = (lane,) * (len(arguments) - shared) + (whole,) * shared
-        mesh = Mesh(np.array(layout.devices), ("lane",))
-        return jax.shard_map(on_device, mesh=mesh, in_specs=specs, out_specs=lane, check_vma=False)(
-            *arguments
-        )
+        split = (True,) * (len(arguments) - shared) + (False,) * shared
+        return spread_over_devices(on_device, split, layout.devices)(*arguments)
 
     return spread
 

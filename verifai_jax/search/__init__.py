@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from verifai_jax.errors import check_names, unknown_name
+from verifai_jax.core.cube import Cube as Cube
+from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.search.annealing import Annealing as Annealing
 from verifai_jax.search.bandit import Bandit as Bandit
-from verifai_jax.search.base import Cube as Cube
 from verifai_jax.search.base import Evaluated as Evaluated
 from verifai_jax.search.base import Plan as Plan
 from verifai_jax.search.base import Search as Search

@@ -23,14 +23,8 @@ import numpy as np
 from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import (
-    Cube,
-    Evaluated,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
 from verifai_jax.search.gaussian_process import (
     GaussianProcess,
     Hyper,

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search, check_count, check_fraction
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction
 
 MOST_COMBINATIONS = 1024
 MOST_BINS = 2**22

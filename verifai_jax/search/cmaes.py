@@ -27,14 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import (
-    Cube,
-    Evaluated,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 

@@ -21,14 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.search.base import (
-    Cube,
-    Evaluated,
-    Plan,
-    Search,
-    check_count,
-    check_fraction,
-)
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Plan, Search, check_count, check_fraction
 
 AT_ONCE = 16
 """Failures archived in a round at most."""

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
-    Cube,
     Evaluated,
     Search,
     check_count,

@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
     CLAUSES,
-    Cube,
     Evaluated,
     Plan,
     Search,

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search, check_count
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search, check_count
 
 MOST_POINTS = 2**31 - 1
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search
 
 BITS = 32  # of the index
 PLAIN_UP_TO = 8  # coordinates; beyond, the bases are so large that lines are visible

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from verifai_jax.search.base import Cube, Evaluated, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search
 
 
 class ListedState(NamedTuple):

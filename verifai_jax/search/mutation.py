@@ -19,14 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.search.base import (
-    Cube,
-    Evaluated,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before."""

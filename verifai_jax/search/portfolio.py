@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.search.base import Cube, Evaluated, Plan, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Plan, Search
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
 from verifai_jax.search.mutation import Mutation, MutationState

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search
 
 BITS = 32
 MOST_DIMENSIONS = 21201  # direction numbers are known for

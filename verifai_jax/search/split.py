@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.errors import unknown_name
-from verifai_jax.search.base import Cube, Evaluated, Plan, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.search.base import Evaluated, Plan, Search
 
 
 @dataclass(frozen=True, init=False)

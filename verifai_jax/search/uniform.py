@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.search.base import Cube, Evaluated, Search
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Evaluated, Search
 
 
 class UniformState(NamedTuple):

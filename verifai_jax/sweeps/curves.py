@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.errors import check_names
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval
 from verifai_jax.mtl.recording import resample
-from verifai_jax.mtl.services import rebuilt
-from verifai_jax.trace import Trace
+from verifai_jax.mtl.rewriting import rebuilt
 
 SIGNALS = ("return",)
 """What a learning curve has: the mean return of the episodes that ended in each update."""

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.pca import Components, pca
+from verifai_jax.analysis._pca import Components, pca
 from verifai_jax.features import Constant, FeatureSpace
+from verifai_jax.sweeps.fanova import boxes_of, variance_shares
 from verifai_jax.sweeps.trends import trends
-from verifai_jax.sweeps.variance import boxes_of, variance_shares
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,8 +85,8 @@ class HyperparameterImportance:
 
         **Raises:** `ValueError` with too few configurations.
         """
-        from verifai_jax.report.style import new_figure, show_or_save
-        from verifai_jax.sweeps.picture import draw_importance, draw_trends
+        from verifai_jax.plotting.style import new_figure, show_or_save
+        from verifai_jax.plotting.sweep import draw_importance, draw_trends
 
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")

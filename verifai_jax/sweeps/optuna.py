@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.errors import MissingExtra, require, unknown_name
+from verifai_jax.core.errors import MissingExtra, require, unknown_name
 from verifai_jax.features import (
     Box,
     Categorical,
@@ -23,7 +23,7 @@ from verifai_jax.features import (
 )
 from verifai_jax.features.domain import Domain
 from verifai_jax.features.fixed import Fixed
-from verifai_jax.sweeps.searching import Values
+from verifai_jax.sweeps.proposers import Values
 from verifai_jax.sweeps.trainer import labelled, labels
 
 _SAMPLERS = {

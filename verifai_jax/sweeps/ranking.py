@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from verifai_jax.sweeps.pareto import fronts
+from verifai_jax.statistics.pareto import fronts
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.errors import suggests_options
-from verifai_jax.falsify import falsify
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.trace import Trace
+from verifai_jax.falsification._falsify import falsify
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula
-from verifai_jax.problem import Problem
+from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
 from verifai_jax.sweeps.curves import check_curve, curve_trace, judge_curve
 from verifai_jax.sweeps.importance import HyperparameterImportance, hyperparameter_importance
 from verifai_jax.sweeps.ranking import by_configuration, chosen_first, is_safe, pareto_fronts
 from verifai_jax.sweeps.record import SweepRecord
-from verifai_jax.trace import Trace
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -282,7 +282,7 @@ class Sweep:
 
     def summary(self) -> str:
         """How many learn the task and how many of those are safe, the best, and its price."""
-        from verifai_jax.sweeps.telling import summary
+        from verifai_jax.sweeps.summary import summary
 
         return summary(self)
 
@@ -293,7 +293,7 @@ class Sweep:
         return self.summary()
 
     def _repr_html_(self) -> str:
-        from verifai_jax.sweeps.telling import as_html
+        from verifai_jax.sweeps.summary import as_html
 
         return as_html(self)
 
@@ -302,7 +302,7 @@ class Sweep:
 
         Returns the figure, which is also written where a `path` is given.
         """
-        from verifai_jax.sweeps.picture import plot_sweep
+        from verifai_jax.plotting.sweep import plot_sweep
 
         return plot_sweep(self, path)
 
@@ -312,7 +312,7 @@ class Sweep:
         Numbers and text only; `load_sweep` reads it. The policies are files that `rl.load_policy`
         reads too.
         """
-        from verifai_jax.sweeps.saving import save_sweep
+        from verifai_jax.sweeps.storage import save_sweep
 
         return save_sweep(self, path)
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.sweeps.certifying import Judged
 from verifai_jax.sweeps.curves import judge_curve
-from verifai_jax.sweeps.lessons import Reached
 from verifai_jax.sweeps.record import AFTER, BEFORE, Curve
+from verifai_jax.sweeps.safety import Judged
 from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.training_runs import Reached
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from verifai_jax.errors import UnknownNameError
+from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula
-from verifai_jax.problem import Problem, ProblemError
+from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.curves import check_curve
 from verifai_jax.sweeps.trainer import STEPS, StudyError, Trainer, probes

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.errors import require
+from verifai_jax.core.errors import require
 from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, LogUniform
 from verifai_jax.features.domain import Domain
 

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.errors import unknown_name
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.features import (
     Box,
     Categorical,
@@ -32,7 +32,7 @@ from verifai_jax.rl import algorithms
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.ppo import PPO
-from verifai_jax.rl.task import Task
+from verifai_jax.rl.task.task import Task
 from verifai_jax.rl.trainings import Configuration
 
 ALGORITHM, STEPS, WIDTH = "algorithm", "steps", "width"

@@ -11,9 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.proposals import Proposals
+from verifai_jax.core.budget import Limits
 from verifai_jax.search import Search
-from verifai_jax.synthesis.limits import Limits
+from verifai_jax.search.proposals import Proposals
 from verifai_jax.synthesis.parametric import Pairs, Parametric
 
 MOST_FOLLOWED = 4
@@ -76,7 +76,13 @@ def attack(
     each = 1 if loop.differentiable else 1 + int(free)
     kept = DESCENT * MOST_FOLLOWED * (each + len(STEPS)) if follows else 0
     searching = limits.slice(limits.left - min(kept, limits.left // 3))
-    proposals = Proposals(search, loop.environment, batch, jax.random.key(seed))
+    proposals = Proposals(
+        search,
+        loop.environment.cube,
+        batch,
+        jax.random.key(seed),
+        loop.environment.constraint,
+    )
     seen: list[tuple[np.ndarray, Pairs]] = []
     found = 0
     while not searching.over and not proposals.exhausted:

@@ -20,14 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.engine import in_precision, judge, simulation_key, verdict
-from verifai_jax.errors import check_names
-from verifai_jax.evaluator import Evaluator
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.engine import judge, verdict
+from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import robustness, smooth
-from verifai_jax.problem import Problem
-from verifai_jax.run import run_keys
-from verifai_jax.trace import Status
+from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.problem import Problem
-from verifai_jax.synthesis.heldout import HeldOut
+from verifai_jax.problem.problem import Problem
+from verifai_jax.synthesis.held_out import HeldOut
 from verifai_jax.synthesis.parametric import held
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class Repair:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the worst robustness that each attack found; returns the figure."""
-        from verifai_jax.report.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+        from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
         figure = new_figure(figsize=(5.0, 3.0))
         axes = figure.subplots()

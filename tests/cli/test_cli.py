@@ -1,0 +1,260 @@
+"""The command line, as a person uses it from the root of the checkout."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from verifai_jax.cli.doctor import bad_pairs
+from verifai_jax.cli.main import main
+from verifai_jax.falsification.run import load
+
+ROOT = Path(__file__).parents[2]
+PROBLEM = """
+import jax.numpy as jnp
+import verifai_jax as vj
+
+ramp = vj.Problem(
+    "ramp",
+    space={"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)},
+    system=lambda f, key: vj.Trace({"x": f["a"] + f["b"] * jnp.linspace(0, 1, 9)}, dt=1 / 8),
+    spec="always[0, 1] x <= 1",
+    description="a ramp that should stay below one",
+    nominal={"a": 0.5, "b": 0.25},
+)
+flat = vj.Problem("flat", ramp.space, ramp.system, "eventually x > 0.5")
+"""
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "specs").mkdir()
+    (tmp_path / "specs" / "ramp.py").write_text(PROBLEM)
+
+    def run(*arguments, code=0):
+        result = CliRunner().invoke(main, [str(a) for a in arguments])
+        assert result.exit_code == code, result.output
+        return result.output
+
+    return run
+
+
+def test_falsify_and_replay(call, tmp_path):
+    output = call(
+        "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300, "--seed", 2
+    )
+    assert "simulations violate the property" in output
+    assert "always[0,1] (x <= 1)" in output
+    assert "95 % interval" in output
+    folder = tmp_path / "runs" / "ramp-1"
+    for picture in ("features.png", "robustness.png", "worst.png"):
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+        assert str(Path("runs/ramp-1") / picture) in output
+    record = json.loads((folder / "run.json").read_text())
+    assert record["target"] == "specs/ramp.py:ramp"
+    command = next(line for line in output.splitlines() if "verifai-jax replay" in line)
+    again = call(*command.split("verifai-jax ")[1].split())
+    assert "violated" in again
+    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures")
+    assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
+
+
+def test_options_of_a_search(call, tmp_path):
+    output = call(
+        "falsify",
+        "specs/ramp.py:ramp",
+        "--search",
+        "cross_entropy",
+        "--set",
+        "elite=0.3",
+        "--budget",
+        64,
+        "--batch",
+        32,
+        "--out",
+        "here",
+        "--no-pictures",
+    )
+    assert "0.3" in json.loads((tmp_path / "here" / "run.json").read_text())["search"]
+    assert "here" in output
+
+
+def test_resume_goes_on_in_the_same_folder(call, tmp_path):
+    start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--batch", 16]
+    call(*start, "--budget", 48, "--only", "b", "--out", "one", "--no-pictures")
+    call("falsify", "--resume", "one", "--only", "b", "--budget", 80, "--no-pictures")
+    call(*start, "--budget", 80, "--only", "b", "--out", "two", "--no-pictures")
+    one, two = (load(tmp_path / name).table.all for name in ("one", "two"))
+    assert one.equals(two)
+    assert set(one["a"]) == {0.5}
+    output = call("falsify", "--resume", "one", "--budget", 99, code=1)
+    assert "its feature 'a' was" in output
+    output = call("falsify", "--resume", "one", "--seed", 3, code=2)
+    assert "--seed is fixed in the run that --resume goes on with" in output
+
+
+def test_ends_and_warm_start(call):
+    ramp = ["falsify", "specs/ramp.py:ramp", "--batch", 64, "--no-pictures"]
+    output = call(*ramp, "--search", "uniform", "--within", 0.1, "--out", "prior")
+    assert "stopped by stop_when" in output
+    assert "whenever stopped" in output
+    output = call(*ramp, "--search", "uniform", "--decide", 0.6, "--out", "decided")
+    assert "stopped by stop_when" in output
+    output = call(*ramp, "--warm-start", "prior", "--budget", 64, "--out", "warm")
+    assert "64 simulations" in output
+    assert "give one" in call(*ramp, "--within", 0.1, "--decide", 0.1, code=2)
+    assert "needs independent samples" in call(*ramp, "--within", 0.1, code=1)
+
+
+def test_analyze(call, tmp_path):
+    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 400, "--no-pictures")
+    output = call("analyze", "runs/ramp-1")
+    assert "Where it fails" in output
+    report = (tmp_path / "runs" / "ramp-1" / "analysis" / "report.md").read_text()
+    assert "Coverage" in report
+    assert (tmp_path / "runs/ramp-1/analysis/overview.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_list(call):
+    output = call("list")
+    assert "specs/ramp.py:ramp  a ramp that should stay below one" in output
+    assert "specs/ramp.py:flat" in output
+    assert "searches: " in output
+    assert "cross_entropy" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["falsify", "specs/ramp.py:rampe"],
+            "unknown problem in specs/ramp.py 'rampe'; did you mean",
+        ),
+        (["falsify", "specs/ramp.py"], "has 2 problems; name one: specs/ramp.py:ramp"),
+        (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
+        (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
+        (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "slope=1"], "did you mean 'slopes"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "elite"], "--set needs NAME=VALUE"),
+        (
+            ["falsify", "specs/ramp.py:ramp", "--budget", "0"],
+            "budget must be an integer of at least",
+        ),
+        (["falsify", "specs/ramp.py:ramp", "--budgets", "3"], "--budget"),
+        (["falsfy", "specs/ramp.py:ramp"], "did you mean 'falsify'"),
+        (["replay", "runs/none"], "no run in runs/none"),
+    ],
+)
+def test_mistakes_get_one_line(call, arguments, message):
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code != 0
+    assert message in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
+    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures", "--out", "r")
+    record = json.loads((tmp_path / "r" / "run.json").read_text())
+    evil = tmp_path / "r" / "evil.py"
+    evil.write_text("raise SystemExit('ran')")
+    for target in ("r/evil.py:ramp", "/etc/evil.py:ramp", "../evil.py:x", "os:path", None):
+        (tmp_path / "r" / "run.json").write_text(json.dumps(record | {"target": target}))
+        result = CliRunner().invoke(main, ["replay", "r", "0"])
+        assert "does not say which problem of this project" in result.output
+    output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")
+    assert "robustness" in output
+
+
+def test_precision_of_a_run(call, tmp_path):
+    where = ("--out", tmp_path / "run", "--no-pictures")
+    call("falsify", "specs/ramp.py:ramp", "--budget", 32, "--precision", "float64", *where)
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert (record["precision"], record["backend"]) == ("float64", None)
+    output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=1)
+    assert "has no backends to choose from; got backend 'native'" in output
+
+
+def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_path):
+    (tmp_path / "specs" / "noisy.py").write_text(
+        PROBLEM.replace('f["a"] +', 'jax.random.normal(key) + f["a"] +').replace(
+            "import jax.numpy", "import jax\nimport jax.numpy"
+        )
+    )
+    call("falsify", "specs/noisy.py:ramp", "--search", "uniform", "--budget", 64, "--no-pictures")
+    output = call("replay", "runs/ramp-1", 7, "--no-pictures")
+    stored = load(tmp_path / "runs" / "ramp-1").table.all["rho"][7]
+    assert "row 7, float32" in output
+    assert f"robustness {stored:.6g} in float32, {stored:.6g} in the table" in output
+    call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 8, "--no-pictures")
+    assert "float64" in call("replay", "runs/ramp-2", 0, "--no-pictures")
+
+
+def test_a_missing_extra_is_one_line(call, tmp_path):
+    (tmp_path / "specs" / "robot.py").write_text(
+        "from verifai_jax.core.errors import require\nrequire('no_such_engine', extra='engine')\n"
+    )
+    told = "no_such_engine is not installed: pip install 'verifai_jax[engine]'"
+    assert call("falsify", "specs/robot.py:walk", code=1) == f"Error: {told}\n"
+    output = call("list")
+    assert f"specs/robot.py: {told}\n" in output
+    assert "specs/ramp.py:ramp" in output
+
+
+def test_doctor_knows_what_does_not_go_together():
+    assert bad_pairs({"brax": "0.14.2", "mujoco": "3.4.0", "jax": "0.10.2"}) == []
+    (told,) = bad_pairs({"brax": "0.14.2", "mujoco": "4.0.0", "gymnax": None, "jax": "0.10.2"})
+    assert told.startswith("brax 0.14.2 with mujoco 4.0.0: its swimmer")
+    (told,) = bad_pairs({"gymnax": "0.0.9", "jax": "0.10.2"})
+    assert "pip install 'gymnax>=1.0.1'" in told
+
+
+def test_doctor(call):
+    output = call("doctor")
+    assert "jax " in output
+    assert "devices" in output
+    assert "cores" in output
+
+
+class TestMonitor:
+    @pytest.fixture(autouse=True)
+    def recording(self, call, tmp_path):
+        (tmp_path / "drive.csv").write_text(
+            "time,dist,speed\n0.0,5.0,1.0\n0.5,3.0,2.0\n1.0,1.5,4.0\n1.5,2.5,2.5\n"
+        )
+
+    def test_robustness_of_a_recording(self, call):
+        assert call("monitor", "always dist > 1", "drive.csv") == "holds with robustness 0.5\n"
+        assert call("monitor", "always[0, 1] dist >= 2", "drive.csv", "--fail", code=1) == (
+            "fails with robustness -0.5\n"
+        )
+        assert "robustness 0.5" in call(
+            "monitor", "G (dist < 2 -> F[0, 500ms] slow)", "drive.csv",
+            "--define", "slow=speed < limit", "--const", "limit=3",
+        )  # fmt: skip
+
+    def test_why(self, call, tmp_path):
+        output = call(
+            "monitor", "always[0, 1] dist >= 2", "drive.csv", "--explain", "--plot", "why.png"
+        )
+        assert "decided by  dist >= 2  at 1 s" in output
+        assert (tmp_path / "why.png").read_bytes().startswith(b"\x89PNG")
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["always dst > 1", "drive.csv"], "unknown signal 'dst'; did you mean 'dist'"),
+            (["always (dist > 1", "drive.csv"], "^"),
+            (["always[0, 0.3] dist > 1", "drive.csv"], "0.3"),
+            (["always dist > 1", "none.csv"], "no recording none.csv"),
+            (["always dist > 1", "drive.csv", "--time", "t"], "no column 't' of sample times"),
+            (["always dist > 1", "drive.csv", "--const", "a=b"], "--const a must be a number"),
+            (["always[0, 9] dist > 1", "drive.csv", "--end", "strict"], "9"),
+        ],
+    )
+    def test_mistakes(self, arguments, message):
+        result = CliRunner().invoke(main, ["monitor", *arguments])
+        assert result.exit_code != 0
+        assert message in result.output
+        assert "Traceback" not in result.output

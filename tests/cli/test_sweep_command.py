@@ -1,0 +1,172 @@
+"""`verifai-jax sweep`, as a person uses it."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from drifting import quick_certificates
+
+from verifai_jax.cli.main import main
+from verifai_jax.core.targets import TargetError, load_study, studies_in
+from verifai_jax.sweeps import _sweep as driver
+
+STUDY = """
+import verifai_jax as vj
+from drifting import Drift, Point, closed_loop, drifting
+from dataclasses import replace
+
+safe = replace(drifting({"rate": vj.LogUniform(0.01, 1.0), "noise": vj.Box(0.0, 0.1)}),
+               name="safe", description="drifts that stay")
+other = replace(safe, name="other")
+"""
+
+
+@pytest.fixture
+def call(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
+    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    (tmp_path / "specs").mkdir()
+    (tmp_path / "specs" / "drift.py").write_text(STUDY)
+
+    def run(*arguments, code=0):
+        result = CliRunner().invoke(main, ["sweep", *map(str, arguments)])
+        assert result.exit_code == code, result.output
+        return result.output
+
+    return run
+
+
+SMALL = ("--configurations", 3, "--samples", 64, "--no-pictures")
+
+
+def test_sweep_and_what_it_writes(call, tmp_path):
+    output = call("specs/drift.py:safe", *SMALL, "--seed", 2)
+    assert output.startswith("safe: 3 configurations")
+    assert "rate" in output
+    assert "nominal_return" in output
+    folder = tmp_path / "sweeps" / "safe-1"
+    assert "table        sweeps/safe-1/table.parquet" in output
+    assert {"table.parquet", "sweep.json", "policies", "sweep.sqlite"} <= {
+        path.name for path in folder.iterdir()
+    }
+    call("specs/drift.py:safe", *SMALL)
+    assert (tmp_path / "sweeps" / "safe-2").exists()
+
+
+def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
+    asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
+    whole = call("specs/drift.py:safe", *SMALL, *asked, "--out", "whole")
+    stopped = _Stopping(after=7)
+    monkeypatch.setattr(driver, "Store", stopped)
+    part = call("specs/drift.py:safe", *SMALL, *asked, "--out", "part")
+    assert "NOT FINISHED" in part
+    assert "go on        verifai-jax sweep --resume part" in part
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
+    monkeypatch.setattr(driver, "certify_policies", quick_certificates)
+    again = call("--resume", "part", "--no-pictures")
+
+    def rows(output):
+        return [line for line in output.splitlines() if line.endswith(("safe@0.01", "unsafe"))]
+
+    assert rows(again) == rows(whole)
+    import pandas as pd
+
+    one, other = (pd.read_parquet(f"{name}/table.parquet") for name in ("whole", "part"))
+    pd.testing.assert_frame_equal(
+        one.drop(columns="training_seconds"), other.drop(columns="training_seconds")
+    )
+
+
+class _Stopping:
+    """A store that is interrupted once so much is done."""
+
+    def __init__(self, after):
+        self.after = after
+
+    def __call__(self, path):
+        from verifai_jax.sweeps.cache import Store
+
+        store, put = Store(path), Store.put
+
+        def stopped(work):
+            put(store, work)
+            if store.made >= self.after:
+                raise KeyboardInterrupt
+
+        store.put = stopped
+        return store
+
+
+def test_errors_in_one_line(call, tmp_path):
+    for arguments, told in (
+        (("specs/drift.py:sfae",), "Error: unknown study in specs/drift.py 'sfae'; did you mean"),
+        (("specs/drift.py",), "Error: specs/drift.py has 2 studies; name one: specs/drift.py:safe"),
+        (("specs/none.py:safe",), "Error: no file specs/none.py"),
+        (("specs/drift.py:safe", "--search", "halten"), "did you mean 'halton'"),
+        (("specs/drift.py:safe", "--set", "elite=2"), "unknown option of search halton 'elite'"),
+        (("specs/drift.py:safe", "--halving", 0.5), "reduction must be greater than 1; got 0.5"),
+        (("specs/drift.py:safe", "--only", "raet"), "did you mean 'rate'"),
+        (("specs/drift.py:safe", "--only", "rate"), "noise has none"),
+        (("--resume", "nowhere"), "Error: no sweep to go on with in nowhere"),
+        (("specs/drift.py:safe", "--samples", 0), "samples must be a whole number"),
+    ):
+        output = call(*arguments, code=1)
+        assert told in output
+        assert len(output.strip().splitlines()) == 1
+    for arguments, told in (
+        ((), "Missing argument 'TARGET'"),
+        (("--resume", "x", "--seed", 3), "--seed is fixed in the sweep that --resume goes on with"),
+        (("--resume", "x", "--halving", 3), "--halving is fixed in the sweep"),
+        (("specs/drift.py:safe", "--halving-by", "safety"), "--halving-by goes with --halving"),
+    ):
+        assert told in call(*arguments, code=2)
+    # Nothing was begun.
+    assert not (tmp_path / "sweeps").exists()
+
+
+def test_only_some_vary(call):
+    output = call(
+        "specs/drift.py:safe", *SMALL, "--only", "rate", "--at", "noise=0.05", "--out", "some"
+    )
+    assert output.count(" 0.05 ") >= 3
+    call("--resume", "some", "--no-pictures")
+
+
+def test_another_sweep_in_the_same_folder_is_refused(call):
+    call("specs/drift.py:safe", *SMALL, "--out", "kept")
+    output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--out", "kept", code=1)
+    assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the store 0" in output
+
+
+def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
+    call("specs/drift.py:safe", *SMALL, "--out", "kept")
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    shutil.move(tmp_path / "specs", tmp_path / "kept" / "specs")
+    import sqlite3
+
+    base = sqlite3.connect(tmp_path / "kept" / "sweep.sqlite")
+    base.execute("UPDATE about SET value = replace(value, 'specs/', 'kept/specs/')")
+    base.commit()
+    base.close()
+    output = call("--resume", "kept", code=1)
+    assert "kept does not say which study of this project it is of" in output
+
+
+def test_studies_are_found_as_problems_are(call):
+    assert set(studies_in("specs/drift.py")) == {"safe", "other"}
+    assert load_study("specs/drift.py:safe").description == "drifts that stay"
+    Path("specs/empty.py").write_text("x = 1\n")
+    with pytest.raises(TargetError, match=r"specs/empty.py defines no Study"):
+        load_study("specs/empty.py")
+
+
+def test_list_names_studies_beside_problems(call):
+    listed = CliRunner().invoke(main, ["list"])
+    assert listed.exit_code == 0, listed.output
+    assert "specs/drift.py:safe  drifts that stay" in listed.output
+    assert "a study of trainings, for sweep, over rate, noise" in listed.output

@@ -1,0 +1,64 @@
+"""The number of JAX devices and the compile cache, each in a process of its own."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+
+def run(code, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+        check=False,
+    )
+
+
+def test_one_device_per_core():
+    done = run(
+        "import verifai_jax, jax, os; print(len(jax.devices()), len(os.sched_getaffinity(0)))"
+    )
+    devices, cores = done.stdout.split()
+    assert devices == cores
+
+
+@pytest.mark.parametrize(("cores", "devices"), [("1", "1"), ("3", "3")])
+def test_the_user_may_choose(cores, devices):
+    done = run("import verifai_jax, jax; print(len(jax.devices()))", VERIFAI_JAX_CORES=cores)
+    assert done.stdout.strip() == devices
+
+
+def test_a_choice_that_is_none():
+    done = run("import verifai_jax", VERIFAI_JAX_CORES="many")
+    assert "VERIFAI_JAX_CORES must be a positive integer; got 'many'" in done.stderr
+
+
+def test_a_backend_that_runs_already_is_left_alone():
+    done = run("import jax; jax.devices(); import verifai_jax; print(len(jax.devices()))")
+    assert done.stdout.strip() == "1"
+
+
+def test_compiled_programs_outlive_the_process(tmp_path):
+    code = (
+        "import jax.numpy as jnp, verifai_jax as vj\n"
+        "system = lambda f, key: vj.Trace({'x': jnp.sin(f['a'] * jnp.arange(50.))}, dt=1.0)\n"
+        "p = vj.Problem('p', space={'a': vj.Box(0, 1)}, system=system, spec='always x < 2')\n"
+        "vj.falsify(p, 'uniform', 10, batch=10)\n"
+    )
+    from verifai_jax.core import devices
+
+    done = run(
+        "import verifai_jax.core.devices as d, jax\n"
+        "d.enable_compile_cache()\n"
+        "jax.config.update('jax_persistent_cache_min_compile_time_secs', 0.0)\n" + code,
+        VERIFAI_JAX_CACHE=str(tmp_path),
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.iterdir())
+    done = run(code, VERIFAI_JAX_CACHE="off", XDG_CACHE_HOME=str(tmp_path / "home"))
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "home").exists()
+    assert devices.cache_folder() is None  # as tests/conftest.py sets it

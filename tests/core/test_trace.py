@@ -1,0 +1,74 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.core.trace import Status, Trace
+
+
+def test_hold_repeats_the_last_valid_sample():
+    trace = Trace({"x": jnp.arange(5.0), "p": jnp.arange(10.0).reshape(5, 2)}, dt=0.1, valid=3)
+    held = trace.hold()
+    assert held.signals["x"].tolist() == [0, 1, 2, 2, 2]
+    assert held.signals["p"][:, 1].tolist() == [1, 3, 5, 5, 5]
+    assert held.held
+    assert held.hold() is held
+
+
+def test_trim_keeps_the_valid_part():
+    trace = Trace({"x": jnp.arange(5.0)}, times=jnp.arange(5.0) ** 2, valid=jnp.array(2))
+    assert trace.trim().signals["x"].tolist() == [0, 1]
+    assert trace.trim().clock().tolist() == [0, 1]
+    assert trace.clock().tolist() == [0, 1, 4, 9, 16]
+
+
+def test_clock_counts_periods():
+    np.testing.assert_allclose(Trace({"x": np.zeros(3)}, dt=0.5).clock(), [0, 0.5, 1.0])
+
+
+def test_a_batch_of_traces_is_a_trace_of_batches():
+    def simulate(x):
+        return Trace({"x": x + jnp.arange(4.0)}, dt=1.0, valid=jnp.array(2), status=jnp.int32(0))
+
+    batch = jax.vmap(simulate)(jnp.array([0.0, 10.0]))
+    assert batch.signals["x"].shape == (2, 4)
+    held = jax.vmap(Trace.hold)(batch)
+    assert held.signals["x"].tolist() == [[0, 1, 1, 1], [10, 11, 11, 11]]
+    assert batch.dt == 1.0
+
+
+def test_signals_keep_the_order_written():
+    trace = Trace({"x": np.zeros(2), "a": np.ones(2), "m": np.ones((2, 3))}, dt=1.0)
+    again = jax.jit(lambda t: t)(trace)
+    assert list(again.signals) == ["x", "a", "m"]
+    assert again.signals["m"].shape == (2, 3)
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(trace)]
+    assert names == ["['x']", "['a']", "['m']"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"signals": {}, "dt": 1.0}, "at least one signal; got none"),
+        ({"signals": {"x": np.zeros(0)}, "dt": 1.0}, "got signals of length 0"),
+        ({"signals": {"x": np.zeros(3), "y": np.zeros(4)}, "dt": 1.0}, "got x: 3, y: 4"),
+        ({"signals": {"x": np.zeros((2, 2, 2))}, "dt": 1.0}, r"'x' must have shape .* \[2, 2, 2\]"),
+        ({"signals": {"x": np.zeros(3)}}, "either a sampling period dt or sample times"),
+        ({"signals": {"x": np.zeros(3)}, "dt": 1.0, "times": np.arange(3)}, "give one"),
+        ({"signals": {"x": np.zeros(3)}, "dt": 0.0}, "dt must be positive; got 0.0"),
+        ({"signals": {"x": np.zeros(3)}, "times": np.arange(4)}, r"shape \[3\].* got \[4\]"),
+    ],
+)
+def test_bad_traces_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Trace(**arguments)
+
+
+def test_status_codes_are_stable():
+    # They are stored in tables on disk.
+    assert [(s.name, s.value) for s in Status] == [
+        ("OK", 0),
+        ("NONFINITE", 1),
+        ("ERROR", 2),
+        ("TIMEOUT", 3),
+    ]

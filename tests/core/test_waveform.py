@@ -1,0 +1,100 @@
+"""Functions of time by control points: against NumPy, at the knots, under jit, vmap and grad."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from verifai_jax.core.waveform import Waveform, bound
+
+KNOTS = np.float32([1, -2, 0.5, 4, 4])
+LINEAR = Waveform(jnp.asarray(KNOTS), "linear", 2.0)
+CONSTANT = Waveform(jnp.asarray(KNOTS), "constant", 2.0)
+TIMES = np.linspace(-1, 3, 401).astype(np.float32)
+
+
+def test_linear_is_interpolation():
+    values = jax.jit(jax.vmap(LINEAR))(TIMES)
+    np.testing.assert_allclose(values, np.interp(TIMES, np.linspace(0, 2, 5), KNOTS), atol=1e-5)
+
+
+def test_constant_holds_each_from_its_start_on():
+    values = jax.jit(jax.vmap(CONSTANT))(TIMES)
+    starts = np.arange(5) * 0.4
+    # The clock of a rollout rounds; the start of a piece is in it, up to a millionth.
+    places = np.searchsorted(starts, TIMES.astype(np.float64) + 1e-6, side="right") - 1
+    np.testing.assert_array_equal(values, KNOTS[np.clip(places, 0, 4)])
+
+
+@given(st.sampled_from([1, 3, 16, 40]), st.integers(1, 500), st.floats(0.001, 0.1))
+@settings(max_examples=60, deadline=None)
+def test_pieces_begin_on_the_beat_of_a_rollout(pieces, steps, dt):
+    wave = Waveform(jnp.arange(pieces, dtype=jnp.float32), "constant", pieces * steps * dt)
+    clock = jnp.arange(pieces, dtype=jnp.float32) * steps * jnp.float32(dt)
+    assert jax.vmap(wave)(clock).tolist() == list(range(pieces))
+
+
+@pytest.mark.parametrize("wave", [LINEAR, CONSTANT], ids=["linear", "constant"])
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_refined_is_the_same_function(wave, factor):
+    fine = wave.refined(factor)
+    times = TIMES + np.float32(0.0013)
+    np.testing.assert_allclose(jax.vmap(fine)(times), jax.vmap(wave)(times), atol=2e-5)
+    assert len(fine.knots) == {"linear": 4 * factor + 1, "constant": 5 * factor}[wave.hold]
+
+
+def test_vectors_and_batches():
+    knots = jax.random.normal(jax.random.key(0), (7, 5, 2))
+    batch = Waveform(knots, "linear", 2.0)
+    values = jax.jit(jax.vmap(lambda wave: wave(0.25)))(batch)
+    np.testing.assert_allclose(values, (knots[:, 0] + knots[:, 1]) / 2, atol=1e-6)
+    own = jnp.linspace(0, 2, 7)
+    values = jax.vmap(lambda wave, time: wave(time))(batch, own)
+    assert values.shape == (7, 2)
+    np.testing.assert_allclose(values[-1], knots[-1, -1])
+
+
+def test_gradients():
+    slopes = jax.grad(lambda wave: wave(0.625))(LINEAR)
+    np.testing.assert_allclose(slopes.knots, [0, 0.75, 0.25, 0, 0], atol=1e-6)
+    assert float(jax.grad(LINEAR)(0.2)) == pytest.approx(-6)
+    held = jax.grad(lambda wave: wave(0.5))(CONSTANT)
+    np.testing.assert_array_equal(held.knots, [0, 1, 0, 0, 0])
+
+
+def test_a_duration_is_needed_and_can_be_given():
+    unbound = Waveform(jnp.asarray(KNOTS))
+    with pytest.raises(ValueError, match=r"Signal\(\.\.\., duration=4.0\).*over\(4.0\)\(time\)"):
+        unbound(0.5)
+    assert float(unbound.over(2.0)(0.625)) == float(LINEAR(0.625))
+    features = {"wind": unbound, "x": 1.0, "short": LINEAR, "many": [unbound]}
+    given = bound(features, 8.0)
+    assert given["wind"].duration == given["many"][0].duration == 8.0
+    assert given["short"].duration == 2.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Waveform(KNOTS, "linaer"), "unknown hold 'linaer'; did you mean 'linear'"),
+        (lambda: LINEAR.over(0), "duration must be a positive number of seconds; got 0"),
+        (lambda: LINEAR.over(float("nan")), "positive number of seconds; got nan"),
+        (lambda: LINEAR.over("4"), "positive number of seconds; got '4'"),
+    ],
+)
+def test_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("hold", ["linear", "constant"])
+@pytest.mark.parametrize("knots", [np.array([1.0, -2.0, 4.0]), np.arange(6.0).reshape(3, 2)])
+def test_on_the_host_it_is_the_same_function_in_numpy(hold, knots):
+    knots = knots.astype(np.float32)
+    host, traced = Waveform(knots, hold, 2.0), Waveform(jnp.asarray(knots), hold, 2.0)
+    for time in (-1.0, 0, 0.3, 2 / 3, 1.0, np.float64(1.7), 2.0, 5.0):
+        value = host(time)
+        assert isinstance(value, np.ndarray | np.float32)
+        np.testing.assert_allclose(value, traced(time), rtol=1e-6)

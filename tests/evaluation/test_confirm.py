@@ -1,0 +1,524 @@
+"""Which counterexamples are real: against closed forms, and against replays of their own."""
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import verifai_jax as vj
+from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.keys import run_keys
+from verifai_jax.core.trace import Trace
+from verifai_jax.counterexamples._confirm import confirm
+from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.falsification.run import replay
+
+
+def oscillator(bound=1.5):
+    """A circle of radius `a`, which explicit Euler leaves: it reaches 1.6 `a` in 10 s.
+
+    At half the step 1.27 `a`, at a quarter of it 1.13 `a`.
+    """
+    system = vj.ode(
+        lambda t, s, control, f: {"x": s["v"], "v": -s["x"]},
+        lambda f, key: {"x": f["a"], "v": jnp.zeros_like(f["a"])},
+        dt=0.1,
+        duration=10.0,
+        method="euler",
+    )
+    return vj.Problem("circle", {"a": vj.Box(0.5, 2.0)}, system, f"always abs(x) <= {bound}")
+
+
+@pytest.fixture(scope="module")
+def circles():
+    return vj.falsify(
+        oscillator(), "uniform", 256, batch=256, seed=0, progress=False, confirm=False
+    )
+
+
+@pytest.fixture(scope="module")
+def confirmed_circles(circles):
+    return confirm(circles)
+
+
+def plain(function, spec="always x <= 0.8", space=None, **options):
+    """A problem whose signal is a function of its features and random key."""
+
+    def system(features, key):
+        return Trace({"x": jnp.broadcast_to(function(features, key), (3,))}, dt=0.1)
+
+    return vj.Problem("plain", space or {"x": vj.Box(0.0, 1.0)}, system, spec, **options)
+
+
+def checked(problem, values, seed=0, **options):
+    values = np.asarray(values, np.float32)
+    return Confirmer(problem, seed=seed, **options)({"x": values}, np.arange(len(values)))
+
+
+def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles):
+    a = circles.table.counterexamples["a"]
+    verdict = confirmed_circles.frame["verdict"]
+    # The solution has the radius a: what does not reach the bound may not be claimed.
+    assert (a[verdict == "confirmed"] > 1.5).all()
+    assert (verdict[a > 1.56] == "confirmed").all()
+    assert (verdict[a < 1.16] == "refuted").all()
+    assert (verdict[(a > 1.2) & (a < 1.5)] == "fragile").all()
+    assert confirmed_circles.counts.keys() == {"confirmed", "fragile", "refuted"}
+    assert len(confirmed_circles) == len(a) == sum(confirmed_circles.counts.values())
+
+
+def test_robustness_of_each_check_is_that_of_an_own_replay(circles, confirmed_circles):
+    row = circles.best
+    for factor, name in ((1, "float64"), (2, "half_step"), (4, "quarter_step")):
+        problem = replace(oscillator(), system=oscillator().system.refined(factor))
+        again = replay(problem, row, run_keys(0)[1], 0, "float64").rho["spec"]
+        found = confirmed_circles.frame.loc[row.name, f"rho.{name}"]
+        np.testing.assert_allclose(found, again, rtol=1e-12)
+
+
+def test_one_row_in_words(circles, confirmed_circles):
+    one = confirm(circles, int(circles.best.name))
+    assert one.confirmed
+    assert one == confirm(circles, circles.best)
+    row = confirmed_circles.frame.loc[circles.best.name]
+    assert (one.verdict, one.band) == (row["verdict"], pytest.approx(row["band"]))
+    assert str(one).startswith(
+        f"row {circles.best.name} of circle: confirmed, it fails in every replay. Robustness "
+    )
+    assert "as run (float32)" in str(one)
+    assert "at a quarter of the step in float32" in str(one)
+    frame = confirmed_circles.frame
+    least = int(frame.loc[frame["verdict"] == "refuted", "rho"].idxmin())
+    refuted = confirm(circles, least)
+    assert (
+        f"row {least} of circle: refuted, an artefact of the simulation: "
+        "it fails only in float64. Robustness" in str(refuted)
+    )
+
+
+def test_all_rows_in_words(circles, confirmed_circles):
+    told = str(confirmed_circles)
+    counts = confirmed_circles.counts
+    assert told.startswith(
+        f"circle: of {len(confirmed_circles)} counterexamples, {counts['confirmed']} confirmed, "
+        f"{counts['fragile']} fragile, {counts['refuted']} refuted\n"
+    )
+    assert f"the worst confirmed is row {circles.best.name}, robustness" in told
+
+
+def test_a_mapping_of_features_needs_no_row(circles):
+    assert confirm(circles, {"a": 1.9}).verdict == "confirmed"
+    assert confirm(circles, {"a": 1.0}).verdict == "refuted"
+    assert np.isnan(confirm(circles, {"a": 1.0}).rho["as_run"])
+
+
+def test_single_precision_is_not_believed():
+    # Beside 2^24 single precision has whole numbers only.
+    rounded = plain(lambda f, key: (f["x"] + 2.0**24) - 2.0**24)
+    found = checked(rounded, [0.6, 0.7, 0.9])
+    assert found.verdict.tolist() == ["refuted", "refuted", "confirmed"]
+    np.testing.assert_allclose(found.rho["float64"], [0.2, 0.1, -0.1], atol=1e-6)
+    assert found.notes == ("not checked at a finer step: the system has no refined(factor)",)
+    # A run that is off by as much as it fails by is no proof.
+    rows = {"x": np.array([0.9], np.float32), "rho": np.array([-0.2])}
+    doubtful = Confirmer(rounded)(rows, [0])
+    assert doubtful.verdict.tolist() == ["fragile"]
+    assert doubtful.why == ["its robustness -0.1 moves by 0.1 between replays"]
+
+
+def test_chaos_is_fragile():
+    def doubled(features, key):
+        x = features["x"]
+        for _ in range(45):
+            x = 4.0 * x * (1.0 - x)
+        return x
+
+    run = vj.falsify(
+        plain(doubled, "always x <= 0.9"),
+        "uniform",
+        1024,
+        batch=1024,
+        seed=0,
+        progress=False,
+        confirm=False,
+    )
+    found = confirm(run)
+    assert len(found) > 100
+    assert len(found.confirmed) < len(found) / 20
+
+
+@dataclass(frozen=True)
+class Steps:
+    """A signal that is a function of the feature and of how fine the step is."""
+
+    of: object
+    factor: int = 1
+
+    def refined(self, factor):
+        return Steps(self.of, self.factor * factor)
+
+    def __call__(self, features, key):
+        return Trace({"x": jnp.broadcast_to(self.of(features["x"], self.factor), (3,))}, dt=0.1)
+
+
+def steps(of, spec="always x <= 0.5"):
+    return vj.Problem("steps", {"x": vj.Box(0.0, 1.0)}, Steps(of), spec)
+
+
+def test_a_simulation_that_breaks_down_at_a_finer_step_is_fragile():
+    gone = steps(lambda x, factor: x if factor < 4 else x * jnp.nan)
+    found = checked(gone, [0.9])
+    assert found.verdict.tolist() == ["fragile"]
+    assert np.isnan(found.rho["quarter_step"][0])
+    assert "no verdict at a quarter of the step" in found.why[0]
+    assert "it is not finite" in found.why[0]
+
+    def raising(x, factor):
+        if factor == 2:
+            raise RuntimeError("too fine")
+        return x
+
+    found = checked(steps(raising), [0.9])
+    assert found.verdict.tolist() == ["fragile"]
+    assert found.why == ["no verdict at half the step: RuntimeError: too fine"]
+
+
+def test_steps_that_disagree_are_fragile_and_neither_is_taken_for_the_truth():
+    halves = {1: 1.0, 2: 0.4, 4: 1.0}
+    found = checked(steps(lambda x, factor: x * halves[factor]), [0.9])
+    assert found.verdict.tolist() == ["fragile"]
+    assert found.why == ["it holds at half the step"]
+
+
+def test_a_factor_that_must_be_an_integer_is_one():
+    @dataclass(frozen=True)
+    class Boastful(Steps):
+        traced_factor = True
+
+    problem = vj.Problem(
+        "integers",
+        {"x": vj.Box(0.0, 1.0)},
+        Boastful(lambda x, factor: x * len(range(factor)) / factor),
+        "always x <= 0.5",
+    )
+    found = checked(problem, [0.9])
+    assert found.verdict.tolist() == ["confirmed"]
+    assert found.notes == ()
+    assert set(found.rho) >= {"half_step", "quarter_step", "quarter_step_float32"}
+
+
+def test_a_step_that_cannot_be_made_smaller_is_told():
+    class Stiff(Steps):
+        def refined(self, factor):
+            raise ValueError("one step only")
+
+    problem = vj.Problem(
+        "stiff", {"x": vj.Box(0.0, 1.0)}, Stiff(lambda x, factor: x), "always x <= 0.5"
+    )
+    found = checked(problem, [0.9])
+    assert found.verdict.tolist() == ["confirmed"]
+    assert found.notes == (
+        "not checked at a finer step: refined(2) raised ValueError: one step only",
+    )
+    assert set(found.rho) == {"float64", "nudged"}
+
+
+def test_at_zero_the_boolean_semantics_decide():
+    touching = plain(lambda f, key: 0.0 * f["x"], "always x > 0")
+    assert checked(touching, [0.3]).verdict.tolist() == ["confirmed"]
+    allowed = plain(lambda f, key: 0.0 * f["x"], "always x >= 0")
+    assert checked(allowed, [0.3]).verdict.tolist() == ["refuted"]
+
+
+def test_random_systems_keep_their_numbers_and_their_precision():
+    noisy = plain(lambda f, key: f["x"] + 0.1 * jax.random.normal(key))
+    run = vj.falsify(noisy, "uniform", 64, batch=64, seed=3, progress=False, confirm=False)
+    found = confirm(run)
+    np.testing.assert_allclose(found.frame["rho.again"], found.frame["rho"], rtol=1e-5, atol=1e-7)
+    assert "not checked in float64: in it the system would draw other random numbers" in found.notes
+    # The same numbers again say nothing new.
+    assert found.counts == {"unchecked": len(found)}
+    finer = confirm(run, int(run.best.name), simulator=noisy)
+    assert finer.verdict == "confirmed"
+
+
+def test_a_run_in_double_precision_without_a_finer_step_is_unchecked():
+    run = vj.falsify(
+        plain(lambda f, key: f["x"]),
+        "uniform",
+        32,
+        batch=32,
+        precision="float64",
+        progress=False,
+        confirm=False,
+    )
+    found = confirm(run)
+    assert found.counts == {"unchecked": len(found)}
+    assert "nothing finer to check it with" in str(confirm(run, int(run.best.name)))
+
+
+def test_formulas_count_together():
+    spec = {"low": "always x <= 0.8", "high": "always x >= 0.1"}
+    found = checked(plain(lambda f, key: f["x"], spec), [0.05, 0.95, 0.5])
+    assert found.verdict.tolist() == ["confirmed", "confirmed", "refuted"]
+    np.testing.assert_allclose(found.rho["float64"], [-0.05, -0.15, 0.3], atol=1e-6)
+
+
+def boxed(function, spec="always x <= 0.5"):
+    return vj.Problem("boxed", {"x": vj.Box(0.0, 1.0)}, vj.blackbox(function), spec)
+
+
+def test_a_black_box_is_simulated_again():
+    steady = boxed(lambda f: Trace({"x": np.full(4, f["x"])}, dt=0.1))
+    found = checked(steady, [0.7, 0.9])
+    assert found.verdict.tolist() == ["confirmed"] * 2
+    assert found.notes == (
+        "not checked in float64: a black box",
+        "not checked at a finer step: the system has no refined(factor)",
+    )
+    answers = iter([1.0, 0.0, 1.0, 0.0, *[0.0] * 9])
+    moody = boxed(lambda f: Trace({"x": np.full(4, next(answers))}, dt=0.1))
+    run = vj.falsify(moody, "uniform", 4, batch=4, progress=False, confirm=False)
+    assert confirm(run).counts == {"fragile": 2}
+
+
+def test_a_black_box_may_be_refined():
+    def finer(factor):
+        def simulate(features):
+            if features["x"] > 0.95 and factor > 1:
+                raise RuntimeError("diverged")
+            return Trace({"x": np.full(4, features["x"] / factor)}, dt=0.1)
+
+        simulate.refined = lambda more: finer(factor * more)
+        return simulate
+
+    found = checked(boxed(finer(1), "always x <= 0.2"), [0.3, 0.5, 0.85, 0.99])
+    assert found.verdict.tolist() == ["refuted", "fragile", "fragile", "fragile"]
+    assert "RuntimeError: diverged" in found.why[3]
+    np.testing.assert_allclose(
+        found.rho["quarter_step"][:3], 0.2 - np.array([0.3, 0.5, 0.85]) / 4, rtol=1e-5
+    )
+
+
+def test_features_are_those_of_the_table():
+    space = vj.FeatureSpace(
+        {
+            "point": vj.Box([0.0, 1.0], [1.0, 5.0]),
+            "mass": vj.LogUniform(0.1, 10.0),
+            "wind": vj.Signal(vj.Box(-1.0, 1.0), knots=3, hold="linear"),
+            "kind": vj.Categorical("a", "b"),
+            "count": vj.DiscreteBox(1, 6),
+            "cars": vj.Array(vj.Struct({"x": vj.Box(0.0, 9.0)}), length=(0, 2)),
+            "g": vj.Constant(9.81),
+        }
+    )
+    u = jnp.asarray(np.random.default_rng(0).random((12, space.dim), np.float32))
+    columns = space.rows(jax.vmap(space.unflatten)(u))
+    for precision in ("float32", "float64"):
+        batch = space.features_of(columns, precision)
+        with jax.enable_x64(precision == "float64"):
+            for i in range(12):
+                row = {name: column[i] for name, column in columns.items()}
+                one, other = space.from_row(row), jax.tree.map(lambda leaf, i=i: leaf[i], batch)
+                assert jax.tree.structure(one) == jax.tree.structure(other)
+                for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+                    assert a.dtype == b.dtype
+                    np.testing.assert_array_equal(a, b)
+    moved = space.nudged(space.features_of(columns, "float64"))
+    np.testing.assert_array_equal(moved["g"], 9.81)
+    share = np.abs(moved["mass"] / space.features_of(columns, "float64")["mass"] - 1)
+    np.testing.assert_allclose(share, 2.0**-23, rtol=1e-6)
+    corner = space.nudged({**moved, "point": np.array([[1.0, 5.0]])})["point"]
+    assert np.all(corner < [1.0, 5.0])
+    with pytest.raises(UnknownNameError, match="unknown column 'mass'"):
+        space.features_of({name: c for name, c in columns.items() if name != "mass"}, "float32")
+
+
+def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
+    smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
+    run = vj.falsify(smooth, "uniform", 1024, batch=1024, seed=1, progress=False, confirm=False)
+    failing = run.table.counterexamples
+    columns = {name: failing[name].to_numpy() for name in failing.columns}
+    confirmer = Confirmer(smooth, most=100)
+    found = confirmer(columns, failing.index.to_numpy())
+    left = found.verdict == "unexamined"
+    assert (~left).sum() == confirmer.examined == 100
+    rho = np.abs(columns["rho"])
+    assert rho[~left].max() <= rho[left].min()
+    assert rho[left].min() > 10 * confirmer.band > 0
+    told = found.why[int(np.argmax(left))]
+    assert told == found.notes[-1]
+    assert told.startswith(f"{left.sum()} of {len(failing)} were not replayed: 0.")
+    assert "where none of 100 replays moved a row by more than" in told
+    assert np.isnan(found.rho["float64"][left]).all()
+    # Where rounding or the step decides, all of them are.
+    rows = circles.table.counterexamples
+    all_of_them = Confirmer(circles.problem, most=10)(
+        {name: rows[name].to_numpy() for name in rows.columns}, rows.index.to_numpy()
+    )
+    assert "unexamined" not in all_of_them.verdict
+    with pytest.raises(ValueError, match="most must be a positive integer; got 0"):
+        Confirmer(smooth, most=0)
+
+
+def test_what_is_finished_survives_ctrl_c(circles, monkeypatch):
+    monkeypatch.setattr(sys.modules[confirm.__module__], "BLOCK", 16)
+    calls = iter([True, False])
+    whole = Confirmer.__call__
+
+    def interrupted(self, rows, numbers):
+        if not next(calls):
+            raise KeyboardInterrupt
+        return whole(self, rows, numbers)
+
+    monkeypatch.setattr(Confirmer, "__call__", interrupted)
+    found = confirm(circles)
+    assert found.counts["unexamined"] == len(found) - 16
+    assert found.notes == ("interrupted after 16 rows",)
+
+
+def test_another_simulator_has_to_agree(circles):
+    exact = vj.ode(
+        lambda t, s, control, f: {"x": s["v"], "v": -s["x"]},
+        lambda f, key: {"x": f["a"], "v": jnp.zeros_like(f["a"])},
+        dt=0.1,
+        duration=10.0,
+    )
+    row = int(circles.best.name)
+    agreed = confirm(circles, row, simulator=exact)
+    assert agreed.verdict == "confirmed"
+    assert agreed.rho["simulator"] == pytest.approx(1.5 - circles.best["a"], abs=1e-2)
+    calm = replace(exact, initial=lambda f, key: {"x": 0.1 * f["a"], "v": 0.0 * f["a"]})
+    other = confirm(circles, row, simulator=replace(circles.problem, system=calm))
+    assert other.verdict == "fragile"
+    assert other.why == "it holds in the other simulator"
+    with pytest.raises(ValueError, match="no backends; simulator must be a system or a Problem"):
+        confirm(circles, row, simulator="native")
+    stranger = vj.Problem("other", {"b": vj.Box(0.5, 2.0)}, exact, "always x <= 1")
+    with pytest.raises(UnknownNameError, match="unknown feature of the simulator 'b'"):
+        confirm(circles, row, simulator=stranger)
+
+
+def test_errors_say_what_to_do(circles, tmp_path):
+    safe = int(circles.table.safe.index[0])
+    with pytest.raises(ValueError, match=f"row {safe} is no counterexample: it keeps the property"):
+        confirm(circles, safe)
+    with pytest.raises(IndexError, match="row 999 is not in the table of 256 simulations"):
+        confirm(circles, 999)
+    with pytest.raises(UnknownNameError, match="did you mean 'simulator'"):
+        confirm(circles, simulater="native")
+    with pytest.raises(TypeError, match="confirm needs a Run; got Problem"):
+        confirm(circles.problem)
+    circles.save(tmp_path / "run")
+    with pytest.raises(ValueError, match=r"was loaded without its problem.*vj.load\(path, problem"):
+        confirm(vj.load(tmp_path / "run"))
+    loaded = vj.load(tmp_path / "run", circles.problem)
+    assert confirm(loaded, int(loaded.best.name)).verdict == "confirmed"
+
+
+def test_a_run_without_failures():
+    calm = vj.falsify(oscillator(5.0), "uniform", 16, batch=16, progress=False, confirm=False)
+    assert str(confirm(calm)) == "circle: no counterexample to confirm"
+    assert len(confirm(calm).confirmed) == 0
+
+
+SPEC = """
+from tests.test_confirm import oscillator
+circle = oscillator()
+"""
+
+
+def test_command_line(circles, tmp_path):
+    from verifai_jax.cli.confirm import confirm as command
+
+    target = tmp_path / "circle.py"
+    target.write_text(SPEC)
+    circles.save(tmp_path / "run")
+    folder, problem = str(tmp_path / "run"), ["--problem", f"{target}:circle"]
+    call = CliRunner().invoke
+    done = call(command, [folder, str(circles.best.name), *problem, "--fail"])
+    assert done.exit_code == 0, done.output
+    assert "of circle: confirmed, it fails in every replay" in done.output
+    done = call(command, [folder, *problem])
+    assert done.exit_code == 0
+    assert "circle: of" in done.output
+    done = call(command, [folder, *problem, "--fail"])
+    assert done.exit_code == 1
+    assert "refuted" in done.output
+
+
+def independent(run, numbers, factors):
+    """Robustness `[rows, factors]` of rows, each replayed by itself in double precision."""
+    rho = []
+    for number in numbers:
+        row = run.table.all.loc[number]
+        each = []
+        for factor in factors:
+            finer = replace(run.problem, system=run.problem.system.refined(factor))
+            again = replay(finer, row, run_keys(run.seed)[1], int(number), "float64")
+            each.append(min(again.rho.values()))
+        rho.append(each)
+    return np.array(rho)
+
+
+@pytest.mark.slow
+def test_automatic_transmission_is_believed():
+    from specs.arch import automatic_transmission as at
+
+    run = vj.falsify(at.at2, "uniform", 256, batch=256, seed=1, progress=False, confirm=False)
+    found = confirm(run)
+    assert found.counts.keys() == {"confirmed"}
+    assert found.notes == ()
+    numbers = found.confirmed.index[:3]
+    finer = independent(run, numbers, (4, 8))
+    assert np.all(finer < 0)
+    np.testing.assert_allclose(found.frame.loc[numbers, "rho.quarter_step"], finer[:, 0], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_chaotic_loop_is_not_believed_and_what_is_holds_up():
+    from specs.arch import neural_network_controller as nn
+
+    run = vj.falsify(nn.nn, "uniform", 20_480, batch=1024, seed=1, progress=False, confirm=False)
+    found = confirm(run)
+    assert len(found) > 50
+    assert len(found.confirmed) < len(found) / 4
+    numbers = found.confirmed.index[:4]
+    assert len(numbers)
+    assert np.all(independent(run, numbers, (4, 8)) < 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["native", "mjx"])
+def test_mujoco_on_both_engines(backend):
+    pytest.importorskip("mujoco")
+    from specs import mujoco_cartpole
+
+    run = vj.falsify(
+        mujoco_cartpole.balance,
+        "uniform",
+        256,
+        batch=256,
+        backend=backend,
+        progress=False,
+        confirm=False,
+    )
+    other = "mjx" if backend == "native" else "native"
+    row = int(run.best.name)
+    found = confirm(run, row, simulator=other)
+    assert found.verdict == "confirmed"
+    assert found.rho["simulator"] == pytest.approx(found.rho["as_run"], abs=1e-4)
+    assert {"half_step", "quarter_step"} <= found.rho.keys()
+    assert found.rho["half_step"] != found.rho["as_run"]
+    assert len(confirm(run)) == len(run.table.counterexamples)
+
+
+def test_the_page_says_what_comes_out():
+    text = (Path(__file__).parents[2] / "docs" / "confirm.md").read_text()
+    for verdict in ("confirmed", "fragile", "refuted", "unchecked", "unexamined"):
+        assert f"`{verdict}`" in text

@@ -1,0 +1,188 @@
+"""Simulators on the host: in lock-step, one by one in any order, with rows that fail."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.evaluation.journal import JOURNAL, Journal, Judged
+from verifai_jax.falsification.loop import Rounds
+from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.search import Uniform
+from verifai_jax.systems.outcome import Outcome
+
+SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
+SPEC = "always x <= 0.9"
+CLOCK = np.linspace(0, 1, 5)
+
+
+def ramp(features, key):
+    return Trace({"x": (features["a"] + 0.1 * features["b"]) * jnp.asarray(CLOCK)}, dt=0.25)
+
+
+class LockStep:
+    black_box: ClassVar[bool] = True
+
+    def __call__(self, features, key=None):
+        return ramp(features, key)
+
+    def simulate_batch(self, features, keys):
+        return jax.vmap(ramp)(features, keys)
+
+
+class OneByOne:
+    """Answers in a shuffled order; what each row does depends on its feature alone."""
+
+    black_box: ClassVar[bool] = True
+
+    def __init__(self):
+        self.simulated = []
+
+    def __call__(self, features, key=None):
+        return ramp(features, key)
+
+    def outcome(self, features):
+        if features["b"] > 0.9:
+            return Outcome(None, Status.TIMEOUT, "no answer for 1 s")
+        if features["b"] < -0.9:
+            return Outcome(None, Status.ERROR, "worker died")
+        trace = ramp(features, None)
+        # Traces of several lengths: held at the end, they say the same.
+        return Outcome(trace if features["b"] > 0 else held(trace, 9))
+
+    def simulate_each(self, features, seeds):
+        for i in np.random.default_rng(1).permutation(len(features)):
+            self.simulated.append(round(features[i]["a"], 6))
+            yield int(i), self.outcome(features[i])
+
+
+def held(trace, length):
+    signals = {
+        n: np.append(s, [np.asarray(s)[-1]] * (length - 5)) for n, s in trace.signals.items()
+    }
+    return dataclasses.replace(trace, signals=signals)
+
+
+def problem_of(system):
+    return vj.Problem("ramp", SPACE, system, SPEC)
+
+
+@pytest.fixture(scope="module")
+def traced():
+    return vj.falsify(problem_of(ramp), "uniform", 200, batch=64).table.all
+
+
+def test_lock_step_gives_the_table_of_the_traced_system(traced):
+    table = vj.falsify(problem_of(LockStep()), "uniform", 200, batch=64).table.all
+    assert (table["message"] == "").all()
+    np.testing.assert_allclose(table["rho"], traced["rho"], atol=1e-6)
+    assert (table["violated"] == traced["violated"]).all()
+
+
+def test_rows_come_in_any_order_and_are_told_apart(traced):
+    table = vj.falsify(problem_of(OneByOne()), "uniform", 200, batch=64).table.all
+    late, dead = table["b"] > 0.9, table["b"] < -0.9
+    assert late.any()
+    assert dead.any()
+    assert (table.loc[late, "status"] == "timeout").all()
+    assert (table.loc[late, "message"] == "no answer for 1 s").all()
+    assert (table.loc[dead, "message"] == "worker died").all()
+    proper = ~late & ~dead
+    assert (table.loc[proper, "status"] == "ok").all()
+    np.testing.assert_allclose(table.loc[proper, "rho"], traced.loc[proper, "rho"], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (lambda f: 3, "TypeError: the system must return a Trace; it returned int"),
+        (lambda f: Trace({"y": np.ones(3)}, dt=1.0), "unknown signal 'x'"),
+        (lambda f: 1 / 0, "ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_goes_wrong_is_a_row(system, message):
+    table = vj.falsify(problem_of(vj.blackbox(system)), "uniform", 40, batch=40).table.all
+    assert (table["status"] == "error").all()
+    assert table["message"].str.contains(message, regex=False).all()
+
+
+def test_a_batch_of_the_wrong_form_is_rows_too():
+    class Short(LockStep):
+        def simulate_batch(self, features, keys):
+            return jax.vmap(ramp)(*jax.tree.map(lambda leaf: leaf[:3], (features, keys)))
+
+    table = vj.falsify(problem_of(Short()), "uniform", 8, batch=8).table.all
+    assert (table["status"] == "error").all()
+    assert "a batch of 8 simulations must give signals [8, time]; 'x' has" in table["message"][0]
+
+
+def test_finished_rows_of_a_batch_survive_a_kill(tmp_path, traced):
+    """A process that dies within a batch leaves a journal; only the other rows are simulated."""
+
+    class Dies(OneByOne):
+        def simulate_each(self, features, seeds):
+            for k, answer in enumerate(super().simulate_each(features, seeds)):
+                if k == 40:
+                    raise KeyboardInterrupt
+                yield answer
+
+    folder = tmp_path / "run"
+    whole = vj.falsify(problem_of(OneByOne()), "uniform", 64, batch=64)
+    first = Dies()
+    run = vj.falsify(problem_of(first), "uniform", 64, batch=64, folder=folder)
+    assert run.stopped == "interrupted"
+    assert len(run.table) == 0
+    second = OneByOne()
+    resumed = vj.resume(folder, problem_of(second))
+    assert resumed.table.all.equals(whole.table.all)
+    finished = first.simulated[:32]  # Judged in blocks of 32 at most; failed ones at once.
+    assert len(set(second.simulated) & set(finished)) < len(finished)
+    assert len(second.simulated) < 64
+    assert not (folder / JOURNAL).exists()
+
+
+def test_journal_recalls_only_the_same_point(tmp_path):
+    points = np.random.default_rng(0).random((3, 2)).astype(np.float32)
+    journal = Journal(tmp_path)
+    journal.add(7, points[1], Judged(np.array([0.1, np.nan]), 1, np.array([True, False]), "é"))
+    journal.settle(7)  # Nothing of the batch in flight is in the table yet.
+    with open(journal.path, "a") as file:
+        file.write('{"row": 8, "po')  # Where the process died.
+    known = Journal(tmp_path).recall(6, points)
+    assert list(known) == [1]
+    assert known[1].message == "é"
+    np.testing.assert_array_equal(known[1].rho, [0.1, np.nan])
+    assert Journal(tmp_path).recall(7, points) == {}
+    Journal(tmp_path).settle(8)
+    assert not journal.path.exists()
+
+
+def test_a_system_says_early_what_does_not_fit():
+    class Picky(LockStep):
+        def check(self, features):
+            raise ValueError(f"no use for {sorted(features)}")
+
+    with pytest.raises(ValueError, match=r"no use for \['a', 'b'\]"):
+        problem_of(Picky()).check()
+
+    class Told(LockStep):
+        def abstract(self, features):
+            return jax.eval_shape(lambda: Trace({"y": jnp.ones(5)}, dt=0.25))
+
+    with pytest.raises(ValueError, match="unknown signal 'x'"):
+        problem_of(Told()).check()
+
+
+def test_zero_is_decided_by_the_comparator_without_another_simulation():
+    system = OneByOne()
+    problem = vj.Problem("edge", {"a": vj.Constant(0.0), "b": vj.Constant(0.5)}, system, "x > 0")
+    rounds = Rounds(problem, Uniform(), 4, 0, ErrorTable(("a", "b")))
+    rounds.compile()
+    rounds.advance(4)
+    assert rounds.found == 4
+    assert len(system.simulated) == 4

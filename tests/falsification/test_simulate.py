@@ -1,0 +1,77 @@
+"""Given features are simulated in their order, each once."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Listed
+from verifai_jax.testing import check_batch_independence, check_search
+
+SPACE = vj.FeatureSpace({"a": vj.Box(0, 2), "kind": vj.Categorical("slow", "fast")})
+
+
+@pytest.fixture(scope="module")
+def problem():
+    def system(features, key):
+        return vj.Trace({"x": features["a"] * (1 + features["kind"]) * jnp.ones(2)}, dt=1.0)
+
+    return vj.Problem("given", SPACE, system, "x < 2.5")
+
+
+def test_rows_of_a_table(problem):
+    earlier = vj.falsify(problem, "uniform", 50, batch=50)
+    wanted = earlier.table.all.iloc[[7, 3, 41]]
+    run = vj.simulate(problem, wanted, batch=2)
+    assert (run.stopped, run.simulations) == ("budget", 3)
+    np.testing.assert_allclose(run.table.all["a"], wanted["a"], rtol=1e-6)
+    assert list(run.table.all["kind"]) == list(wanted["kind"])
+    np.testing.assert_allclose(run.table.all["rho"], wanted["rho"], atol=1e-5)
+    assert run.failure_rate is None
+
+
+def test_features_as_a_person_writes_them(problem):
+    one = vj.simulate(problem, {"a": 1.5, "kind": "fast"}).table.all
+    assert one["rho"].tolist() == pytest.approx([-0.5])
+    two = vj.simulate(problem, [{"a": 1.0, "kind": "slow"}, {"a": 2.0, "kind": "fast"}]).table.all
+    np.testing.assert_allclose(two["rho"], [1.5, -1.5], rtol=1e-6)
+
+
+def test_contract():
+    points = np.random.default_rng(0).random((50, 2), np.float32)
+    check_search(Listed(points), Cube((0, 0)))
+    check_batch_independence(Listed(points), Cube((0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda p: vj.simulate(p, {"a": 3, "kind": "fast"}), r"a must lie in \[0, 2\]; got 3"),
+        (lambda p: vj.simulate(p, {"a": 1}), "kind is missing"),
+        (
+            lambda p: vj.simulate(p, vj.falsify(p, budget=4).table.all.drop(columns="kind")),
+            "unknown column 'kind'",
+        ),
+        (lambda p: Listed(np.zeros((0, 2))), r"n >= 1; got shape \[0, 2\]"),
+        (lambda p: Listed([[1.5, 0]]), "must lie in the unit cube"),
+        (
+            lambda p: vj.falsify(p, Listed([[0.5]])),
+            "the points have 1 coordinates, the space has 2",
+        ),
+    ],
+)
+def test_bad_input(problem, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(problem)
+
+
+def test_only_holds_the_others_where_it_is_told_to():
+    def system(features, key):
+        return vj.Trace({"x": (features["a"] + features["w"])[None]}, dt=1.0)
+
+    space = {"a": vj.Box(0, 1), "w": vj.Box(-1, 1)}
+    problem = vj.Problem("held", space, system, "x <= 9", nominal={"a": 0.5, "w": 0.0})
+    held = problem.only("a", nominal={"w": 0.25})
+    assert held.nominal == {"a": 0.5, "w": 0.25}
+    assert set(vj.falsify(held, "uniform", 4, batch=4).table.all["w"]) == {0.25}

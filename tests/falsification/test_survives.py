@@ -1,0 +1,181 @@
+"""Runs that are killed, and disks that do not take what is written to them."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax.falsification.checkpoint import STATE
+from verifai_jax.falsification.run import RECORD
+from verifai_jax.falsification.table import STREAM
+
+SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
+
+
+def ramp(features, key):
+    return vj.Trace({"x": (features["a"] + 0.1 * features["b"]) * jnp.linspace(0, 1, 5)}, dt=0.25)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return vj.Problem("ramp", SPACE, ramp, "always x <= 0.9")
+
+
+@pytest.fixture(scope="module")
+def whole(problem):
+    return vj.falsify(problem, "cross_entropy", 160, batch=16).table.all
+
+
+def full_disk(folder, name):
+    """Let writing to this file of the folder fail as on a full disk."""
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    folder.mkdir(exist_ok=True)
+    (folder / name).symlink_to("/dev/full")
+
+
+class Full:
+    """A writer to a disk that has no room."""
+
+    def __init__(self, file):
+        self.file = file
+
+    def write_batch(self, batch):
+        self.file.write(bytes(99))
+
+    def close(self):
+        pass
+
+
+def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    rows = vj.ErrorTable.append
+
+    def append(self, columns):
+        # The disk is full from the fourth batch on: what is written goes nowhere.
+        if len(self) == 48 and self._stream is not None:
+            self._stream._file.close()
+            self._stream._file = open("/dev/full", "wb")  # noqa: SIM115 - closed by the table
+            self._stream._writer = Full(self._stream._file)
+        rows(self, columns)
+
+    monkeypatch.setattr(vj.ErrorTable, "append", append)
+    with pytest.raises(vj.RunError, match=r"broke down after 64 .*[Nn]o space") as raised:
+        vj.falsify(problem, "cross_entropy", 160, batch=16, folder=folder)
+    monkeypatch.undo()
+    assert "make room there and resume it, or save the run elsewhere" in str(raised.value)
+    run = raised.value.run
+    # In memory: all that was simulated. It can be saved elsewhere, and goes on there.
+    assert run.table.all.equals(whole.iloc[:64])
+    elsewhere = run.save(tmp_path / "elsewhere")
+    assert vj.resume(elsewhere, problem).table.all.equals(whole)
+    # On disk: whole batches, from which a resumed run gives the same table.
+    assert vj.resume(folder, problem).table.all.equals(whole)
+
+
+@pytest.mark.parametrize("name", [f"{STATE}.part", f"{RECORD}.part", "table.parquet.part"])
+def test_a_disk_that_is_full_at_the_end(problem, whole, tmp_path, name):
+    folder = tmp_path / "run"
+    vj.falsify(problem, "cross_entropy", 64, batch=16, folder=folder)
+    full_disk(folder, name)
+    with pytest.raises((vj.RunError, ValueError), match=r"[Nn]o space") as raised:
+        vj.resume(folder, problem, budget=160)
+    if isinstance(raised.value, vj.RunError):
+        assert raised.value.run.table.all.equals(whole)
+    (folder / name).unlink(missing_ok=True)
+    assert vj.resume(folder, problem, budget=160).table.all.equals(whole)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_runs(problem, tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file" / "run", Path("/proc/run")):
+        with pytest.raises(ValueError, match=r"folder '.*run' cannot be written \(.+\); give one"):
+            vj.falsify(problem, "uniform", 32, folder=folder)
+
+
+def test_a_damaged_folder_is_told(problem, tmp_path):
+    run = vj.falsify(problem, "cross_entropy", 64, batch=16, folder=tmp_path / "run")
+    assert run.folder is not None
+    (run.folder / "table.parquet").unlink()
+    (run.folder / STREAM).write_bytes(b"")
+    with pytest.raises(ValueError, match="its search had seen 64 simulations, of which its table"):
+        vj.resume(run.folder, problem, budget=160)
+
+
+def test_a_kill_before_the_first_rows_is_resumed(problem, whole, tmp_path):
+    run = vj.falsify(problem, "cross_entropy", 32, batch=16, folder=tmp_path)
+    record = json.loads((tmp_path / RECORD).read_text())
+    (tmp_path / RECORD).write_text(json.dumps({**record, "stopped": "running"}))
+    (tmp_path / "table.parquet").unlink()
+    (tmp_path / STATE).unlink()
+    assert len(run.table) == 32
+    assert vj.resume(tmp_path, problem, budget=160).table.all.equals(whole)
+
+
+def test_a_kill_before_the_first_record_does_not_block_the_folder(problem, tmp_path):
+    (tmp_path / f"{RECORD}.part").write_text("{")
+    assert len(vj.falsify(problem, "uniform", 32, folder=tmp_path).table) == 32
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import numpy as np
+import verifai_jax as vj
+from tests.test_survives import slow_problem
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[2])
+    if (folder / "run.json").exists():
+        vj.resume(folder, slow_problem(sys.argv[1]))
+    else:
+        vj.falsify(
+            slow_problem(sys.argv[1]), "cross_entropy", int(sys.argv[3]), batch=16, folder=folder
+        )
+"""
+
+
+def simulate_slowly(features):
+    time.sleep(0.0005)
+    return vj.Trace({"x": (features["a"] + 0.1 * features["b"]) * np.linspace(0, 1, 5)}, dt=0.25)
+
+
+def slow_problem(kind):
+    system = ramp if kind == "traced" else vj.blackbox(simulate_slowly)
+    return vj.Problem("ramp", SPACE, system, "always x <= 0.9")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "kills"), [("traced", 20), ("blackbox", 4)])
+def test_killed_at_random_moments_and_resumed_the_table_is_the_same(kind, kills, tmp_path):
+    script, folder = tmp_path / "killed.py", tmp_path / "run"
+    script.write_text(KILLED)
+    root = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": root, "VERIFAI_JAX_CACHE": str(tmp_path / "cache")}
+    # More than any machine can do meanwhile: every one of the processes is killed.
+    command = [sys.executable, str(script), kind, str(folder), str(100_000_000)]
+    moments = random.Random(0)
+    for _ in range(kills):
+        child = subprocess.Popen(command, env=environment, cwd=root)
+        # Some die while they import, most in the middle of their rounds.
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(timeout=moments.uniform(1.0, 6.0))
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+    cut_off = len(vj.load(folder).table)
+    assert cut_off > 1000
+    budget = 16 * (cut_off // 16 + 50)
+    table = vj.resume(folder, slow_problem(kind), budget=budget).table.all
+    whole = vj.falsify(slow_problem("traced"), "cross_entropy", budget, batch=16).table.all
+    assert list(table.index) == list(range(budget))
+    np.testing.assert_allclose(table["rho"], whole["rho"], atol=0 if kind == "traced" else 1e-6)
+    assert table["a"].equals(whole["a"])

@@ -1,0 +1,126 @@
+"""Constraints under every search: only accepted points, at most once each, and none for nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import verifai_jax as vj
+from verifai_jax.search import Grid, named, names
+from verifai_jax.search.proposals import ConstraintError, Proposals
+
+DOMAINS = {"x": vj.Box(0, 1), "y": vj.Box(0, 1), "kind": vj.Categorical("a", "b", "c")}
+
+
+def below(features):
+    """Below the diagonal, and not of the first kind: a third of the space."""
+    return (features["y"] < features["x"]) & (features["kind"] > 0)
+
+
+SPACE = vj.FeatureSpace(DOMAINS, where=below)
+KEY = jax.random.key(4)
+
+
+def play(proposals, rounds, gradient):
+    """The points of some rounds, of which those near a corner of the allowed part fail."""
+    seen = []
+    for _ in range(rounds):
+        points = np.asarray(proposals.next(16))
+        seen.append(points)
+        offset = points - np.array([1.0, 0.9, 0.5])
+        rho = np.linalg.norm(offset[:, :2], axis=1) - 0.1
+        slope = (offset * np.array([1, 1, 0])).astype(np.float32) if gradient else None
+        proposals.tell(rho.astype(np.float32), np.ones(len(points), bool), slope)
+    return np.concatenate(seen)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow if name in ("bayes", "cmaes") else ())
+        for name in names()
+        if name != "grid"
+    ],
+)
+def test_every_search(name):
+    search = named(name)
+    proposals = Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint)
+    points = play(proposals, 8, search.wants_gradient)
+    features = jax.vmap(SPACE.unflatten)(jnp.asarray(points))
+    assert np.all(jax.vmap(below)(features))
+    # Rounds with slopes are of few rows.
+    assert len(points) >= (16 if search.wants_clauses else 64)
+    assert proposals.accepted == len(points) <= proposals.asked
+    again = play(Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint), 8, search.wants_gradient)
+    np.testing.assert_array_equal(points, again)
+
+
+def test_a_search_goes_on_from_its_snapshot_under_a_constraint():
+    for name in ("halton", "cross_entropy"):
+        one = Proposals(named(name), SPACE.cube, 16, KEY, SPACE.constraint)
+        play(one, 3, False)
+        two = Proposals(named(name), SPACE.cube, 16, jax.random.key(99), SPACE.constraint)
+        two.restore(one.snapshot())
+        np.testing.assert_array_equal(play(one, 3, False), play(two, 3, False))
+        assert (one.asked, one.accepted) == (two.asked, two.accepted)
+
+
+def test_accepted_samples_follow_the_prior_given_the_constraint():
+    points = np.asarray(
+        Proposals(named("uniform"), SPACE.cube, 512, KEY, SPACE.constraint).next(4096)
+    )
+    kinds = np.unique(np.floor(points[:, 2] * 3), return_counts=True)[1]
+    assert stats.chisquare(kinds).pvalue > 1e-3
+    # x has density 2 x below the diagonal, and y / x is uniform.
+    assert stats.kstest(points[:, 0] ** 2, "uniform").pvalue > 1e-3
+    assert stats.kstest(points[:, 1] / points[:, 0], "uniform").pvalue > 1e-3
+
+
+def test_sequences_do_not_depend_on_the_batch():
+    for name in ("uniform", "halton", "sobol"):
+        small, large = (
+            Proposals(named(name), SPACE.cube, batch, KEY, SPACE.constraint) for batch in (8, 64)
+        )
+        parts = np.concatenate([np.asarray(small.next(n)) for n in (8, 3, 8, 5, 8)])
+        np.testing.assert_array_equal(parts, np.asarray(large.next(32)))
+
+
+def test_a_grid_ends():
+    proposals = Proposals(Grid(5), SPACE.cube, 16, KEY, SPACE.constraint)
+    assert proposals.total == 75
+    points = np.concatenate([np.asarray(proposals.next(16)) for _ in range(5)])
+    assert proposals.exhausted
+    # 10 of 25 points lie below the diagonal, with two of three kinds.
+    assert len(points) == len(np.unique(points, axis=0)) == 20
+    assert len(proposals.next(16)) == 0
+    problem = vj.Problem(
+        "grid", SPACE, lambda f, key: vj.Trace({"x": f["x"][None]}, dt=1.0), "x < 2"
+    )
+    run = vj.falsify(problem, Grid(5), batch=16)
+    assert (run.stopped, run.simulations) == ("exhausted", 20)
+    assert run.acceptance == pytest.approx(20 / 75)
+    assert "let through 26.7 % of all proposals" in run.summary()
+    assert vj.resume(run, budget=500).simulations == 20
+
+
+def test_a_search_that_does_not_get_past_the_constraint_says_so():
+    never = vj.FeatureSpace(DOMAINS, where=lambda f: f["x"] > 2)
+    with pytest.raises(ConstraintError, match=r"where refused all that .* 0 of \d+ points"):
+        Proposals(named("halton"), never.cube, 16, KEY, never.constraint).next(16)
+
+
+def test_the_cube_of_a_space():
+    space = vj.FeatureSpace(
+        {
+            "x": vj.Normal(0, 1),
+            "kind": vj.Categorical("a", "b", weights=[0.9, 0.1]),
+            "cars": vj.Array(vj.Struct({"x": vj.Box(0, 1)}), length=(1, 3)),
+        }
+    )
+    cube = space.cube
+    assert cube.levels == (0, 2, 3, 0, 0, 0)
+    assert cube.weights[1] == (0.9, 0.1)
+    assert cube.ordered == (True, False, True, True, True, True)
+    assert cube.names[2:4] == ("cars.length", "cars[0].x")
+    assert cube.lengths == (2,)

@@ -1,0 +1,241 @@
+"""How well the samples cover the feature space: how evenly, where the holes are, what is untried.
+
+found = coverage(run)
+found.hole                  features in the middle of the largest hole
+found.untried               values and pairs of values that no row has
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.analysis.data.cells import cut, occupied
+from verifai_jax.analysis.data.marginals import Marginal, marginals
+from verifai_jax.analysis.data.samples import Samples, whole
+from verifai_jax.analysis.holes import MOST_TREE, alike, largest_hole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.falsification.run import Run
+    from verifai_jax.falsification.table import ErrorTable
+
+MOST_ROWS = 2000
+MOST_ENTRIES = 8e7
+"""Rows that the discrepancy is computed from, and what their square times the features may be."""
+REPEATS = 8
+ALLOWED = 8192
+LEAST_ACCEPTED = 0.005
+MOST_LISTED = 5
+MOST_NAMED = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """How well the rows cover the feature space.
+
+    **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
+    `occupied`, the share of pairs of cells with other features (`pairs`), and the share that as
+    many uniform samples would occupy (`expected`, `expected_pairs`); `untried`: the discrete values
+    and pairs of values that no row has, at most 1000 of `untried_count`; `discrepancy`: squared
+    centred L2 discrepancy over that expected of as many uniform samples: 1 for those, less where
+    the rows are more even, much more where they crowd; `dispersion`: radius of the largest empty
+    ball of the ordered features, in unit coordinates, and `uniform_dispersion` that of as many
+    uniform samples; `hole`: the features in its middle; all None without ordered features;
+    `samples`.
+    """
+
+    table: "pd.DataFrame"
+    untried: "pd.DataFrame"
+    untried_count: int
+    discrepancy: float
+    dispersion: float | None
+    uniform_dispersion: float | None
+    hole: dict[str, Any] | None
+    samples: Samples
+
+    @property
+    def occupied(self) -> float:
+        """Share of all pairs of cells that some row lies in; of cells with a single feature."""
+        column = "pairs" if len(self.table) > 1 else "occupied"
+        return float(np.nanmean(self.table[column].to_numpy(float)))
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw how often each cell is occupied, and the least occupied pair; returns the figure."""
+        from verifai_jax.plotting.coverage import plot_coverage
+
+        return plot_coverage(self, path)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        from verifai_jax.core.text import format_features
+
+        expected = "expected_pairs" if len(self.table) > 1 else "expected"
+        what = "pairs of cells" if len(self.table) > 1 else "cells"
+        share, uniform = self.occupied, float(np.nanmean(self.table[expected].to_numpy(float)))
+        lines = [
+            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {100 * share:.0f} % of "
+            f"all {what} ({100 * uniform:.0f} % if they were uniform), "
+            + _evenness(self.discrepancy)
+        ]
+        if self.hole is not None:
+            where = format_features(dict(list(self.hole.items())[:MOST_NAMED]))
+            lines.append(
+                f"largest hole: nothing within {self.dispersion:.2f} in unit coordinates "
+                f"({self.uniform_dispersion:.2f} if uniform) around {where}"
+                + (", ..." if len(self.hole) > MOST_NAMED else "")
+            )
+        shares = self.table["occupied"].to_numpy(float)
+        if shares.min() < 1:
+            worst = self.table.index[int(shares.argmin())]
+            lines.append(f"least covered feature: {worst}, {100 * shares.min():.0f} % of its cells")
+        if self.untried_count:
+            shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
+            more = self.untried_count - len(shown)
+            lines.append("never tried: " + "; ".join(shown) + (f"; and {more:,} more" * (more > 0)))
+        if self.samples.space is not None and self.samples.space.where is not None:
+            lines.append("(uniform means samples of the prior that fulfil the space's constraint)")
+        return "\n".join(lines)
+
+
+def coverage(
+    source: "Run | ErrorTable | pd.DataFrame | Samples", *, cells: int = 10, seed: int = 0
+) -> Coverage:
+    """Measure how well samples cover the space of features.
+
+    - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
+      verdict.
+    - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
+      to fill them; a discrete feature of up to 20 values has a cell for each.
+
+    Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares
+    of the ranges in the table where no space is known. With a constraint between features, uniform
+    samples are 8192 that fulfil it, cells without any of them do not count, and the hole is in the
+    midst of one of them; one that less than a two-hundredth fulfils is not looked at. Absent
+    entries are left out feature by feature, and are in the middle where a point is needed. The
+    discrepancy is of 2000 rows at most, drawn by `seed`, with discrete values spread over their
+    cells.
+
+    Sources: Hickernell, A generalized discrepancy and quadrature error bound, Mathematics of
+    Computation 67 (1998); its mean for uniform samples, `((5/4)^d - (13/12)^d) / n`, follows from
+    the definition. For the others see `cells.py` and `holes.py`.
+
+    **Raises:** `ValueError` for no rows, no feature that varies, or fewer than 2 cells.
+    """
+    cells = whole(cells, "cells", 2)
+    samples = Samples.of(source, "all")
+    samples = _varying(samples)
+    generator = np.random.default_rng(seed)
+    parts = marginals(samples)
+    allowed = _allowed(samples, seed)
+    # With five rows a pair of cells, uniform samples leave one in a hundred and fifty empty.
+    count = int(np.clip(np.sqrt(len(samples) / 5), 2, cells))
+    table, untried, missing = occupied(
+        len(samples),
+        cut(samples, parts, count),
+        None if allowed is None else cut(allowed, parts, count),
+    )
+    dispersion = uniform = hole = None
+    ordered = parts[: len(samples.ordered)]
+    if ordered:
+        points = _units(samples, ordered)
+        if allowed is None:
+            among = None
+            repeats = REPEATS if len(ordered) <= MOST_TREE else 1
+            others = [alike(ordered, generator, len(points)) for _ in range(repeats)]
+        else:
+            among, other = np.array_split(_units(allowed, ordered), 2)
+            others = [other[: len(points)]]
+        dispersion, place = largest_hole(points, ordered, seed, among)
+        uniform = float(np.mean([largest_hole(p, ordered, seed, among)[0] for p in others]))
+        hole = {
+            part.column.name: part.value(float(u)) for part, u in zip(ordered, place, strict=True)
+        }
+    return Coverage(
+        table=table,
+        untried=untried,
+        untried_count=missing,
+        discrepancy=_discrepancy(
+            _units(samples, parts, generator),
+            None if allowed is None else _units(allowed, parts, generator),
+            generator,
+        ),
+        dispersion=dispersion,
+        uniform_dispersion=uniform,
+        hole=hole,
+        samples=samples,
+    )
+
+
+def _units(
+    samples: Samples, parts: Sequence[Marginal], generator: Any = None
+) -> Float[np.ndarray, "n d"]:
+    return np.stack([part.unit(samples, generator) for part in parts], axis=1)
+
+
+def _allowed(samples: Samples, seed: int) -> Samples | None:
+    """Samples of the prior that fulfil the constraint of the space; None without one."""
+    space = samples.space
+    if space is None or space.where is None or space.check_where() < LEAST_ACCEPTED:
+        return None
+    import jax
+    import pandas as pd
+
+    key = jax.random.key(seed, impl="threefry2x32")
+    rows = space.rows(space.sample(key, ALLOWED))
+    return replace(samples, frame=pd.DataFrame(rows))
+
+
+def _varying(samples: Samples) -> Samples:
+    """Without the columns that have a single value in the space, or in a table without a space."""
+    names = [
+        column.name
+        for column in samples.columns
+        if (column.far > column.near if column.ordered else len(column.choices) > 1)
+    ]
+    if not names:
+        raise ValueError(
+            f"nothing varies among {len(samples):,} rows of {samples.name!r}: "
+            f"{', '.join(samples.names)} has one value each"
+        )
+    return Samples.of(samples, columns=names)
+
+
+def _discrepancy(
+    unit: Float[np.ndarray, "n d"], allowed: Float[np.ndarray, "m d"] | None, generator: Any
+) -> float:
+    """Squared centred discrepancy over that of as many samples of the prior."""
+    from scipy.stats import qmc
+
+    n, d = unit.shape
+    most = int(min(MOST_ROWS, np.sqrt(MOST_ENTRIES / d)))
+    if allowed is not None:
+        most = min(most, len(allowed))
+    if n > most:
+        unit, n = unit[generator.choice(n, most, replace=False)], most
+    expected = ((5 / 4) ** d - (13 / 12) ** d) / n
+    if allowed is not None:
+        expected = qmc.discrepancy(allowed[:n], method="CD")
+    return float(qmc.discrepancy(unit, method="CD") / expected)
+
+
+def _words(row: dict[Any, Any]) -> str:
+    def pair(name: str, value: Any) -> str:
+        return f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
+
+    words = pair(row["feature"], row["value"])
+    return f"{words} with {pair(row['other'], row['other_value'])}" if row["other"] else words
+
+
+def _evenness(discrepancy: float) -> str:
+    if discrepancy < 0.5:
+        return f"more evenly than uniform samples (discrepancy {discrepancy:.2g} times theirs)"
+    if discrepancy <= 3:
+        return f"as evenly as uniform samples (discrepancy {discrepancy:.2g} times theirs)"
+    return f"more crowded than uniform samples (discrepancy {discrepancy:.3g} times theirs)"

@@ -1,0 +1,129 @@
+"""A diverse subset: few rows that stand for all, each as far as can be from those before.
+
+    found = diverse(run, 10)
+    found.table                    the rows, the worst first, and how far each was from those before
+
+Greedy farthest points: Gonzalez, Clustering to minimize the maximum intercluster distance,
+Theoretical Computer Science 38, 1985. Every row is within twice the least possible distance of
+some chosen one, and the least distance between chosen ones is half the greatest possible or more
+(Ravi, Rosenkrantz and Tayi, Operations Research 42(2), 1994).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, distances, whole
+from verifai_jax.features import FeatureSpace
+from verifai_jax.plotting.rows import draw_rows, two_columns
+from verifai_jax.plotting.style import FAILING, new_figure, show_or_save, tidy
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Diverse:
+    """Rows chosen from `samples`, in the order in which they were added.
+
+    **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]`: how far each was from the
+    nearest one before, in the coordinates of `samples.points`, infinite for the first;
+    `radius`: how far the row is that is farthest from all chosen ones.
+    """
+
+    samples: Samples
+    rows: Int[np.ndarray, " k"]
+    distances: Float[np.ndarray, " k"]
+    radius: float
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
+        import pandas as pd
+
+        own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
+        return beside(self.samples.at(self.rows), own)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the rows among all, in their order, and the distances; returns the figure."""
+        figure = new_figure(figsize=(8.6, 4.0))
+        cloud, curve = figure.subplots(1, 2, width_ratios=(1.4, 1))
+        across, up = two_columns(self.samples)
+        drawn = draw_rows(
+            cloud, self.samples, self.rows, FAILING, f"{len(self.rows)} chosen", (across, up)
+        )
+        for i, (x, y) in enumerate(drawn[:12]):
+            if np.isfinite(x) and np.isfinite(y):
+                place = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
+                cloud.annotate(str(i + 1), (x, y), **place)
+        curve.plot(
+            np.arange(2, len(self.rows) + 1), self.distances[1:], "o-", color=FAILING, markersize=3
+        )
+        curve.set_ylim(bottom=0)
+        curve.set_xlabel("rows chosen")
+        curve.set_ylabel("distance of the last from those before")
+        curve.xaxis.get_major_locator().set_params(integer=True)
+        for axes in (cloud, curve):
+            tidy(axes)
+        figure.suptitle(f"{len(self.rows)} diverse rows, {self.samples.kind}", fontsize=10)
+        return show_or_save(figure, path)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __str__(self) -> str:
+        shown = ", ".join(map(str, self.rows[:12].tolist())) + ", ..." * (len(self.rows) > 12)
+        apart = ""
+        if len(self.rows) > 1:
+            apart = f"; they are {self.distances[1:].min():.3g} apart or more"
+        return (
+            f"{len(self.rows)} diverse rows, {self.samples.kind}: {shown}{apart}; "
+            f"every row is within {self.radius:.3g} of one of them"
+        )
+
+
+def diverse(
+    source: Any,
+    k: int,
+    start: int | None = None,
+    columns: Sequence[str] | None = None,
+    which: Which = "counterexamples",
+    scale: Scale = "range",
+    space: Problem | FeatureSpace | None = None,
+) -> Diverse:
+    """`k` rows: the worst one first, then always the row farthest from all those chosen.
+
+    - `source`, `columns`, `which`, `space`: as in `Samples.of`; `scale` as in `Samples.scaling`.
+    - `k`: how many; all rows if there are no more.
+    - `start`: the number of the first row, instead of that of the least robustness.
+
+    Rows that equal a chosen one come last, at a distance of 0. Of rows that are equally far the
+    first in the table is taken. Takes `n k` steps. **Raises:** `ValueError` for a `k` below 1;
+    `IndexError` for a start that is not among the rows.
+    """
+    samples = Samples.of(source, which, columns, space)
+    k = min(whole(k, "k"), len(samples))
+    place = samples.worst
+    if start is not None:
+        place = int(samples.frame.index.get_indexer(np.array([start]))[0])
+        if place < 0:
+            raise IndexError(f"row {start} is not among the {samples.kind}")
+    placed = samples.place(scale)
+    nearest = np.full(len(samples), np.inf)
+    chosen, added = [], []
+    for _ in range(k):
+        chosen.append(place)
+        added.append(nearest[place])
+        nearest = np.minimum(nearest, distances(placed, (placed[0][place], placed[1][place])))
+        # Chosen ones are below the rows that equal them.
+        nearest[place] = -1
+        place = int(np.argmax(nearest))
+    return Diverse(
+        samples, samples.rows[chosen], np.array(added), float(max(nearest.max(initial=0), 0))
+    )

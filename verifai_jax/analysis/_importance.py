@@ -1,0 +1,258 @@
+"""Which features failing, and the robustness, depend on, from the table alone.
+
+found = importance(run)
+found.table                 drop of the score when a feature is shuffled
+found.trusted("failing")    whether the model behind it can predict at all
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.analysis.data.samples import Samples, whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.falsification.run import Run
+    from verifai_jax.falsification.table import ErrorTable
+
+MOST_TRAINED = 4000
+MOST_TESTED = 2000
+MOST_PREDICTED = 200_000
+"""Predictions at most, over all features and repetitions."""
+FEWEST = 5
+"""Rows of each verdict, for training and for measuring, below which nothing is learned."""
+MOST_ONE_HOT = 30
+MOST_ENTRIES = 4_000_000
+TREES = 60
+LEAST = {"failing": 0.65, "rho": 0.2}
+"""Scores on held-out rows below which the importances mean nothing."""
+SCORES = {"failing": "AUC", "rho": "R^2"}
+LEAST_LOSS = 0.01
+MOST_NAMED = 6
+MOST_SHOWN = 15
+
+
+@dataclass(frozen=True, eq=False)
+class Importance:
+    """How much a model of the table loses when a feature is shuffled.
+
+    **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
+    area under the ROC curve (0.5 is chance) of a model of which rows fail, `rho` the loss in R^2
+    of a model of the robustness, each with `_low` and `_high`, two standard deviations of the
+    repetitions away; NaN where there is no model. `scores`: of the models on rows that they were
+    not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
+    """
+
+    table: "pd.DataFrame"
+    scores: dict[str, float]
+    missing: dict[str, str]
+    name: str
+
+    def trusted(self, target: str) -> bool:
+        """Whether the model of `"failing"` or `"rho"` predicts rows that it has not seen."""
+        return self.scores.get(target, -np.inf) >= LEAST[target]
+
+    @property
+    def ranked(self) -> list[str]:
+        """Features from the most to the least important, by the model that can be trusted."""
+        return [str(name) for name in self.table.index]
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the losses as bars; returns the figure."""
+        from verifai_jax.plotting.bars import plot_bars
+
+        columns = {target: f"{_WHAT[target]} ({self._score(target)})" for target in self.scores}
+        title = f"importance of the features of {self.name}"
+        weak = [target for target in self.scores if not self.trusted(target)]
+        if weak:
+            what = " and of ".join(_WHAT[target] for target in weak)
+            title += f"\nmeaningless for {what}: the model does not predict"
+        shown = self.table.head(MOST_SHOWN)
+        return plot_bars(shown, columns, title, "loss of score when shuffled", path)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        lines = []
+        for target, what in _WHAT.items():
+            if target in self.missing:
+                lines.append(f"{what}: {self.missing[target]}")
+                continue
+            losses = self.table[target].to_numpy(float)
+            order = [i for i in np.argsort(-losses, kind="stable") if losses[i] >= LEAST_LOSS]
+            listed = ", ".join(
+                f"{self.table.index[i]} ({losses[i]:.2f})" for i in order[:MOST_NAMED]
+            )
+            if self.trusted(target):
+                lines.append(f"{what} depends on {listed}; {self._score(target)}")
+            else:
+                lines.append(
+                    f"{what}: importances mean nothing, a model from these rows does not predict "
+                    f"others ({self._score(target)})"
+                )
+        return "\n".join(lines)
+
+    def _score(self, target: str) -> str:
+        return f"{SCORES[target]} {self.scores[target]:.2f} on rows kept aside"
+
+
+_WHAT = {"failing": "failing", "rho": "robustness"}
+
+
+def importance(
+    source: "Run | ErrorTable | pd.DataFrame | Samples", *, repeats: int = 5, seed: int = 0
+) -> Importance:
+    """Measure how important each feature is to a model trained on the table; nothing is simulated.
+
+    - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
+      verdict.
+    - `repeats`: how often each feature is shuffled.
+
+    Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two
+    features that go together in the table, as an active search may make them, share their
+    importance or hide each other's.
+
+    Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
+    (2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001).
+
+    **Raises:** `ValueError` for no rows, or where neither failing nor the robustness can be
+    learned.
+    """
+    repeats = whole(repeats, "repeats", 2)
+    samples = Samples.of(source, "all")
+    matrix, groups = _encoded(samples)
+    names = [column.name for column in (*samples.ordered, *samples.unordered)]
+    columns: dict[str, Any] = {}
+    scores: dict[str, float] = {}
+    missing: dict[str, str] = {}
+    for target, values in (("failing", samples.failing), ("rho", samples.rho)):
+        usable = np.isfinite(values.astype(np.float64))
+        reason = _unlearnable(target, values[usable])
+        if reason:
+            missing[target] = reason
+            continue
+        generator = np.random.default_rng(seed)
+        rows = np.flatnonzero(usable)
+        train, test = _split(values[rows], generator, len(groups) * repeats)
+        score, losses = _losses(
+            matrix[rows], values[rows], groups, train, test, generator, repeats, seed
+        )
+        scores[target] = score
+        mean, spread = losses.mean(axis=1), 2 * losses.std(axis=1, ddof=1)
+        columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
+    if not scores:
+        reasons = "; ".join(f"{_WHAT[target]}: {reason}" for target, reason in missing.items())
+        raise ValueError(f"no importance can be learned from {samples.name!r}: {reasons}")
+    import pandas as pd
+
+    table = pd.DataFrame(columns, index=pd.Index(names, name="feature"))
+    by = max(scores, key=lambda target: (scores[target] >= LEAST[target], target == "failing"))
+    table = table.sort_values(by, ascending=False, kind="stable")
+    return Importance(table, scores, missing, samples.name)
+
+
+def _unlearnable(target: str, values: Any) -> str:
+    """Why nothing can be learned; empty if something can."""
+    if target == "failing":
+        fewest = int(min(values.sum(), (~values).sum()))
+        if fewest < 2 * FEWEST:
+            kind = "failing" if values.sum() <= (~values).sum() else "safe"
+            return (
+                f"{fewest or 'no'} {kind} {'row' if fewest < 2 else 'rows'}, too few to learn from"
+            )
+    elif len(values) < 4 * FEWEST:
+        rows = "row" if len(values) == 1 else "rows"
+        return f"{len(values)} {rows} with a robustness, too few to learn from"
+    elif np.ptp(values) == 0:
+        return f"it is {values[0]:.4g} in every row"
+    return ""
+
+
+def _split(
+    values: Any, generator: Any, predictions: int
+) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " test"]]:
+    """Rows to train on and rows to measure on; rare verdicts are kept before others."""
+    most = int(np.clip(MOST_PREDICTED // max(predictions, 1), 200, MOST_TESTED))
+    if values.dtype != bool:
+        order = generator.permutation(len(values))
+        half = len(values) // 2
+        return order[:half][:MOST_TRAINED], order[half:][:most]
+    train, test = [], []
+    for part in (values, ~values):
+        order = generator.permutation(np.flatnonzero(part))
+        half = len(order) // 2
+        # Neither score depends on how many rows of each verdict there are.
+        train.append(order[:half][: MOST_TRAINED // 2])
+        test.append(order[half:][: most // 2])
+    return np.concatenate(train), np.concatenate(test)
+
+
+def _losses(
+    matrix: Float[np.ndarray, "n e"],
+    values: Any,
+    groups: Sequence[Sequence[int]],
+    train: Int[np.ndarray, " train"],
+    test: Int[np.ndarray, " test"],
+    generator: Any,
+    repeats: int,
+    seed: int,
+) -> tuple[float, Float[np.ndarray, "features repeats"]]:
+    """The score of a model on the test rows, and its losses by shuffling each feature."""
+    from sklearn.ensemble import ExtraTreesClassifier, ExtraTreesRegressor
+    from sklearn.metrics import r2_score, roc_auc_score
+
+    # Enough features a split that those without influence do not drown the others.
+    options: Any = {"n_estimators": TREES, "min_samples_leaf": 2, "random_state": seed}
+    options |= {"max_features": min(1.0, 40 / matrix.shape[1])}
+    binary = values.dtype == bool
+    if binary:
+        model: Any = ExtraTreesClassifier(class_weight="balanced", **options)
+    else:
+        model = ExtraTreesRegressor(**options)
+    model.fit(matrix[train], values[train])
+
+    def scores(rows: Float[np.ndarray, "copies test e"]) -> Float[np.ndarray, " copies"]:
+        flat = rows.reshape(-1, rows.shape[-1])
+        guess = model.predict_proba(flat)[:, 1] if binary else model.predict(flat)
+        measure: Any = roc_auc_score if binary else r2_score
+        return np.array([measure(values[test], part) for part in guess.reshape(len(rows), -1)])
+
+    plain = matrix[test]
+    reached = float(scores(plain[None])[0])
+    # Several features a call: sklearn takes longer to call a tree than to ask it.
+    together = max(1, int(MOST_ENTRIES // (repeats * plain.size)))
+    losses = []
+    for begin in range(0, len(groups), together):
+        some = groups[begin : begin + together]
+        shuffled = np.repeat(plain[None], repeats * len(some), axis=0)
+        for i, part in enumerate(shuffled):
+            group = some[i // repeats]
+            part[:, group] = plain[generator.permutation(len(test))][:, group]
+        losses.append(reached - scores(shuffled).reshape(len(some), repeats))
+    return reached, np.concatenate(losses)
+
+
+def _encoded(samples: Samples) -> tuple[Float[np.ndarray, "n e"], list[list[int]]]:
+    """Columns for the trees, and which of them belong to each feature, ordered ones first."""
+    columns: list[Any] = []
+    groups: list[list[int]] = []
+    for values in samples.matrix().T.reshape(len(samples.ordered), -1):
+        groups.append([len(columns)])
+        columns.append(values)
+    absent: Bool[np.ndarray, "n k"] = np.isnan(samples.values())
+    for j in np.flatnonzero(absent.any(axis=0)):
+        groups[j].append(len(columns))
+        columns.append(absent[:, j].astype(float))
+    for codes, column in zip(samples.codes().T, samples.unordered, strict=True):
+        choices = len(column.choices)
+        parts = [codes] if choices > MOST_ONE_HOT else [codes == i for i in range(choices)]
+        groups.append(list(range(len(columns), len(columns) + len(parts))))
+        columns += [part.astype(float) for part in parts]
+    return np.stack(columns, axis=1).astype(np.float32), groups

@@ -1,0 +1,308 @@
+"""Principal components: the directions in which failing features vary together.
+
+    components = pca(run)
+    components.table                       loadings, deviation and share of each direction
+    components.generate(0, 100)            new features along the directions: a DataFrame
+    components.plot()
+
+Jolliffe, Principal Component Analysis, 2nd edition, 2002. New samples from principal components
+are how VerifAI augments data: Dreossi et al., VerifAI: a toolkit for the design and analysis of
+artificial intelligence-based systems, CAV 2019.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, Key
+
+from verifai_jax.analysis.data.columns import feature_columns
+from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, generator, whole
+from verifai_jax.features import FeatureSpace
+from verifai_jax.plotting.rows import shortened
+from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Fractions of the total variance below this are rounding.
+_NOTHING = 1e-12
+_REDRAWS = 32
+DOTS = 3000
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """Principal components of the ordered features of `samples`, the strongest first.
+
+    **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
+    orthonormal in the scaled coordinates, the largest entry of each positive; `deviations` `[m]`:
+    standard deviation along each, in the scaled coordinates; `shares` `[m]` of the total variance;
+    `offset` and `width` `[k]` of the scaling.
+
+    There are only directions in which the rows vary: none if all rows are equal.
+    """
+
+    samples: Samples
+    pivot: Float[np.ndarray, " k"]
+    directions: Float[np.ndarray, "m k"]
+    deviations: Float[np.ndarray, " m"]
+    shares: Float[np.ndarray, " m"]
+    offset: Float[np.ndarray, " k"]
+    width: Float[np.ndarray, " k"]
+    scale: Scale
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the `k` columns."""
+        return tuple(column.name for column in self.samples.ordered)
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row for each component: its loadings, its deviation and its share of the variance."""
+        import pandas as pd
+
+        place = pd.RangeIndex(1, len(self.directions) + 1, name="component")
+        table = pd.DataFrame(self.directions, index=place, columns=list(self.names))
+        own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=place)
+        return beside(table, own)
+
+    def project(self, rows: "pd.DataFrame | Sequence[int] | None" = None) -> "pd.DataFrame":
+        """Coordinates along the components, in scaled units, a column each; 0 is the pivot.
+
+        - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
+          that were analysed.
+
+        An absent entry is taken as the pivot's. **Raises:** `IndexError` for a row number that is
+        not in the table.
+        """
+        import pandas as pd
+
+        frame = self.samples.frame
+        if isinstance(rows, pd.DataFrame):
+            frame = rows
+        elif rows is not None:
+            frame = self.samples.at(rows)
+        values = frame[list(self.names)].to_numpy(np.float64)
+        moved = np.where(np.isnan(values), 0.0, values - self.pivot) / self.width
+        columns = range(1, len(self.directions) + 1)
+        return pd.DataFrame(moved @ self.directions.T, index=frame.index, columns=list(columns))
+
+    def generate(
+        self, seed: "int | Key[jax.Array, '']", n: int, spread: float = 1.0
+    ) -> "pd.DataFrame":
+        """New features: normal along the components around the pivot, within the space's bounds.
+
+        - `seed`: an integer or a `jax.random` key.
+        - `spread`: times the standard deviations of the rows.
+
+        Draws outside the bounds (of the space, or of the whole table where no space is known) are
+        drawn again; what is still outside after 32 rounds moves towards the pivot until inside.
+        Whole numbers are rounded. All other features, choices and the number of items of arrays
+        among them, are those of the nearest row analysed. What breaks a constraint of the space is
+        drawn again too, and after 32 rounds is the nearest row itself. The columns are all
+        features, so that `space.from_row` takes a row.
+
+        **Raises:** `ValueError` for `n < 0` or a spread that is not a positive finite number.
+        """
+        import pandas as pd
+
+        whole(n, "the number of samples", least=0)
+        if not (np.isfinite(spread) and spread > 0):
+            raise ValueError(f"spread must be positive and finite; got {spread!r}")
+        rng = generator(seed)
+        found, donors = self._features(self._draw(rng, n, spread))
+        for turn in range(_REDRAWS + 1):
+            again = np.flatnonzero(~_accepted(self.samples.space, found))
+            if not len(again):
+                break
+            new, others = self._features(self._draw(rng, len(again), spread))
+            if turn == _REDRAWS:
+                new = self.samples.frame.iloc[donors[again]][list(found.columns)]
+            donors[again] = others
+            rest = found.drop(index=again)
+            found = pd.concat([rest, new.set_index(again)]).sort_index()
+        return found.rename_axis(index="sample")
+
+    def _draw(self, rng: np.random.Generator, n: int, spread: float) -> Float[np.ndarray, "n k"]:
+        """Values of the ordered columns within the bounds."""
+        low, high = self._bounds
+        steps = self.directions * self.width
+
+        def normal(count: int) -> np.ndarray:
+            return rng.normal(0, spread, (count, len(steps))) * self.deviations @ steps
+
+        moves = normal(n)
+        for _ in range(_REDRAWS):
+            values = self.pivot + moves
+            outside = ((values < low) | (values > high)).any(axis=1)
+            if not outside.any():
+                break
+            moves[outside] = normal(int(outside.sum()))
+        # The pivot is inside, and the bounds are convex: some fraction of the way is inside too.
+        room = np.where(moves > 0, high - self.pivot, self.pivot - low)
+        ratio = np.divide(room, np.abs(moves), out=np.ones_like(moves), where=moves != 0)
+        fraction = np.clip(ratio, 0, 1).min(axis=1, initial=1)
+        return np.clip(self.pivot + moves * fraction[:, None], low, high)
+
+    def _features(
+        self, values: Float[np.ndarray, "n k"]
+    ) -> "tuple[pd.DataFrame, Int[np.ndarray, ' n']]":
+        """All features with these ordered values, and the places of the rows that lent the rest."""
+        donors = self._nearest(values)
+        names = feature_columns(self.samples.table, self.samples.space)
+        found: Any = self.samples.frame.iloc[donors][list(names)].reset_index(drop=True)
+        for j, column in enumerate(self.samples.ordered):
+            if column.name not in names or column.length:
+                continue
+            kept = np.asarray(found[column.name], np.float64)
+            new = np.where(np.isnan(kept), np.nan, values[:, j])
+            if column.integer:
+                new = np.round(new) if np.isnan(new).any() else np.round(new).astype(np.int64)
+            found[column.name] = new
+        return found, donors
+
+    @cached_property
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the space; of the table where none is known."""
+        columns = self.samples.ordered
+        low = [column.low if column.known else column.near for column in columns]
+        high = [column.high if column.known else column.far for column in columns]
+        # A table may hold rows outside the space: the pivot has to be inside.
+        return np.minimum(low, self.pivot), np.maximum(high, self.pivot)
+
+    def _nearest(self, values: np.ndarray) -> np.ndarray:
+        from scipy.spatial import KDTree
+
+        tree = KDTree(self.samples.matrix("raw") / self.width)
+        return np.asarray(tree.query(values / self.width)[1], np.int64)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the rows along the first two components, and the loadings; returns the figure."""
+        return _plot(self, path)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{len(self.directions)} principal components of {self.samples.kind}, "
+            f"over {len(self.names)} ordered columns"
+        ]
+        for i, direction in enumerate(self.directions[:5]):
+            order = np.argsort(-np.abs(direction), kind="stable")
+            parts = [
+                f"{direction[j]:+.2f} {self.names[j]}" for j in order if _matters(direction[j])
+            ]
+            rest = ", ..." if len(parts) > 4 else ""
+            lines.append(
+                f"  {i + 1}: {self.shares[i]:.0%} of variance: {', '.join(parts[:4])}{rest}"
+            )
+        if not len(self.directions):
+            lines.append("  the rows do not vary")
+        return "\n".join(lines)
+
+
+def pca(
+    source: Any,
+    components: int | None = None,
+    columns: Sequence[str] | None = None,
+    which: Which = "counterexamples",
+    scale: Scale = "range",
+    space: Problem | FeatureSpace | None = None,
+) -> Components:
+    """Principal components of the ordered features.
+
+    - `source`, `columns`, `which`, `space`: as in `Samples.of`; unordered columns are left out.
+    - `components`: how many; by default all in which the rows vary. Fewer are returned where the
+      rows vary in fewer directions.
+    - `scale`: `"range"` compares features by their range in the space, `"raw"` does not scale
+      (VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` compares by
+      the range of the rows.
+
+    **Raises:** `ValueError` for no ordered column, or more components than rows or columns.
+    """
+    samples = Samples.of(source, which, columns, space)
+    samples.need_ordered("principal component analysis")
+    offset, width = samples.scaling(scale)
+    scaled = samples.matrix(scale)
+    most = min(scaled.shape)
+    if components is not None and whole(components, "components") > most:
+        raise ValueError(
+            f"components must be from 1 to {most}, the lesser of {scaled.shape[0]} rows and "
+            f"{scaled.shape[1]} ordered columns; got {components}"
+        )
+    mean = scaled.mean(axis=0)
+    # The mean of equal numbers is not always that number.
+    constant = scaled.min(axis=0) == scaled.max(axis=0)
+    mean = np.where(constant, scaled[0], mean)
+    _, singular, directions = np.linalg.svd(scaled - mean, full_matrices=False)
+    variances = singular**2 / max(len(scaled) - 1, 1)
+    kept = variances > _NOTHING * variances.sum()
+    directions = np.where(constant, 0.0, directions[kept][:components])
+    largest = np.argmax(np.round(np.abs(directions), 9), axis=1)
+    signs = np.sign(np.take_along_axis(directions, largest[:, None], axis=1))
+    variances, total = variances[kept][:components], variances.sum()
+    return Components(
+        samples=samples,
+        pivot=mean * width + offset,
+        directions=directions * signs + 0.0,  # No negative zeros.
+        deviations=np.sqrt(variances),
+        shares=variances / total if total > 0 else variances,
+        offset=offset,
+        width=width,
+        scale=scale,
+    )
+
+
+def _accepted(space: FeatureSpace | None, frame: "pd.DataFrame") -> np.ndarray:
+    """Which rows keep the constraint of the space, if it has one."""
+    if space is None or space.where is None or not len(frame):
+        return np.ones(len(frame), bool)
+    rows: Any = frame.to_dict("records")
+    features = [space.from_row(row) for row in rows]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *features)
+    return np.asarray(jax.vmap(space.accepts)(stacked), bool)
+
+
+def _matters(loading: float) -> bool:
+    return abs(loading) >= 0.05
+
+
+def _plot(components: Components, path: str | Path | None) -> Any:
+    samples, names, directions = components.samples, components.names, components.directions
+    shown = np.argsort(-np.abs(directions[:3]).max(axis=0, initial=0), kind="stable")[:12]
+    figure = new_figure(figsize=(8.4, max(3.4, 1.2 + 0.27 * len(shown))))
+    cloud, bars = figure.subplots(1, 2, width_ratios=(1.25, 1))
+    projected = components.project().to_numpy()
+    along = [projected[:, i] if i < len(directions) else np.zeros(len(samples)) for i in (0, 1)]
+    for part, color in ((~samples.failing, SAFE), (samples.failing, FAILING)):
+        places = np.flatnonzero(part)
+        places = places[:: max(1, len(places) // DOTS)]
+        cloud.scatter(along[0][places], along[1][places], c=color, s=9, alpha=0.55, linewidths=0)
+    for i, axis in ((0, cloud.xaxis), (1, cloud.yaxis)):
+        share = f" ({components.shares[i]:.0%} of variance)" if i < len(directions) else " (none)"
+        axis.set_label_text(f"component {i + 1}{share}")
+    tidy(cloud)
+    height = 0.8 / max(1, min(3, len(directions)))
+    for i, color in zip(
+        range(min(3, len(directions))), (BOUND, "#31688e", "#b8b8b8"), strict=False
+    ):
+        place = np.arange(len(shown)) + (i - (min(3, len(directions)) - 1) / 2) * height
+        bars.barh(
+            place, directions[i][shown], height * 0.9, color=color, label=f"component {i + 1}"
+        )
+    bars.set_yticks(np.arange(len(shown)), [shortened(names[j], 28) for j in shown])
+    bars.invert_yaxis()
+    bars.axvline(0, color=BOUND, linewidth=0.8)
+    bars.set_xlim(-1.05, 1.05)
+    bars.set_xlabel("loading")
+    tidy(bars)
+    if len(directions):
+        figure.legend(frameon=False, fontsize=8, loc="outside lower right", ncols=3)
+    left = f"; {len(names) - len(shown)} columns not drawn" if len(names) > len(shown) else ""
+    figure.suptitle(f"Principal components of {samples.kind}{left}", fontsize=10)
+    return show_or_save(figure, path)

@@ -1,0 +1,1 @@
+"""Clusters of counterexamples, by density or around prototypes."""

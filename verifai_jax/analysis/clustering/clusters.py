@@ -1,0 +1,386 @@
+"""Clusters of failures: kinds of rows that lie together, and one row to look at for each.
+
+    found = clusters(run)
+    found.table                  size, centre, a typical row and the worst row of each cluster
+    found.labels                 cluster of each row number
+    run.replay(int(found.table["representative"][0]))
+
+k-means (Lloyd, Least squares quantization in PCM, IEEE Transactions on Information Theory 28(2),
+1982) for numbers; `prototypes.py` for choices and mixtures; `density.py` for clusters of any shape.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, Key
+
+from verifai_jax.analysis.clustering.density import dbscan
+from verifai_jax.analysis.clustering.prototypes import prototypes
+from verifai_jax.analysis.data.samples import (
+    Samples,
+    Scale,
+    Which,
+    beside,
+    distances,
+    generator,
+    whole,
+)
+from verifai_jax.core.text import format_features
+from verifai_jax.features import FeatureSpace
+from verifai_jax.plotting.rows import PALETTE, name_axes, pair, positions
+from verifai_jax.plotting.style import WITHOUT_VERDICT, new_figure, show_or_save, tidy
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Method = Literal["auto", "kmeans", "kmodes", "kprototypes", "dbscan"]
+METHODS = ("auto", "kmeans", "kmodes", "kprototypes", "dbscan")
+# Kaufman and Rousseeuw, Finding Groups in Data, 1990: below, there is no substantial structure.
+LEAST_SILHOUETTE = 0.25
+DOTS = 4000
+_JUDGED = 2000
+_TRIED = 5000
+_STARTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """A partition of `samples`.
+
+    **Fields:** `assigned` `[n]`: cluster of each row looked at, 0 the largest, -1 noise; `method`;
+    `silhouette`: from -1 to 1, how much nearer rows are to their own cluster than to the next, on
+    at most 2000 rows; NaN for less than two clusters; `radius` of DBSCAN, else None.
+    """
+
+    samples: Samples
+    assigned: Int[np.ndarray, " n"]
+    method: str
+    silhouette: float
+    scale: Scale
+    weight: float = 1.0
+    radius: float | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of clusters, noise not counted."""
+        return int(self.assigned.max(initial=-1)) + 1
+
+    @property
+    def labels(self) -> "pd.Series":
+        """Cluster of each row number of the table; -1 is noise."""
+        import pandas as pd
+
+        return pd.Series(self.assigned, index=self.samples.frame.index, name="cluster")
+
+    def rows(self, cluster: int) -> Int[np.ndarray, " size"]:
+        """Row numbers of a cluster.
+
+        **Raises:** `IndexError` for a cluster that does not exist.
+        """
+        if cluster not in self.table.index:
+            raise IndexError(f"there is no cluster {cluster} among {list(self.table.index)}")
+        return self.samples.rows[self.assigned == cluster]
+
+    @cached_property
+    def centres(self) -> "pd.DataFrame":
+        """Mean of each ordered column, most frequent choice of each unordered one, by cluster."""
+        import pandas as pd
+
+        kinds = np.unique(self.assigned)
+        frame = self.samples.frame
+        columns: dict[str, Any] = {}
+        for column in self.samples.columns:
+            entries: Any = frame[column.name].groupby(self.assigned)
+            if column.ordered:
+                columns[column.name] = entries.mean().reindex(kinds).to_numpy(np.float64)
+            else:
+                codes = column.codes(frame[column.name])
+                most = [np.argmax(np.bincount(codes[self.assigned == c] + 1)) - 1 for c in kinds]
+                choices = [column.choices[i] if i >= 0 else None for i in most]
+                columns[column.name] = pd.Series(choices, dtype=object).to_numpy()
+        return pd.DataFrame(columns, index=pd.Index(kinds, name="cluster"))
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row for each cluster, the largest first, noise (-1) last.
+
+        Its centre in the features; `size` and `share` of the rows; `representative`: the row
+        nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a
+        feature has gets `_` added.
+        """
+        import pandas as pd
+
+        placed = _place(self.samples, self.scale, self.weight)
+        centred = _place(self.samples, self.scale, self.weight, self.centres)
+        rho = np.nan_to_num(self.samples.rho, nan=np.inf)
+        own = []
+        for i, cluster in enumerate(self.centres.index):
+            members = np.flatnonzero(self.assigned == cluster)
+            near = distances(
+                (placed[0][members], placed[1][members]), (centred[0][i], centred[1][i])
+            )
+            worst = members[np.argmin(rho[members])]
+            own.append(
+                {
+                    "size": len(members),
+                    "share": len(members) / len(self.samples),
+                    "representative": self.samples.rows[members[np.argmin(near)]],
+                    "worst": self.samples.rows[worst],
+                    "worst_rho": self.samples.rho[worst],
+                }
+            )
+        table = beside(self.centres, pd.DataFrame(own, index=self.centres.index))
+        return table.loc[[*range(self.count), *([-1] if -1 in table.index else [])]]
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the clusters over the two columns that tell them apart best; returns the figure."""
+        return _plot(self, path)
+
+    def __str__(self) -> str:
+        score = f", silhouette {self.silhouette:.2f}" if np.isfinite(self.silhouette) else ""
+        radius = f", radius {self.radius:.3g}" if self.radius is not None else ""
+        number = f"{self.count} cluster{'' if self.count == 1 else 's'}"
+        lines = [f"{number} of {self.samples.kind} ({self.method}{score}{radius})"]
+        features = list(self.samples.names)
+        more = ", ..." if len(features) > 8 else ""
+        for cluster in list(self.table.index)[:12]:
+            where = format_features({name: self.centres.at[cluster, name] for name in features[:8]})
+            size, share, typical, worst = (self._own(cluster, name) for name in _OWN[:4])
+            lines.append(
+                f"  {f'{cluster}:' if cluster >= 0 else 'noise:'} {size:,} rows ({share:.0%}) "
+                f"around {where}{more}; typical row {typical}, worst row {worst}"
+            )
+        return "\n".join(lines)
+
+    def _own(self, cluster: int, name: str) -> Any:
+        return self.table.at[cluster, f"{name}_" if f"{name}_" in self.table else name]
+
+
+_OWN = ("size", "share", "representative", "worst", "worst_rho")
+
+
+def clusters(
+    source: Any,
+    method: Method = "auto",
+    count: int | None = None,
+    seed: "int | Key[jax.Array, '']" = 0,
+    columns: Sequence[str] | None = None,
+    which: Which = "counterexamples",
+    scale: Scale = "range",
+    most: int = 8,
+    radius: float | None = None,
+    space: Problem | FeatureSpace | None = None,
+) -> Clusters:
+    """Clusters of rows.
+
+    - `source`, `columns`, `which`, `space`: as in `Samples.of`; `scale` as in `Samples.scaling`.
+    - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
+      `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
+      both, and finds the number of clusters and the noise itself.
+    - `count`: number of clusters; by default that from 2 to `most` with the greatest silhouette
+      (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if none is above
+      0.25, or there are less than three rows. It is chosen on at most 5000 rows.
+    - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
+      twice the number of columns, and 4 at least.
+
+    The same seed gives the same clusters. **Raises:** `ValueError` for an unknown method; a method
+    without a column that it can use; a `count` above the number of different rows, or for DBSCAN; a
+    radius that is not positive, or for another method.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}")
+    samples = Samples.of(source, which, columns, space)
+    if method == "auto":
+        mixed = "kprototypes" if samples.unordered else "kmeans"
+        method = mixed if samples.ordered else "kmodes"
+    if method == "kmeans":
+        samples.need_ordered("k-means")
+        samples = replace(samples, columns=samples.ordered)
+    if method == "kmodes":
+        samples.need_unordered("k-modes")
+        samples = replace(samples, columns=samples.unordered)
+    rng = generator(seed)
+    if method == "dbscan":
+        return _dense(samples, count, radius, scale, rng)
+    if radius is not None:
+        raise ValueError(f"a radius is for method='dbscan'; got {radius!r} with {method!r}")
+    weight = _weight(samples, scale)
+    placed = _place(samples, scale, weight)
+    different = len(np.unique(np.concatenate(placed, axis=1), axis=0))
+    if count is None:
+        count = _best_count(placed, min(whole(most, "most"), different), rng)
+    elif whole(count, "count") > different:
+        raise ValueError(
+            f"count must be from 1 to {different}, the number of different rows among "
+            f"{samples.kind}; got {count}"
+        )
+    found = _partition(placed, count, rng)
+    score = _silhouette(placed, found, rng)
+    return Clusters(samples, _by_size(found), method, score, scale, weight)
+
+
+def _weight(samples: Samples, scale: Scale) -> float:
+    """So that numbers and choices differ equally much on average over pairs of rows."""
+    coordinates, codes = samples.place(scale)
+    apart = 2 * coordinates.var(axis=0).sum() / max(len(samples.ordered), 1)
+    if not codes.shape[1] or apart <= 0:
+        return 1.0
+    unlike = [1 - (np.unique(c, return_counts=True)[1] ** 2).sum() / len(c) ** 2 for c in codes.T]
+    return float(apart / np.mean(unlike)) if np.mean(unlike) > 0 else 1.0
+
+
+def _place(
+    samples: Samples, scale: Scale, weight: float, frame: "pd.DataFrame | None" = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `Samples.place`, the coordinates divided so that a different choice has this weight."""
+    coordinates, codes = samples.place(scale, frame)
+    return coordinates / np.sqrt(weight), codes
+
+
+def _best_count(placed: tuple[np.ndarray, np.ndarray], most: int, rng: np.random.Generator) -> int:
+    """The number of clusters with the greatest silhouette, tried on at most 5000 rows."""
+    rows = rng.permutation(len(placed[0]))[:_TRIED]
+    part = placed[0][rows], placed[1][rows]
+    best, reached = 1, LEAST_SILHOUETTE
+    for count in range(2, min(most, len(rows) - 1) + 1):
+        # The same rows for each count, so that chance does not decide between them.
+        score = _silhouette(part, _partition(part, count, rng), np.random.default_rng(0))
+        if score > reached:
+            best, reached = count, score
+    return best
+
+
+def _partition(
+    placed: tuple[np.ndarray, np.ndarray], count: int, rng: np.random.Generator
+) -> Int[np.ndarray, " n"]:
+    coordinates, codes = placed
+    if codes.shape[1]:
+        return prototypes(coordinates, codes, count, rng)
+    from sklearn.cluster import KMeans
+    from threadpoolctl import threadpool_limits
+
+    means: Any = KMeans(count, n_init=_STARTS, random_state=int(rng.integers(2**31)))  # pyright: ignore[reportArgumentType]
+    # Its threads wait for each other in a loop, which is slow where the processor is shared.
+    with threadpool_limits(1):
+        return means.fit(coordinates).labels_.astype(np.int64)
+
+
+def _dense(
+    samples: Samples,
+    count: int | None,
+    radius: float | None,
+    scale: Scale,
+    rng: np.random.Generator,
+) -> Clusters:
+    if count is not None:
+        raise ValueError(f"dbscan finds the number of clusters itself; got count={count!r}")
+    if radius is not None and not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius must be positive and finite; got {radius!r}")
+    needed = max(4, 2 * len(samples.columns))
+    found, radius = dbscan(samples.points(scale), needed, radius, rng)
+    score = _silhouette(samples.place(scale), found, rng)
+    return Clusters(samples, _by_size(found), "dbscan", score, scale, radius=radius)
+
+
+def _silhouette(
+    placed: tuple[np.ndarray, np.ndarray], labels: np.ndarray, rng: np.random.Generator
+) -> float:
+    """On at most 2000 rows, noise left out; NaN where it is not defined."""
+    from sklearn.metrics import silhouette_score
+
+    rows = np.flatnonzero(labels >= 0)
+    rows = rng.permutation(rows)[:_JUDGED]
+    kinds = len(np.unique(labels[rows]))
+    if not 2 <= kinds < len(rows):
+        return np.nan
+    part = placed[0][rows], placed[1][rows]
+    between = np.stack([distances(part, (one, code)) for one, code in zip(*part, strict=True)])
+    return float(silhouette_score(between, labels[rows], metric="precomputed"))
+
+
+def _by_size(labels: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Renumbered, the largest cluster first; of equal ones that with the first row."""
+    kinds, first, counts = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
+    order = np.lexsort((first, -counts))
+    new = np.full(int(labels.max(initial=-1)) + 2, -1, np.int64)
+    new[kinds[order]] = np.arange(len(kinds))
+    return new[labels]
+
+
+def telling_columns(found: Clusters) -> tuple[str, str]:
+    """The two columns of which the clusters explain most of the variation."""
+
+    def explained(total: Float[np.ndarray, " n"]) -> float:
+        spread = ((total - total.mean(axis=0)) ** 2).sum()
+        means = np.stack([total[found.assigned == c].mean(axis=0) for c in kinds])
+        inner = ((total - means[np.searchsorted(kinds, found.assigned)]) ** 2).sum()
+        return 1 - inner / spread if spread > 0 else -1.0
+
+    kinds = np.unique(found.assigned)
+    samples, scores = found.samples, {}
+    matrix = iter(samples.matrix("standard").T)
+    codes = iter(samples.codes().T)
+    for column in samples.columns:
+        if column.ordered:
+            scores[column.name] = explained(next(matrix)[:, None])
+        else:
+            scores[column.name] = explained(np.eye(len(column.choices) + 1)[next(codes)])
+    best = sorted(scores, key=lambda name: -scores[name])
+    return pair(samples, best)
+
+
+def _plot(found: Clusters, path: str | Path | None) -> Any:
+    samples = found.samples
+    across, up = telling_columns(found)
+    figure = new_figure(figsize=(6.2, 4.4))
+    axes = figure.subplots()
+    table = found.table
+    for cluster in reversed(list(table.index)):
+        color = PALETTE[cluster % len(PALETTE)] if cluster >= 0 else WITHOUT_VERDICT
+        rows = found.rows(cluster)
+        shown = samples.at(rows[:: max(1, len(samples) // DOTS)])
+        name = f"cluster {cluster}" if cluster >= 0 else "noise"
+        axes.scatter(
+            positions(samples, across, shown),
+            positions(samples, up, shown),
+            c=color,
+            s=10,
+            alpha=0.6 if cluster >= 0 else 0.4,
+            linewidths=0,
+            label=f"{name}: {found._own(cluster, 'size'):,}",
+        )
+        if cluster >= 0:
+            one = samples.at([found._own(cluster, "representative")])
+            axes.scatter(
+                positions(samples, across, one),
+                positions(samples, up, one),
+                c=color,
+                marker="*",
+                s=190,
+                edgecolors="white",
+                linewidths=1.1,
+                zorder=4,
+            )
+    name_axes(axes, samples, across, up)
+    tidy(axes)
+    handles, labels = axes.get_legend_handles_labels()
+    axes.legend(
+        handles[::-1],
+        labels[::-1],
+        frameon=False,
+        fontsize=8,
+        loc="center left",
+        bbox_to_anchor=(1, 0.5),
+    )
+    figure.suptitle(
+        f"{samples.kind}: {found.count} cluster{'' if found.count == 1 else 's'} ({found.method}); "
+        "stars are typical rows",
+        fontsize=10,
+    )
+    return show_or_save(figure, path)

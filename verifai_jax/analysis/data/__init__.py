@@ -1,0 +1,1 @@
+"""Tables as numbers: their columns, their samples, and the prior of each column."""

@@ -1,0 +1,142 @@
+"""Which cells of the feature space, of one feature and of two, have samples in them.
+
+Pairs of discrete values are those of t-wise coverage in combinatorial testing (Kuhn, Kacker and
+Lei, Introduction to combinatorial testing, 2013).
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.analysis.data.marginals import Marginal
+from verifai_jax.analysis.data.samples import Samples
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_VALUES = 20
+"""Values up to which each one of a discrete feature is a cell of its own."""
+MOST_FEATURES = 60
+"""Features up to which all of their pairs are counted."""
+MOST_UNTRIED = 1000
+BLOCK = 4096
+
+
+class Cells(NamedTuple):
+    """One feature cut into cells: the cell of each row (-1 where absent), and their prior."""
+
+    name: str
+    ids: Int[np.ndarray, " n"]
+    prior: Float[np.ndarray, " cells"]
+    marginal: Marginal
+    listed: bool  # Whether each cell is one value.
+
+
+def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
+    """The rows in cells: one for each value of a discrete feature, else `count` of a range."""
+    found = []
+    for part in parts:
+        name = part.column.name
+        if part.edges is not None and (part.count <= MOST_VALUES or not part.column.ordered):
+            ids, prior = part.cells(samples), np.diff(part.edges)
+            found.append(Cells(name, ids, prior, part, True))
+        else:
+            ids = np.clip(np.floor(part.unit(samples) * count), 0, count - 1).astype(np.int64)
+            absent = samples.frame[name].isna().to_numpy()
+            prior = np.full(count, 1 / count)
+            found.append(Cells(name, np.where(absent, -1, ids), prior, part, False))
+    return found
+
+
+def occupied(
+    n: int, rows: list[Cells], allowed: list[Cells] | None = None
+) -> tuple["pd.DataFrame", "pd.DataFrame", int]:
+    """The tables of features and of what was never tried, and how much that is.
+
+    - `n`: number of rows.
+    - `allowed`: samples of the prior in the same cells, where it is not uniform on all of them:
+      cells in which none of them lies do not count.
+    """
+    import pandas as pd
+
+    most = min(len(rows), MOST_FEATURES)
+    counts = np.array([len(cells.prior) for cells in rows])
+    edges = np.concatenate([[0], np.cumsum(counts[:most])])
+    together = pair_counts(_ids(rows[:most]), counts[:most])
+    possible = together if allowed is None else pair_counts(_ids(allowed[:most]), counts[:most])
+    table = np.full((len(rows), len(_COLUMNS)), np.nan)
+    untried: list[tuple[Any, ...]] = []
+    missing = 0
+    for i, one in enumerate(rows):
+        seen = _count(one, counts[i]) > 0
+        prior = one.prior if allowed is None else _shares(_count(allowed[i], counts[i]))
+        real = seen | (prior > 0)
+        table[i, :3] = real.sum(), np.mean(seen[real]), np.mean(_chance(prior[real], n))
+        if one.listed:
+            never = np.flatnonzero(real & ~seen)
+            missing += len(never)
+            untried += [(one.name, one.marginal.shown(int(cell)), "", "") for cell in never]
+        shares = []
+        for j, other in enumerate(rows[:most]):
+            if i == j or i >= most:
+                continue
+            block = np.s_[edges[i] : edges[i + 1], edges[j] : edges[j + 1]]
+            both = together[block] > 0
+            pair = np.outer(one.prior, other.prior)
+            pair = pair if allowed is None else _shares(possible[block])
+            real = both | (pair > 0)
+            shares.append((np.mean(both[real]), np.mean(_chance(pair[real], n))))
+            if i < j and one.listed and other.listed:
+                # A value that was never tried is not listed again with all of its partners.
+                alive = np.outer(both.any(axis=1), both.any(axis=0))
+                empty = np.argwhere(~both & real & alive)
+                missing += len(empty)
+                for a, b in empty[: max(0, MOST_UNTRIED - len(untried))].tolist():
+                    first = (one.name, one.marginal.shown(a))
+                    untried.append((*first, other.name, other.marginal.shown(b)))
+        if shares:
+            table[i, 3:] = np.mean(shares, axis=0)
+    untried.sort(key=lambda entry: entry[2] != "")
+    index = pd.Index([c.name for c in rows], name="feature")
+    heads = ["feature", "value", "other", "other_value"]
+    return (
+        pd.DataFrame(table, columns=list(_COLUMNS), index=index).astype({"cells": int}),
+        pd.DataFrame(untried[:MOST_UNTRIED], columns=heads),
+        missing,
+    )
+
+
+_COLUMNS = ("cells", "occupied", "expected", "pairs", "expected_pairs")
+
+
+def _ids(rows: list[Cells]) -> Int[np.ndarray, "n d"]:
+    return np.stack([cells.ids for cells in rows], axis=1)
+
+
+def _count(cells: Cells, count: int) -> Int[np.ndarray, " cells"]:
+    return np.bincount(cells.ids[cells.ids >= 0], minlength=count)
+
+
+def _shares(counts: Any) -> Any:
+    return counts / max(counts.sum(), 1)
+
+
+def _chance(prior: Float[np.ndarray, "*cells"], n: int) -> Float[np.ndarray, "*cells"]:
+    """The probabilities that some of `n` samples of the prior lie in a cell."""
+    return 1 - (1 - prior) ** n
+
+
+def pair_counts(ids: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]) -> Any:
+    """How many rows lie in each two cells of all features, `[sum of counts] * 2`."""
+    edges = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    total = int(counts.sum())
+    together = np.zeros((total, total))
+    for begin in range(0, len(ids), BLOCK):
+        block = ids[begin : begin + BLOCK]
+        unit = np.zeros((len(block), total), np.float32)
+        row, column = np.nonzero(block >= 0)
+        unit[row, edges[column] + block[row, column]] = 1
+        together += unit.T @ unit
+    return together

@@ -1,0 +1,376 @@
+"""The rows of an error table that an analysis looks at, and their features as matrices.
+
+    samples = Samples.of(run)                            # its counterexamples
+    samples = Samples.of(frame, "safe", ["x", "alg"])    # any DataFrame with feature columns
+    samples.matrix()                                     # ordered columns in [0, 1], [n, k]
+    samples.codes()                                      # unordered columns as integers, [n, m]
+    samples.points()                                     # all columns, for Euclidean distances
+
+Results always speak of row numbers of the table (`samples.rows`), never of places among the rows
+looked at.
+"""
+
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from verifai_jax.analysis.data.columns import Column, describe_columns, feature_columns
+from verifai_jax.analysis.data.verdicts import chosen, nothing, verdicts
+from verifai_jax.core.errors import check_names
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Which = Literal["counterexamples", "safe", "failed", "all"]
+Scale = Literal["range", "rows", "standard", "raw"]
+WHICH = ("counterexamples", "safe", "failed", "all")
+SCALES = ("range", "rows", "standard", "raw")
+# With it an absent entry is 0.87 to 1 away from every present one of a column in [0, 1].
+_ABSENT = np.sqrt(3) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Rows of a table and the columns of them that are analysed; made by `Samples.of`.
+
+    **Fields:** `frame`: the rows looked at, with all columns of the table and its row numbers as
+    index; `columns`: what is analysed; `which` rows these are; `name` of the run; `table`: the
+    whole table; `space` of the features, if known.
+
+    Entries that are missing (NaN, None) are absent items of arrays of variable length. `matrix`
+    takes the mean of the rows that have the item, so that an absent one adds nothing to a
+    covariance; `codes` says -1; in `points`, absence is a value of its own.
+    """
+
+    frame: "pd.DataFrame"
+    columns: tuple[Column, ...]
+    which: str
+    name: str
+    table: "pd.DataFrame"
+    space: FeatureSpace | None = None
+
+    @classmethod
+    def of(
+        cls,
+        source: "Run | ErrorTable | pd.DataFrame | Samples",
+        which: Which = "counterexamples",
+        columns: Sequence[str] | None = None,
+        space: Problem | FeatureSpace | None = None,
+    ) -> "Samples":
+        """The samples of a run, of its table, or of any DataFrame with feature columns.
+
+        - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
+          rows with a verdict. A DataFrame is judged by its columns `violated` and `status`, else
+          by `rho < 0`; without either, all of its rows are counterexamples.
+        - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
+          robustness, are columns too, but only if named here.
+        - `space`: says which columns are ordered and what their ranges are; a run knows its own.
+
+        `Samples` are taken as they are; only `columns` may select among the table's again.
+
+        **Raises:** `TypeError` for another source; `ValueError` for another `which`, no rows,
+        row numbers that are not unique integers, unknown columns (with the nearest names), or
+        columns named twice.
+        """
+        import pandas as pd
+
+        if isinstance(source, Samples):
+            if columns is None:
+                return source
+            described = _described(source.table, columns, source.space)
+            return replace(source, columns=described)
+        if which not in WHICH:
+            raise ValueError(f"which must be one of {', '.join(map(repr, WHICH))}; got {which!r}")
+        name = "table"
+        if isinstance(source, Run):
+            name, table = source.name, source.table.all
+            space = space if space is not None or source.problem is None else source.problem
+        elif isinstance(source, ErrorTable):
+            table = source.all
+        elif isinstance(source, pd.DataFrame):
+            table = source
+        else:
+            raise TypeError(
+                "samples come from a run, its table or a DataFrame; "
+                f"got {type(source).__name__}: {source!r}"[:300]
+            )
+        if isinstance(space, Problem):
+            space = space.space
+        if not table.index.is_unique or not pd.api.types.is_integer_dtype(table.index):
+            raise ValueError(
+                "row numbers (the index of the DataFrame) must be unique integers; "
+                "reset_index(drop=True) numbers the rows anew"
+            )
+        features = feature_columns(table, space)
+        if isinstance(source, ErrorTable | Run) and space is None:
+            table_of = source.table if isinstance(source, Run) else source
+            features = table_of.features
+        described = _described(table, features if columns is None else columns, space)
+        rows = chosen(table, which)
+        if not rows.any():
+            raise ValueError(nothing(table, which))
+        return cls(table.loc[rows], described, which, name, table, space)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def rows(self) -> Int[np.ndarray, " n"]:
+        """Row numbers in the table."""
+        return self.frame.index.to_numpy()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns that are analysed."""
+        return tuple(column.name for column in self.columns)
+
+    @cached_property
+    def ordered(self) -> tuple[Column, ...]:
+        """Columns of numbers; those of `matrix`."""
+        return tuple(column for column in self.columns if column.ordered)
+
+    @cached_property
+    def unordered(self) -> tuple[Column, ...]:
+        """Columns of choices; those of `codes`."""
+        return tuple(column for column in self.columns if not column.ordered)
+
+    @cached_property
+    def failing(self) -> Bool[np.ndarray, " n"]:
+        """Which of the rows looked at are counterexamples."""
+        return verdicts(self.table)[0][self.table.index.get_indexer(self.frame.index)]
+
+    @cached_property
+    def rho(self) -> Float[np.ndarray, " n"]:
+        """Robustness of the rows; NaN where the table has none."""
+        if "rho" not in self.frame:
+            return np.full(len(self), np.nan)
+        return self.frame["rho"].to_numpy(np.float64)
+
+    @property
+    def worst(self) -> int:
+        """Place (not the row number) of the least robustness; the first without any."""
+        return int(np.argmin(np.nan_to_num(self.rho, nan=np.inf)))
+
+    def others(self, which: Which) -> "Samples":
+        """The same columns of other rows of the same table.
+
+        **Raises:** `ValueError` if there are no such rows.
+        """
+        rows = chosen(self.table, which)
+        if not rows.any():
+            raise ValueError(nothing(self.table, which))
+        return replace(self, frame=self.table.loc[rows], which=which)
+
+    def at(self, rows: "Sequence[int] | Int[np.ndarray, ' k']") -> "pd.DataFrame":
+        """Rows of the table by their numbers, in this order.
+
+        **Raises:** `IndexError` for a row number that is not in the table.
+        """
+        numbers = np.asarray(rows).reshape(-1)
+        places = self.table.index.get_indexer(numbers)
+        if (places < 0).any():
+            stray = numbers[np.argmin(places)]
+            raise IndexError(f"row {stray} is not in the table of {len(self.table):,} rows")
+        return self.table.iloc[places]
+
+    @property
+    def kind(self) -> str:
+        """What the rows are, in words: `"12 counterexamples of cart-pole"`."""
+        what = {"failed": "rows without a verdict", "all": "rows", "safe": "safe rows"}
+        one = len(self) == 1
+        words = what.get(self.which, self.which)
+        words = words.replace("rows", "row").removesuffix("s") if one else words
+        return f"{len(self):,} {words} of {self.name}"
+
+    def values(self) -> Float[np.ndarray, "n k"]:
+        """Ordered columns as they are; NaN where absent."""
+        names = [column.name for column in self.ordered]
+        return self.frame[names].to_numpy(np.float64).reshape(len(self), len(names))
+
+    def scaling(
+        self, scale: Scale = "range"
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Offset and width of each ordered column: scaled is `(value - offset) / width`.
+
+        - `"range"`: range in the feature space, or of the whole table where that is not known;
+        - `"rows"`: least and greatest of the rows looked at (VerifAI's `build_normalized`);
+        - `"standard"`: mean and standard deviation (of the population) of the rows;
+        - `"raw"`: 0 and 1.
+
+        The width of a column that does not vary is 1.
+
+        **Raises:** `ValueError` for another scale.
+        """
+        if scale not in SCALES:
+            raise ValueError(f"scale must be one of {', '.join(map(repr, SCALES))}; got {scale!r}")
+        values = self.values()
+        if scale == "raw":
+            return np.zeros(values.shape[1]), np.ones(values.shape[1])
+        if scale == "range":
+            offset = np.array([column.near for column in self.ordered], np.float64)
+            width = np.array([column.far for column in self.ordered], np.float64) - offset
+        else:
+            ends = [_statistics(values[:, j], scale) for j in range(values.shape[1])]
+            offset, width = np.array(ends, np.float64).reshape(-1, 2).T
+        return offset, np.where(width > 0, width, 1.0)
+
+    def matrix(self, scale: Scale = "range") -> Float[np.ndarray, "n k"]:
+        """Ordered columns, scaled; an absent entry is the mean of the present ones."""
+        offset, width = self.scaling(scale)
+        scaled = (self.values() - offset) / width
+        absent = np.isnan(scaled)
+        if absent.any():
+            present = np.maximum((~absent).sum(axis=0), 1)
+            means = np.where(absent, 0.0, scaled).sum(axis=0) / present
+            scaled = np.where(absent, means, scaled)
+        return scaled
+
+    def codes(self) -> Int[np.ndarray, "n m"]:
+        """Unordered columns as places in their `choices`; -1 where absent."""
+        return self.place()[1]
+
+    def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:
+        """All columns, so that Euclidean distances treat ordered and unordered ones alike.
+
+        The squared distance of two rows is the sum over ordered columns of squared scaled
+        differences, and 1 for each unordered column in which they differ. Where only one of two
+        has an item, its columns count 0.75 to 1 each; where neither has it, 0.
+        """
+        coordinates, codes = self.place(scale)
+        parts = [coordinates]
+        for column, code in zip(self.unordered, codes.T, strict=True):
+            # Two different rows of the unit matrix are the square root of two apart.
+            parts.append((np.eye(len(column.choices) + 1) / np.sqrt(2))[code])
+        return np.concatenate(parts, axis=1)
+
+    def place(
+        self, scale: Scale = "range", frame: "pd.DataFrame | None" = None
+    ) -> tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]]:
+        """Coordinates of the ordered columns and codes of the unordered ones; see `distances`.
+
+        - `frame`: other rows, to be placed among these.
+        """
+        offset, width = self.scaling(scale)
+        middles: Any = np.full(len(self.ordered), 0.5)
+        if scale in ("raw", "standard"):
+            middles = self.matrix(scale).mean(axis=0)
+        rows: Any = self.frame if frame is None else frame
+        parts = []
+        for j, column in enumerate(self.ordered):
+            scaled = (rows[column.name].to_numpy(np.float64) - offset[j]) / width[j]
+            absent = np.isnan(scaled)
+            parts.append(np.where(absent, middles[j], scaled))
+            if _has_absent(self.table[column.name]):
+                parts.append(_ABSENT * absent)
+        coordinates = np.stack(parts, axis=1) if parts else np.zeros((len(rows), 0))
+        codes = [column.codes(rows[column.name]) for column in self.unordered]
+        return coordinates, (
+            np.stack(codes, axis=1) if codes else np.zeros((len(rows), 0), np.int64)
+        )
+
+    def need_ordered(self, purpose: str) -> None:
+        """Raise `ValueError` unless there is an ordered column; `purpose` begins the message."""
+        if not self.ordered:
+            raise ValueError(
+                f"{purpose} needs an ordered column (numbers); "
+                f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} unordered"
+            )
+
+    def need_unordered(self, purpose: str) -> None:
+        """Raise `ValueError` unless there is an unordered column."""
+        if not self.unordered:
+            raise ValueError(
+                f"{purpose} needs an unordered column (choices); "
+                f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} ordered"
+            )
+
+    def __repr__(self) -> str:
+        return (
+            f"Samples({self.kind}: "
+            f"ordered {_listed([c.name for c in self.ordered])}; "
+            f"unordered {_listed([c.name for c in self.unordered])})"
+        )
+
+
+def distances(
+    rows: tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]],
+    one: tuple[Float[np.ndarray, " p"], Int[np.ndarray, " m"]],
+) -> Float[np.ndarray, " n"]:
+    """Distances of rows from one row, both as `Samples.place` gives them; see `points`."""
+    squared = ((rows[0] - one[0]) ** 2).sum(axis=1) + (rows[1] != one[1]).sum(axis=1)
+    return np.sqrt(squared)
+
+
+def whole(value: Any, what: str, least: int = 1) -> int:
+    """A whole number of at least `least`; `what` names it in the error."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or number < least:
+        raise ValueError(f"{what} must be a whole number of at least {least}; got {value!r}")
+    return number
+
+
+def beside(frame: "pd.DataFrame", own: "pd.DataFrame") -> "pd.DataFrame":
+    """The columns of `frame` and, after them, `own` ones, `_` added to a name that is taken."""
+    return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
+
+
+def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.Generator:
+    """A NumPy generator from a seed or a `jax.random` key; the same one for the same seed.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if isinstance(seed, jax.Array):
+        keyed = jnp.issubdtype(seed.dtype, jax.dtypes.prng_key)
+        data = np.asarray(jax.random.key_data(seed) if keyed else seed)
+        return np.random.default_rng([int(word) for word in data.ravel()])
+    return np.random.default_rng(whole(seed, "the seed", least=0))
+
+
+def _described(
+    table: "pd.DataFrame", names: Sequence[str], space: FeatureSpace | None
+) -> tuple[Column, ...]:
+    if isinstance(names, str):
+        raise ValueError(f"columns are given as a list of names; got {names!r}")
+    twice = [name for i, name in enumerate(names) if name in list(names)[:i]]
+    if twice:
+        raise ValueError(f"column {twice[0]!r} is named twice")
+    if not names:
+        raise ValueError("there is no column to analyse: no feature varies")
+    check_names("column", names, map(str, table.columns))
+    return describe_columns(table, names, space)
+
+
+def _statistics(values: np.ndarray, scale: str) -> tuple[float, float]:
+    present = values[~np.isnan(values)]
+    if not len(present):
+        return 0.0, 1.0
+    if scale == "rows":
+        return float(present.min()), float(present.max() - present.min())
+    # All equal entries have a deviation of zero only up to rounding.
+    deviation = float(present.std()) if present.min() < present.max() else 0.0
+    return float(present.mean()), deviation
+
+
+def _has_absent(entries: Any) -> bool:
+    return bool(entries.isna().any())
+
+
+def _listed(names: Sequence[str], most: int = 8) -> str:
+    shown = ", ".join(names[:most]) + (f", and {len(names) - most} more" if names[most:] else "")
+    return shown or "none"

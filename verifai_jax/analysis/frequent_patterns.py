@@ -1,0 +1,368 @@
+"""Recurrent values: choices, and combinations of them, that counterexamples have in common.
+
+    found = recurrent(run)
+    found.table                        combinations: how many, which share, how often they fail
+    found.top                          the most recurrent value of each feature
+    found.rows(0)                      the row numbers that the first combination covers
+
+A combination is as frequent as its rarest part at most, so that rare parts need not be extended:
+Agrawal and Srikant, Fast algorithms for mining association rules, VLDB 1994; depth first over sets
+of rows: Zaki, Scalable algorithms for association mining, IEEE TKDE 12(3), 2000.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations as subsets
+from itertools import pairwise
+from math import prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from verifai_jax.analysis.data.columns import Column
+from verifai_jax.analysis.data.samples import Samples, Which, whole
+from verifai_jax.features import FeatureSpace
+from verifai_jax.plotting.rows import shortened
+from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_COMBINATIONS = 50_000
+BARS = 16
+
+
+@dataclass(frozen=True)
+class Item:
+    """One value of one column, or one cell of an ordered column."""
+
+    column: str
+    value: Any
+    text: str
+    prior: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Recurrent:
+    """Frequent combinations of values among `samples`.
+
+    **Fields:** `items`: the single values, also those that never occur; `combinations`: each a
+    tuple of places in `items`; `counts` of rows; `minimum`: the least share that was looked for;
+    `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`.
+    """
+
+    samples: Samples
+    items: tuple[Item, ...]
+    combinations: tuple[tuple[int, ...], ...]
+    counts: Int[np.ndarray, " c"]
+    expected: np.ndarray
+    minimum: float
+    against: str
+    _present: Bool[np.ndarray, "i n"]
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row for each combination, single values first, then the most frequent first.
+
+        `count` and `share` of the rows looked at; `expected`: the share that the combination has
+        in the prior, or among all rows with a verdict; `lift`: share over expected, which is how
+        many times as often as an average simulation one with these values is among the rows
+        looked at (fails, for counterexamples). NaN where nothing is known to compare with.
+        """
+        import pandas as pd
+
+        share = self.counts / len(self.samples)
+        lift = np.divide(
+            share, self.expected, out=np.full(len(share), np.nan), where=self.expected > 0
+        )
+        return pd.DataFrame(
+            {
+                "combination": [
+                    ", ".join(self.items[i].text for i in one) for one in self.combinations
+                ],
+                "size": [len(one) for one in self.combinations],
+                "count": self.counts,
+                "share": share,
+                "expected": self.expected,
+                "lift": lift,
+            }
+        )
+
+    @cached_property
+    def values(self) -> "pd.DataFrame":
+        """All values of each column, also rare ones: `column`, `value`, `count`, `share`."""
+        import pandas as pd
+
+        counts = self._present.sum(axis=1)
+        table = pd.DataFrame(
+            {
+                "column": [item.column for item in self.items],
+                "value": [item.value for item in self.items],
+                "count": counts,
+                "share": counts / len(self.samples),
+            }
+        )
+        places = {item.column: i for i, item in reversed(list(enumerate(self.items)))}
+        order = np.lexsort((-counts, [places[item.column] for item in self.items]))
+        return table.iloc[order].reset_index(drop=True)
+
+    @cached_property
+    def top(self) -> dict[str, Any]:
+        """The most recurrent value of each column; the first in the order of choices if equal."""
+        first = self.values.drop_duplicates("column")
+        return dict(zip(first["column"], first["value"], strict=True))
+
+    def rows(self, place: int) -> Int[np.ndarray, " count"]:
+        """Row numbers that the combination in row `place` of `table` covers.
+
+        **Raises:** `IndexError` for a place that is not in the table.
+        """
+        if not 0 <= place < len(self.combinations):
+            raise IndexError(
+                f"combination {place} is not among the {len(self.combinations)} in the table"
+            )
+        return self.samples.rows[self._present[list(self.combinations[place])].all(axis=0)]
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the shares of the most telling combinations, and what was expected; the figure."""
+        return _plot(self, path)
+
+    def __str__(self) -> str:
+        sizes = [len(one) for one in self.combinations]
+        single = sizes.count(1)
+        lines = [
+            f"{_number(single, 'value')} and {_number(len(sizes) - single, 'combination')} in at "
+            f"least {self.minimum:.3g} of {self.samples.kind}"
+        ]
+        for column, value in list(self.top.items())[:8]:
+            share = self.values.loc[self.values["column"] == column, "share"].max()
+            lines.append(f"  most recurrent: {column}={value} ({share:.0%})")
+        against = {"table": "among all rows", "prior": "in the prior"}.get(self.against)
+        rows: Any = self.telling.head(5).itertuples()
+        for row in rows:
+            if row.lift > 1:
+                lines.append(
+                    f"  {row.combination}: {row.share:.0%} of them, {row.lift:.2f} times the share "
+                    f"{against}"
+                )
+        return "\n".join(lines)
+
+    @cached_property
+    def telling(self) -> "pd.DataFrame":
+        """Rows of `table` with the greatest lift first, without combinations that add nothing.
+
+        A combination adds something if its lift is 1.1 times that of each of its parts. Where
+        nothing is known to compare with, the single values, the most frequent first.
+        """
+        table: Any = self.table
+        lift = table["lift"].to_numpy()
+        if np.isnan(lift).all():
+            return table[table["size"] == 1]
+        by = dict(zip(self.combinations, lift, strict=True))
+        kept = [
+            all(by[one] > 1.1 * by[part] for part in subsets(one, len(one) - 1) if part)
+            for one in self.combinations
+        ]
+        table = table[kept]
+        return table.iloc[np.argsort(-table["lift"].to_numpy(), kind="stable")]
+
+
+def recurrent(
+    source: Any,
+    columns: Sequence[str] | None = None,
+    size: int = 2,
+    minimum: float = 0.05,
+    bins: int | None = None,
+    against: Literal["auto", "table", "prior"] = "auto",
+    which: Which = "counterexamples",
+    space: Problem | FeatureSpace | None = None,
+) -> Recurrent:
+    """Values of unordered columns, and combinations of up to `size` of them, that occur often.
+
+    - `source`, `columns`, `which`, `space`: as in `Samples.of`.
+    - `minimum`: least share of the rows that a combination must have.
+    - `bins`: takes ordered columns too, in so many equally wide cells of their range; whole
+      numbers that have no more values are taken as they are.
+    - `against`: what a share is compared with: that among all rows with a verdict, or the prior
+      probability. By default the table where it has rows with the other verdict, else the prior
+      where it is known. After an active search both depend on where it went.
+
+    An absent item of an array has no value. **Raises:** `ValueError` for no unordered column and no
+    `bins`; a `size` or number of bins below 1; a minimum outside (0, 1]; `against="prior"` without
+    a space that knows the prior; more than 50 000 combinations.
+    """
+    samples = Samples.of(source, which, columns, space)
+    whole(size, "size")
+    if not (isinstance(minimum, float | int) and 0 < minimum <= 1):
+        raise ValueError(f"minimum is a share, above 0 and at most 1; got {minimum!r}")
+    if against not in ("auto", "table", "prior"):
+        raise ValueError(f"against must be 'auto', 'table' or 'prior'; got {against!r}")
+    if bins is None:
+        samples.need_unordered("recurrent values without bins=...")
+    else:
+        whole(bins, "bins")
+    items, present = _items(samples, bins, samples.frame)
+    verdicts = _has_both_verdicts(samples)
+    priors = all(item.prior is not None for item in items)
+    if against == "prior" and not priors:
+        unknown = next(item.column for item in items if item.prior is None)
+        raise ValueError(
+            f"against='prior' needs the feature space to know the prior of every column; that of "
+            f"{unknown} is not known"
+        )
+    if against == "auto":
+        against = "table" if verdicts or not priors else "prior"
+    if against == "table" and verdicts:
+        _, elsewhere = _items(samples, bins, samples.others("all").frame)
+    else:
+        elsewhere = np.zeros((len(items), 0), bool)
+    least = max(1, int(np.ceil(minimum * len(samples) - 1e-9)))
+    combinations, counts, expected = _frequent(items, present, elsewhere, least, size)
+    if against == "prior":
+        expected = np.array([prod(items[i].prior or 0.0 for i in one) for one in combinations])
+    order = sorted(range(len(counts)), key=lambda i: (len(combinations[i]), -counts[i], i))
+    return Recurrent(
+        samples=samples,
+        items=items,
+        combinations=tuple(combinations[i] for i in order),
+        counts=counts[order],
+        expected=np.asarray(expected, np.float64)[order],
+        minimum=float(minimum),
+        against=against if against == "prior" or verdicts else "nothing",
+        _present=present,
+    )
+
+
+def _has_both_verdicts(samples: Samples) -> bool:
+    """Whether some rows with a verdict are not looked at; looked at are all or one kind."""
+    if samples.which == "all":
+        return False
+    try:
+        return len(samples.others("all")) > len(samples)
+    except ValueError:
+        return False
+
+
+def _frequent(
+    items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, least: int, size: int
+) -> tuple[list[tuple[int, ...]], np.ndarray, np.ndarray]:
+    """All combinations of at most `size` items, of different columns, with `least` rows."""
+    found: list[tuple[int, ...]] = []
+    counts: list[int] = []
+    shares: list[float] = []
+
+    def extend(one: tuple[int, ...], rows: np.ndarray, others: np.ndarray) -> None:
+        for i in range(one[-1] + 1 if one else 0, len(items)):
+            if one and items[i].column == items[one[-1]].column:
+                continue
+            covered = rows & present[i]
+            count = int(np.count_nonzero(covered))
+            if count < least:
+                continue
+            if len(found) == MOST_COMBINATIONS:
+                raise ValueError(
+                    f"more than {MOST_COMBINATIONS:,} combinations of up to {size} values are in "
+                    f"{least} rows or more; raise minimum, or lower size"
+                )
+            beyond = others & elsewhere[i]
+            found.append((*one, i))
+            counts.append(count)
+            shares.append(float(beyond.mean()) if len(beyond) else np.nan)
+            if len(one) + 1 < size:
+                extend((*one, i), covered, beyond)
+
+    extend((), np.ones(present.shape[1], bool), np.ones(elsewhere.shape[1], bool))
+    return found, np.array(counts, np.int64), np.array(shares)
+
+
+def _items(
+    samples: Samples, bins: int | None, frame: "pd.DataFrame"
+) -> tuple[tuple[Item, ...], Bool[np.ndarray, "i n"]]:
+    """The values of all columns, and which rows of `frame` have them."""
+    items: list[Item] = []
+    present: list[np.ndarray] = []
+    for column in samples.columns:
+        entries: Any = frame[column.name]
+        if column.ordered and bins is None:
+            continue
+        if column.ordered:
+            labels, codes, prior = _cells(column, entries.to_numpy(np.float64), bins or 1)
+        else:
+            labels, codes, prior = column.choices, column.codes(entries), column.prior
+        for place, label in enumerate(labels):
+            text = f"{column.name}={label}"
+            if column.ordered and isinstance(label, str):
+                text = f"{column.name} in {label}"
+            items.append(Item(column.name, label, text, prior[place] if prior else None))
+            present.append(codes == place)
+    return tuple(items), np.array(present).reshape(len(items), len(frame))
+
+
+def _cells(
+    column: Column, values: np.ndarray, bins: int
+) -> tuple[Sequence[Any], np.ndarray, Sequence[float] | None]:
+    """Labels of the cells of an ordered column, in which of them the values are, their prior."""
+    width = column.far - column.near
+    if column.integer and width + 1 <= bins:
+        labels: list[Any] = list(range(int(column.near), int(column.far) + 1))
+        edges = np.append(np.array(labels) - 0.5, column.far + 0.5)
+    elif width <= 0:
+        labels, edges = [column.near], np.array([column.near, column.near])
+    else:
+        edges = np.linspace(column.near, column.far, bins + 1)
+        ends = [f"{edge:.4g}" for edge in edges]
+        labels = [f"[{a}, {b})" for a, b in pairwise(ends)]
+        labels[-1] = labels[-1][:-1] + "]"
+    codes = np.searchsorted(edges, values, side="right") - 1
+    codes = np.clip(codes, 0, len(labels) - 1)
+    codes = np.where(np.isnan(values), -1, codes)
+    prior = (1 / len(labels),) * len(labels) if column.uniform else None
+    if prior and column.integer and len(labels) == bins < width + 1:
+        numbers = np.arange(column.near, column.far + 1)
+        inside = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, bins - 1)
+        prior = tuple(np.bincount(inside, minlength=bins) / len(numbers))
+    return labels, codes, prior
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
+def _plot(found: Recurrent, path: str | Path | None) -> Any:
+    compared = found.against != "nothing"
+    shown = found.telling.head(BARS).sort_values("share", ascending=False, kind="stable")
+    longest = max((len(text) for text in shown["combination"]), default=0)
+    figure = new_figure(figsize=(5.2 + 0.055 * min(longest, 60), 1.5 + 0.34 * max(2, len(shown))))
+    axes = figure.subplots()
+    place = np.arange(len(shown))
+    color = SAFE if found.samples.which == "safe" else FAILING
+    axes.barh(place, shown["share"], 0.66, color=color, label="share of the rows looked at")
+    if compared:
+        axes.plot(
+            shown["expected"],
+            place,
+            linestyle="",
+            marker="|",
+            markersize=13,
+            markeredgewidth=2.2,
+            color=BOUND,
+            label="of all rows" if found.against == "table" else "in the prior",
+        )
+        rows: Any = shown.itertuples()
+        for y, row in zip(place, rows, strict=True):
+            if np.isfinite(row.lift):
+                right = max(row.share, row.expected)
+                axes.text(right + 0.015, y, f"{row.lift:.2f}x", va="center", fontsize=8)
+    axes.set_yticks(place, [shortened(text) for text in shown["combination"]])
+    axes.invert_yaxis()
+    axes.set_xlim(0, min(1.1, 1.15 * max(shown[["share", "expected"]].max().max(), 0.05)))
+    axes.set_xlabel("share")
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
+    figure.suptitle(f"Recurrent values, {found.samples.kind}", fontsize=10)
+    return show_or_save(figure, path)

@@ -1,0 +1,1 @@
+"""Sensitivity of the robustness to each feature, by Morris, by Sobol and by gradients."""

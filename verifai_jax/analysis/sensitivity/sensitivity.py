@@ -1,0 +1,214 @@
+"""How much each feature moves the robustness, from new simulations: what the methods share.
+
+    sobol_indices(problem, samples=4096)         sobol.py: shares of the variance
+    morris(problem, trajectories=32)             morris.py: cheap screening
+    gradient_sensitivity(problem, samples=1024)  gradients.py: bounds on total indices
+
+All three take features as the unit cube has them: independent and distributed by the prior.
+Simulation noise is held fixed while a feature changes, and counts as an input of its own.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.keys import run_keys
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.engine import engine_for
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RESAMPLES = 200
+"""Bootstrap samples behind an interval."""
+MOST_SHOWN = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """What a sensitivity analysis found.
+
+    **Fields:** `method`; `problem`: its name; `table`: one row a unit coordinate, the most
+    influential first, with `low` and `high` ends of 95 % bootstrap intervals; `simulations` made;
+    `dropped`: how many of them had no verdict and were left out together with their partners;
+    `variance` of the robustness.
+    """
+
+    method: str
+    problem: str
+    table: "pd.DataFrame"
+    simulations: int
+    dropped: int
+    variance: float
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the indices with their intervals; returns the figure."""
+        from verifai_jax.plotting.bars import plot_bars, plot_effects
+
+        shown = self.table.head(MOST_SHOWN)
+        title = f"{self.method} of {self.problem}, {self.simulations:,} simulations"
+        if "mu_star" in shown:
+            return plot_effects(shown, title, path)
+        if "total" in shown:
+            columns = {"total": "in all", "first": "alone"}
+            return plot_bars(shown, columns, title, "share of the variance", path)
+        # Above 1 a bound says nothing; at its own length it would hide those that do.
+        shown = shown.clip(upper=1)
+        return plot_bars(shown, {"bound": ""}, title, "upper bound on the total index", path)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.method} of {self.problem!r} from {self.simulations:,} simulations, robustness "
+            f"{'varies' if self.variance else 'does not vary'}: "
+            f"standard deviation {np.sqrt(self.variance):.3g}"
+        ]
+        if self.dropped:
+            lines.append(f"{self.dropped:,} simulations had no verdict and were left out")
+        width = max(len(str(name)) for name in self.table.index)
+        for name, row in self.table.head(MOST_SHOWN).iterrows():
+            lines.append(f"  {name!s:<{width}}  {_words(self.method, row)}")
+        if len(self.table) > MOST_SHOWN:
+            lines.append(f"  and {len(self.table) - MOST_SHOWN} more with less influence")
+        return "\n".join(lines)
+
+
+class Simulator:
+    """Robustness of points of the cube, in batches of one shape; counts what it does."""
+
+    def __init__(
+        self, problem: Problem, seed: int, batch: int, of: str | None, gradient: bool = False
+    ) -> None:
+        problem = resolved(problem, gradient=gradient, batch=batch).problem
+        problem.check()
+        self.batch = batch
+        self.engine = (
+            HostEngine(problem) if problem.black_box else engine_for(problem, batch, gradient)
+        )
+        self.key = run_keys(seed)[1]
+        self.column = None if of is None else list(problem.formulas).index(of)
+        self.done = self.dropped = 0
+        self.gradients: list[Any] = []
+
+    def __call__(
+        self, u: Float[np.ndarray, "n d"], first: int, temperature: float = 1.0
+    ) -> Float[np.ndarray, " n"]:
+        """Robustness `[n]`, NaN without a verdict; row `i` has the random key `first + i`."""
+        parts = []
+        for begin in range(0, len(u), self.batch):
+            chunk: Any = np.asarray(u[begin : begin + self.batch], np.float32)
+            done = self.engine.evaluate(chunk, self.key, first + begin, temperature)
+            parts.append(
+                np.min(done.rho, axis=1) if self.column is None else done.rho[:, self.column]
+            )
+            self.gradients.append(done.gradient)
+        rho = np.concatenate(parts).astype(np.float64)
+        rho[~np.isfinite(rho)] = np.nan
+        self.done += len(rho)
+        self.dropped += int(np.sum(np.isnan(rho)))
+        return rho
+
+
+class Coordinates(NamedTuple):
+    """The unit coordinates of a problem: what they are called and which values they have."""
+
+    names: tuple[str, ...]
+    levels: tuple[int, ...]
+    ordered: tuple[bool, ...]
+    weights: tuple[Any, ...]
+
+    def centres(
+        self, cells: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]
+    ) -> Float[np.ndarray, "n d"]:
+        """The middles of cells, of which coordinate `i` has `counts[i]`."""
+        middles = (cells + 0.5) / counts
+        for i, weights in enumerate(self.weights):
+            if weights is not None:
+                edges = np.concatenate([[0.0], np.cumsum(weights)])
+                middles[:, i] = ((edges[1:] + edges[:-1]) / 2)[cells[:, i]]
+        return middles.astype(np.float32)
+
+
+def coordinates_of(problem: Problem) -> Coordinates:
+    space: Any = problem.space
+    levels = tuple(space.levels)
+    names = tuple(space.columns)
+    if len(names) != len(levels):
+        names = tuple(f"u[{i}]" for i in range(len(levels)))
+    return Coordinates(
+        tuple(getattr(space, "coordinates", None) or names),
+        levels,
+        tuple(getattr(space, "ordered", None) or (True,) * len(levels)),
+        tuple(getattr(space, "weights", None) or (None,) * len(levels)),
+    )
+
+
+def check_problem(problem: Any, what: str, of: str | None) -> None:
+    if not isinstance(problem, Problem):
+        raise TypeError(f"a sensitivity analysis needs a Problem; got {type(problem).__name__}")
+    if getattr(problem.space, "where", None) is not None:
+        raise ValueError(
+            f"the space of problem {problem.name!r} has a constraint (where), so its features "
+            f"depend on each other, and {what} assume that they do not; drop the constraint "
+            "or use importance(run), which works on any table"
+        )
+    if not problem.space.dim:
+        raise ValueError(f"nothing varies in the space of problem {problem.name!r}")
+    if of is not None:
+        check_names("formula", [of], problem.formulas)
+
+
+def variance_of(rho: Float[np.ndarray, " n"], problem: Problem) -> float:
+    proper = rho[np.isfinite(rho)]
+    if not len(proper):
+        raise ValueError(
+            f"none of {len(rho)} simulations of problem {problem.name!r} has a verdict; "
+            "falsify(problem, 'uniform', 10).summary() says what happens to them"
+        )
+    if np.ptp(proper) == 0:
+        raise ValueError(
+            f"the robustness of problem {problem.name!r} is {proper[0]:.4g} in all of "
+            f"{len(proper)} simulations: there is no variation that features could explain"
+        )
+    return float(np.var(proper))
+
+
+def mean_of(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
+    """Mean of each column without its NaN; NaN where nothing is left."""
+    count = np.sum(np.isfinite(values), axis=0)
+    return np.where(count > 0, np.nansum(values, axis=0) / np.maximum(count, 1), np.nan)
+
+
+def ranked(names: tuple[str, ...], columns: dict[str, Any], by: str) -> "pd.DataFrame":
+    import pandas as pd
+
+    frame = pd.DataFrame(columns, index=pd.Index(names, name="feature"))
+    return frame.sort_values(by, ascending=False, kind="stable", na_position="last")
+
+
+def _words(method: str, row: Any) -> str:
+    if "total" in row:
+        between = f"{100 * row['total_low']:.1f} to {100 * row['total_high']:.1f} %"
+        alone = f"{100 * max(row['first'], 0):5.1f} % alone"
+        return f"{100 * row['total']:5.1f} % of the variance in all ({between}), {alone}"
+    if "mu_star" in row:
+        way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
+        return (
+            f"moves the robustness by {row['mu_star']:.3g} ({row['low']:.3g} to {row['high']:.3g})"
+            f" over its range, standard deviation {row['sigma']:.3g}{way}"
+        )
+    if np.isnan(row["bound"]):
+        return "discrete: has no gradient"
+    slope = f"typical slope {row['typical']:.3g}"
+    if row["bound"] >= 1:
+        return f"no bound below 100 %: mean squared slope {row['mean_squared']:.3g}, {slope}"
+    between = f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %"
+    return f"at most {100 * row['bound']:.1f} % of the variance ({between}), {slope}"

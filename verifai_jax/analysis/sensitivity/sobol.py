@@ -1,0 +1,113 @@
+"""Sobol indices: shares of the robustness's variance, a feature alone and with all interactions."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.analysis.data.samples import whole
+from verifai_jax.analysis.sensitivity.sensitivity import (
+    RESAMPLES,
+    Sensitivity,
+    Simulator,
+    check_problem,
+    coordinates_of,
+    ranked,
+    variance_of,
+)
+from verifai_jax.problem.problem import Problem
+
+NOISE = "(simulation noise)"
+
+
+def sobol_indices(
+    problem: Problem,
+    samples: int = 4096,
+    *,
+    seed: int = 0,
+    batch: int = 1024,
+    of: str | None = None,
+) -> Sensitivity:
+    """Shares of the robustness's variance that each feature explains, alone and in all.
+
+    `first` is the share that goes away when the feature is known; `total` the share that stays
+    when everything else is known, interactions included. A feature with a total of 0 has no
+    influence at all.
+
+    - `samples`: base points `N`, best a power of two; `N (d + 2)` simulations for `d` coordinates,
+      and `N` more where simulations are random.
+    - `of`: name of the formula; the least robustness of all when left out.
+
+    Sources: first-order estimator of Saltelli et al., Variance based sensitivity analysis of model
+    output, Computer Physics Communications 181 (2010); total of Jansen, Analysis of variance
+    designs for model output, Computer Physics Communications 117 (1999); points of a scrambled
+    Sobol sequence.
+
+    **Raises:** `ValueError` for a space with a constraint, whose features are not independent; for
+    fewer than 16 samples; where no simulation has a verdict or the robustness never varies.
+    """
+    check_problem(problem, "Sobol indices", of)
+    whole(samples, "samples", 16)
+    names = coordinates_of(problem).names
+    d = len(names)
+    from scipy.stats import qmc
+
+    exponent = int(np.ceil(np.log2(samples)))
+    points = qmc.Sobol(2 * d, rng=seed).random_base2(exponent)[:samples].astype(np.float32)
+    simulate = Simulator(problem, seed, min(batch, samples), of)
+    a, b = points[:, :d], points[:, d:]
+    # One base point has one random key, and its partner another: noise is a further coordinate.
+    f_a, f_b = simulate(a, 0), simulate(b, samples)
+    swapped = []
+    for i in range(d):
+        mixed = a.copy()
+        mixed[:, i] = b[:, i]
+        swapped.append(simulate(mixed, 0))
+    probe = min(batch, samples)
+    noisy = not np.array_equal(simulate(a[:probe], samples), f_a[:probe], equal_nan=True)
+    if noisy:
+        swapped.append(simulate(a, samples))
+        names = (*names, NOISE)
+    f_ab = np.stack(swapped, axis=1)
+    proper = np.isfinite(f_a) & np.isfinite(f_b)
+    variance = variance_of(np.concatenate([f_a, f_b]), problem)
+    first, total = _sobol_estimates(f_a, f_b, f_ab, proper)
+    generator = np.random.default_rng(seed)
+    again = []
+    for _ in range(RESAMPLES):
+        rows = generator.integers(samples, size=samples)
+        again.append(_sobol_estimates(f_a[rows], f_b[rows], f_ab[rows], proper[rows]))
+    low, high = np.nanpercentile(np.array(again), [2.5, 97.5], axis=0)
+    table = ranked(
+        names,
+        {
+            "first": first,
+            "first_low": low[0],
+            "first_high": high[0],
+            "total": total,
+            "total_low": low[1],
+            "total_high": high[1],
+            "pairs": np.sum(proper[:, None] & np.isfinite(f_ab), axis=0),
+        },
+        by="total",
+    )
+    return Sensitivity(
+        "Sobol indices", problem.name, table, simulate.done, simulate.dropped, variance
+    )
+
+
+def _sobol_estimates(
+    f_a: Float[np.ndarray, " n"],
+    f_b: Float[np.ndarray, " n"],
+    f_ab: Float[np.ndarray, "n d"],
+    proper: Bool[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    pairs = proper[:, None] & np.isfinite(f_ab)
+    count = np.maximum(pairs.sum(axis=0), 1)
+    both = np.concatenate([f_a[proper], f_b[proper]])
+    variance, mean = (np.var(both), np.mean(both)) if len(both) else (np.nan, 0.0)
+    variance = variance or np.nan
+    # Without the mean the products have less variance; the expectation is the same.
+    a, b = np.where(pairs, f_a[:, None] - mean, 0), np.where(pairs, f_b[:, None] - mean, 0)
+    ab = np.where(pairs, f_ab - mean, 0)
+    first = np.sum(b * (ab - a), axis=0) / count / variance
+    total = np.sum((a - ab) ** 2, axis=0) / (2 * count) / variance
+    return first, total

@@ -1,0 +1,273 @@
+"""How safe many policies are: an attack that may refute, and a certificate from fresh samples.
+
+certificates = certify(problem_of, policies, p=0.01)
+print(certificates)
+certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from verifai_jax.certification.allocation import Allocation, standing
+from verifai_jax.certification.attack import Seen, refute, usable_search
+from verifai_jax.certification.blocks import Pieces, Remember
+from verifai_jax.certification.result import Certificate, Certificates
+from verifai_jax.core.devices import enable_compile_cache
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.statistics.confidence_sequences import bounded, verdict
+
+LANES = 64
+"""Samples of a policy in one block."""
+SETTLED = 3.0
+"""Over `tie`: about as many samples as name a leader that never fails."""
+MOST_KEPT = 1000
+"""Counterexamples of a policy that are kept, the worst ones."""
+ROWS = 256
+"""Rows whose features are computed at a time, so that one shape compiles."""
+
+ProgressReport = Callable[[int, int, str], None]
+
+
+@suggests_options
+def certify(
+    problem_of: Callable[[Any], Problem],
+    policies: Sequence[Any],
+    *,
+    p: float = 0.01,
+    confidence: float = 0.95,
+    samples: int = 512,
+    seed: int = 0,
+    budget: int | None = None,
+    search: str | Search = "cross_entropy",
+    attack: int = 256,
+    tie: float | None = None,
+    remember: Remember | None = None,
+    progress: ProgressReport | None = None,
+    devices: Sequence[Any] | None = None,
+) -> Certificates:
+    """Attack all policies, then bound the failure probability of each from fresh samples.
+
+    **Arguments:**
+
+    - `problem_of`: a policy's `Problem`. JAX traces it with the policy's numbers as arguments, so
+      that policies of one structure share a program; where it cannot, each is compiled by itself.
+    - `policies`: `rl.Policy` objects, or other pytrees of numbers.
+    - `p`: the failure probability that a safe policy stays below.
+    - `confidence`: with which all intervals hold at once.
+    - `samples`: of each policy at least, rounded up to whole blocks of 64 (of fewer for fewer than
+      64 samples). For the name of the safest alone, 32 are enough.
+    - `seed`: of samples and search. The samples are the same for all policies, and from another
+      stream than a training with this seed.
+    - `budget`: samples of all policies together; four times the least number when left out. What
+      is beyond the least goes to policies whose verdict is open, and to the possibly safest.
+    - `search`, `attack`: what looks for failures first, and in how many simulations of each
+      policy, rounded up to blocks; 0 for no attack. What it finds is in no rate.
+    - `tie`: failure rates that differ by less count as equally safe. When left out, `p / 10` or
+      less: as fine as takes about as many samples again as all policies have at least.
+    - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
+      gives, or gave under this key.
+    - `progress(done, total, text)`: called with the simulations so far. `total` may not be reached.
+    - `devices`: JAX devices; all of this process when left out.
+
+    Ctrl-C returns what is known. The same seed gives the same certificates, bit for bit on one
+    machine, whatever the order of the policies, the number of devices or what a memo holds.
+
+    **Raises:** before anything compiles, `ValueError` for numbers out of range, a search that
+    cannot attack, or policies with different features; `ProblemError` and what the monitor raises
+    for a problem whose parts do not fit, such as a formula over a signal that is not there.
+    """
+    started = time.perf_counter()
+    policies = list(policies)
+    budget = _check(policies, p, confidence, samples, seed, budget, attack, tie)
+    lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
+    enable_compile_cache()  # Before the search compiles, too.
+    pieces = Pieces(
+        problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
+    )
+    attacker = usable_search(pieces.problem, search)
+    rounds = -(-attack // lanes)
+    if tie is None:
+        tie = min(p / 10, SETTLED / (len(policies) * samples))
+    allocation = Allocation(p, confidence, samples, budget, lanes, tie)
+    sampled = [Seen() for _ in policies]
+    attacked = [Seen() for _ in policies]
+    report = _Report(progress, len(policies) * rounds * lanes, budget)
+    stopped, margins = "decided", np.full(len(policies), np.nan)
+    try:
+        refute(pieces, attacked, attacker, rounds, report.attacked)
+        margins = np.array([one.least for one in attacked])
+        stopped = _sample(pieces, sampled, allocation, margins, report)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    rows = tuple(
+        _certificate(number, sampled[number], attacked[number], allocation, len(policies), pieces)
+        for number in range(len(policies))
+    )
+    known = all(row.simulations for row in rows)
+    now = standing(*_counts(sampled), tie, margins) if known else None
+    return Certificates(
+        rows=rows,
+        problem=pieces.problem.name,
+        p=p,
+        confidence=confidence,
+        safest=None if now is None else now.leader,
+        chance=None if now is None else now.chance,
+        tie=tie,
+        seed=seed,
+        samples=samples,
+        budget=budget,
+        stopped=stopped,
+        seconds=time.perf_counter() - started,
+        notes=pieces.notes,
+    )
+
+
+def _sample(
+    pieces: Pieces,
+    sampled: list[Seen],
+    allocation: Allocation,
+    margins: np.ndarray,
+    report: "_Report",
+) -> str:
+    """Simulate what the allocation asks for until it asks for nothing; says why it ended."""
+    while True:
+        failures, simulations = _counts(sampled)
+        blocks = allocation.next(failures, simulations, margins)
+        if not blocks.any():
+            break
+        undecided = int(allocation.undecided(failures, simulations).sum())
+        asked = [
+            (number, len(sampled[number].outcomes) + block)
+            for number in range(len(sampled))
+            for block in range(int(blocks[number]))
+        ]
+        for (number, block), outcome in pieces.certificate(asked):
+            sampled[number].add(pieces.points(block), outcome)
+            report.sampled(pieces.lanes, undecided)
+    open_ = allocation.undecided(failures, simulations).any()
+    named = standing(failures, simulations, allocation.tie, margins).chance >= allocation.sure
+    return "decided" if named and not open_ else "budget"
+
+
+def _counts(seen: list[Seen]) -> tuple[np.ndarray, np.ndarray]:
+    """Failures of each policy, those without a verdict included, and simulations."""
+    failures = np.array([one.failures + one.not_finite for one in seen])
+    return failures, np.array([one.simulations for one in seen])
+
+
+def _certificate(
+    number: int, sampled: Seen, attacked: Seen, allocation: Allocation, among: int, pieces: Pieces
+) -> Certificate:
+    rate = None
+    if sampled.simulations:
+        failing = sampled.failures + sampled.not_finite
+        rate = bounded(failing, sampled.simulations, allocation.confidence, among)
+    worst, features, counterexamples = _met(pieces.space, (sampled, attacked))
+    return Certificate(
+        number=number,
+        failures=sampled.failures,
+        simulations=sampled.simulations,
+        not_finite=sampled.not_finite,
+        rate=rate,
+        verdict=verdict(rate, allocation.p),
+        attacks=attacked.simulations,
+        attack_failures=attacked.failures,
+        worst_robustness=worst,
+        worst_features=features,
+        counterexamples=counterexamples,
+    )
+
+
+def _met(space: FeatureSpace, both: Sequence[Seen]) -> tuple[float, Any, dict[str, np.ndarray]]:
+    """The least robustness, the features where it was met, and the worst failing rows."""
+    points = [u for seen in both for u in seen.points]
+    if not points:
+        return float("nan"), None, {}
+    u = np.concatenate(points)
+    outcomes = [outcome for seen in both for outcome in seen.outcomes]
+    rho = np.concatenate([outcome.rho for outcome in outcomes])
+    failing = np.concatenate([outcome.failing for outcome in outcomes])
+    order = np.argsort(rho, kind="stable")  # NaN come last.
+    kept = order[failing[order]][:MOST_KEPT]
+    shown = np.concatenate([order[:1], kept])
+    columns = _columns(space, u[shown])
+    found = {name: values[1:] for name, values in columns.items()} | {"rho": rho[kept]}
+    least = float(rho[order[0]])
+    if np.isnan(least):
+        return least, None, found
+    return least, {name: values[0] for name, values in columns.items()}, found
+
+
+def _columns(space: FeatureSpace, u: np.ndarray) -> dict[str, np.ndarray]:
+    """The table columns of these points."""
+    parts = []
+    for start in range(0, len(u), ROWS):
+        part = u[start : start + ROWS]
+        whole = np.pad(part, ((0, ROWS - len(part)), (0, 0)), mode="edge")
+        features = jax.device_get(_features(space)(whole))
+        parts.append({name: col[: len(part)] for name, col in space.rows(features).items()})
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _features(space: FeatureSpace) -> Any:
+    if "features" not in space.__dict__:
+        space.__dict__["features"] = jax.jit(jax.vmap(space.unflatten))
+    return space.__dict__["features"]
+
+
+class _Report:
+    """Tells the progress."""
+
+    def __init__(self, progress: ProgressReport | None, attacks: int, budget: int) -> None:
+        self._progress, self._total, self._done = progress, attacks + budget, 0
+
+    def attacked(self, simulations: int) -> None:
+        self._tell(simulations, "attacking")
+
+    def sampled(self, simulations: int, undecided: int) -> None:
+        self._tell(simulations, f"sampling, {undecided} undecided")
+
+    def _tell(self, simulations: int, text: str) -> None:
+        self._done += simulations
+        if self._progress is not None:
+            self._progress(self._done, self._total, text)
+
+
+def _check(
+    policies: list[Any],
+    p: float,
+    confidence: float,
+    samples: int,
+    seed: int,
+    budget: int | None,
+    attack: int,
+    tie: float | None,
+) -> int:
+    """Refuse what makes no sense; returns the budget."""
+    if not policies:
+        raise ValueError("there is no policy to certify")
+    for name, value in (("p", p), ("confidence", confidence)):
+        if not 0 < value < 1:
+            raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
+    for name, value, least in (("samples", samples, 1), ("seed", seed, 0), ("attack", attack, 0)):
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        if not whole or value < least:
+            raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")
+    if tie is not None and not 0 <= tie < 1:
+        raise ValueError(f"tie must lie between 0 and 1; got {tie!r}")
+    least = len(policies) * samples
+    if budget is None:
+        return 4 * least
+    if budget < least:
+        raise ValueError(
+            f"{len(policies)} policies with {samples} samples each need a budget of at least "
+            f"{least}; got {budget!r}"
+        )
+    return budget

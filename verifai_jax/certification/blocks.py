@@ -1,0 +1,298 @@
+"""Blocks of simulations by name: computed together, remembered one by one.
+
+    pieces = Pieces(problem_of, policies, seed=0, lanes=64, remember=store.remember)
+    for (policy, block), outcome in pieces.certificate([(0, 0), (0, 1), (5, 0)]):
+        ...
+
+A piece is one policy in one block of samples. Its name holds all that its numbers depend on, so
+whatever is asked for, in whatever order, a memo gives what a simulation would.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.certification.policy_groups import digest, families
+from verifai_jax.certification.simulators import (
+    Alone,
+    Outcome,
+    Simulator,
+    problem_with,
+    traced,
+)
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem, ProblemError
+from verifai_jax.search.uniform import uniform_points
+
+Arrays = Mapping[str, np.ndarray]
+Remember = Callable[[str, Callable[[], dict[str, np.ndarray]]], Arrays]
+
+STREAM = 0x5AFE
+"""Sets the random numbers of a certificate apart from those of a training with the same seed."""
+DRAWN = 4096
+"""Samples drawn from the prior at a time."""
+MOST_BARREN = 1000
+"""Such draws in a row without one that the constraint accepts, after which it is given up."""
+
+
+def just_compute(key: str, compute: Callable[[], dict[str, np.ndarray]]) -> Arrays:
+    """The memo that remembers nothing."""
+    return compute()
+
+
+class Asked(NamedTuple):
+    """One piece: a policy by its number, points `[m, d]` with `m <= lanes`, and its name.
+
+    - `first`: number of its first sample, which the random keys come from.
+    """
+
+    policy: int
+    points: Float[np.ndarray, "m d"]
+    first: int
+    name: str
+
+
+class Pieces:
+    """See the module's docstring. `simulated` counts blocks that were not remembered.
+
+    **Arguments:**
+
+    - `problem_of`: a policy's problem; JAX traces it where it can.
+    - `policies`: any pytrees of numbers, or other objects, which are then simulated one by one.
+    - `seed`: of the samples and of the random keys of simulations.
+    - `lanes`: samples in a block.
+    - `devices`: JAX devices to use; all of this process when left out.
+
+    **Raises:** `ProblemError` as `Problem.check` does, naming the policy, before anything compiles;
+    `ValueError` for policies whose problems have other features than the first.
+    """
+
+    def __init__(
+        self,
+        problem_of: Callable[[Any], Problem],
+        policies: Sequence[Any],
+        *,
+        seed: int,
+        lanes: int,
+        remember: Remember | None = None,
+        devices: Sequence[Any] | None = None,
+    ) -> None:
+        self.lanes = lanes
+        self._notes: list[str] = []
+        self.simulated = 0
+        self._remember = just_compute if remember is None else remember
+        self._simulators: list[tuple[Simulator, dict[int, int]]] = []
+        self._owner: dict[int, int] = {}
+        first: Problem | None = None
+        plans = []
+        for family in families(policies):
+            numbers, together = family.numbers, family.traced
+            problem = _checked(problem_of, policies[numbers[0]], numbers[0])
+            first = problem if first is None else first
+            _check_same(first, problem, numbers[0])
+            problems = [problem]
+            if together and not problem.black_box:
+                together = self._traceable(problem_of, family.weights[0], numbers)
+            if not together or problem.black_box:
+                others = [_checked(problem_of, policies[n], n) for n in numbers[1:]]
+                for number, other in zip(numbers[1:], others, strict=True):
+                    _check_same(first, other, number)
+                plans.append((numbers, None, [problem, *others]))
+            else:
+                plans.append((numbers, family, problems))
+        if first is None:
+            raise ValueError("there is no policy to certify")
+        self.problem, self.space = first, first.space
+        for numbers, family, problems in plans:
+            simulator: Simulator = (
+                Alone(problems, lanes)
+                if family is None
+                else traced(problem_of, family, lanes, self.space.dim, devices)
+            )
+            for number in numbers:
+                self._owner[number] = len(self._simulators)
+            places = {number: place for place, number in enumerate(numbers)}
+            self._simulators.append((simulator, places))
+        root = jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), STREAM)
+        self.attack_key, points_key, self._simulation_key, self._attacked_key = jax.random.split(
+            root, 4
+        )
+        self._samples = _Samples(self.space, points_key)
+        self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
+        self._about = _about(first, seed, lanes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was decided, or went wrong, and would surprise."""
+        notes = list(self._notes)
+        for simulator, places in self._simulators:
+            if isinstance(simulator, Alone):
+                told = simulator.messages
+                notes += [
+                    f"a simulation of policy {number} raised {told[place]}"
+                    for number, place in places.items()
+                    if place in told
+                ]
+        return tuple(notes)
+
+    def certificate(
+        self, asked: Sequence[tuple[int, int]]
+    ) -> Iterator[tuple[tuple[int, int], Outcome]]:
+        """Outcomes of `(policy, block)` pairs: fresh samples of the prior, the same for all."""
+        pieces = []
+        for policy, block in asked:
+            first = block * self.lanes
+            points = self.points(block)
+            name = f"{self._about}/sample/{self._digests[policy]}/{block}"
+            pieces.append(Asked(policy, points, first, name))
+        for i, outcome in self._outcomes(pieces, self._simulation_key):
+            yield asked[i], outcome
+
+    def attack(
+        self, asked: Sequence[tuple[int, np.ndarray]], round_: int, search: str
+    ) -> Iterator[tuple[int, Outcome]]:
+        """Outcomes of points that a search chose for each policy; yields places in `asked`."""
+        pieces = [
+            Asked(
+                policy, points, round_ * self.lanes,
+                f"{self._about}/attack/{search}/{self._digests[policy]}/{round_}",
+            )
+            for policy, points in asked
+        ]  # fmt: skip
+        yield from self._outcomes(pieces, self._attacked_key)
+
+    def points(self, block: int) -> Float[np.ndarray, "lanes d"]:
+        """The samples of one block of the held-out stream, which all policies share."""
+        return self._samples(block * self.lanes, self.lanes)
+
+    def _outcomes(self, pieces: list[Asked], key: Any) -> Iterator[tuple[int, Outcome]]:
+        # Those of one program after another.
+        order = sorted(range(len(pieces)), key=lambda i: self._owner[pieces[i].policy])
+        ready: dict[int, Outcome] = {}
+        for place, i in enumerate(order):
+            piece = pieces[i]
+
+            def compute(place: int = place, i: int = i) -> dict[str, np.ndarray]:
+                if i not in ready:
+                    owner = self._owner[pieces[i].policy]
+                    simulator, _ = self._simulators[owner]
+                    most = simulator.together()
+                    some = [
+                        j
+                        for j in order[place : place + most]
+                        if self._owner[pieces[j].policy] == owner and j not in ready
+                    ]
+                    found = self._simulate(owner, [pieces[j] for j in some], key)
+                    ready.update(zip(some, found, strict=True))
+                return ready.pop(i)._asdict()
+
+            known = self._remember(piece.name, compute)
+            count = len(piece.points)
+            outcome = Outcome(
+                np.asarray(known["rho"], np.float32)[:count],
+                np.asarray(known["failing"], bool)[:count],
+                np.asarray(known["proper"], bool)[:count],
+            )
+            yield i, outcome
+
+    def _simulate(self, owner: int, pieces: list[Asked], key: Any) -> list[Outcome]:
+        simulator, places = self._simulators[owner]
+        self.simulated += len(pieces)
+        u = np.stack([_filled(piece.points, self.lanes) for piece in pieces])
+        members = [places[piece.policy] for piece in pieces]
+        first = np.array([piece.first for piece in pieces], np.int32)
+        return simulator(members, u, first, key)
+
+    def _traceable(self, problem_of: Any, policy: Any, numbers: tuple[int, ...]) -> bool:
+        """Whether the problem can be made of weights that JAX traces; abstract evaluation."""
+
+        def simulated(policy: Any, u: Any, key: Any) -> Any:
+            problem = problem_with(problem_of, policy)
+            return problem.system(problem.space.unflatten(u), key).signals
+
+        try:
+            with jax.ensure_compile_time_eval():
+                dim = problem_of(policy).space.dim
+            u = jax.ShapeDtypeStruct((dim,), np.float32)
+            jax.eval_shape(simulated, policy, u, jax.eval_shape(lambda: jax.random.key(0)))
+        except Exception as error:
+            # With the numbers themselves it worked.
+            told = str(error).strip().split("\n")[0]
+            self._notes.append(
+                f"compiled one by one: {_listed(numbers)}; JAX could not trace problem_of in the "
+                f"policy's numbers ({type(error).__name__}: {told[:120]})"
+            )
+            return False
+        return True
+
+
+class _Samples:
+    """The sequence of independent samples of the prior that the constraint accepts."""
+
+    def __init__(self, space: FeatureSpace, key: Any) -> None:
+        self._space, self._drawn = space, 0
+        self._points = np.zeros((0, space.dim), np.float32)
+        self._draw = jax.jit(lambda index: uniform_points(key, index, space.dim))
+
+    def __call__(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
+        barren = 0
+        while len(self._points) < first + count:
+            u = np.asarray(self._draw(self._drawn + np.arange(DRAWN, dtype=np.uint32)))
+            self._drawn += DRAWN
+            if self._space.where is not None:
+                u = u[self.accepted(u)]
+            barren = 0 if len(u) else barren + 1
+            if barren >= MOST_BARREN:
+                raise ValueError(
+                    f"where accepted none of {MOST_BARREN * DRAWN:,} samples of the space in a row"
+                )
+            self._points = np.concatenate([self._points, u])
+        return self._points[first : first + count]
+
+    def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+        return np.asarray(self._space.accepts_points(u))
+
+
+def _checked(problem_of: Callable[[Any], Problem], policy: Any, number: int) -> Problem:
+    """The problem of one policy, refused before anything compiles if its parts do not fit."""
+    problem = problem_with(problem_of, policy)
+    try:
+        problem.check()
+    except Exception as error:
+        error.add_note(f"while checking the problem of policy {number}")
+        raise
+    return problem
+
+
+def _check_same(first: Problem, problem: Problem, number: int) -> None:
+    same = (
+        problem.space.root == first.space.root
+        and (problem.space.where is None) == (first.space.where is None)
+        and {k: str(f) for k, f in problem.formulas.items()}
+        == {k: str(f) for k, f in first.formulas.items()}
+    )
+    if not same:
+        raise ProblemError(
+            "problem_of must give every policy the same features and formulas, or their rates do "
+            f"not compare; those of policy {number} differ:\n{problem}\nFirst:\n{first}"
+        )
+
+
+def _about(problem: Problem, seed: int, lanes: int) -> str:
+    """A hash of what all pieces depend on but the policy and the samples; code is not in it."""
+    told = [problem.name, str(dict(problem.formulas)), problem.end, str(problem.space.columns)]
+    told += [str(problem.space.levels), str(seed), str(lanes), "float32"]
+    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
+
+
+def _filled(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "lanes d"]:
+    return np.pad(points, ((0, lanes - len(points)), (0, 0)), mode="edge")
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")
+    return f"{'policy' if len(numbers) == 1 else 'policies'} {shown}"

@@ -1,0 +1,174 @@
+"""What this machine offers: versions, devices, cores, compile cache, rendering.
+
+>>> print(report())
+verifai_jax 0.1.0
+...
+"""
+
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from verifai_jax._version import __version__
+from verifai_jax.core.cores import available_cores
+from verifai_jax.core.devices import cache_folder
+
+PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
+EXTRAS = {
+    "mujoco": "mujoco",
+    "mujoco-mjx": "mujoco",
+    "brax": "brax",
+    "gymnax": "gymnax",
+    "gymnasium": "gymnasium",
+}
+"""Optional package -> the extra of verifai_jax that installs it."""
+
+
+class BadPair(NamedTuple):
+    """Versions that are known not to work together: `[least, below)` of each, None for no bound."""
+
+    package: str
+    versions: tuple[str | None, str | None]
+    other: str
+    others: tuple[str | None, str | None]
+    what: str
+
+
+BAD_PAIRS = (
+    BadPair(
+        "brax",
+        (None, "0.15"),
+        "mujoco",
+        ("4.0", None),
+        "its swimmer does not work on any backend; the other environments do",
+    ),
+    BadPair(
+        "gymnax",
+        (None, "1.0"),
+        "jax",
+        ("0.5", None),
+        "pip fell back to an old gymnax, whose step returns other values; "
+        "pip install 'gymnax>=1.0.1'",
+    ),
+    BadPair(
+        "gymnax",
+        ("1.0", "1.1"),
+        "jax",
+        ("0.12", None),
+        "gymnax asks for jax below 0.12: environments may not import; use Python 3.11 with "
+        "jax 0.10",
+    ),
+)
+
+
+def report() -> str:
+    """Versions, devices and settings, one a line, with advice where something costs speed."""
+    import jax
+
+    lines = [
+        f"verifai_jax {__version__}",
+        f"Python      {platform.python_version()} on {platform.system()} {platform.machine()}",
+    ]
+    for package in PACKAGES:
+        version = _version(package) or "missing: pip install verifai_jax installs it"
+        lines.append(f"{package:<12}{version}")
+    installed = {package: _version(package) for package in (*PACKAGES, *EXTRAS)}
+    for package, extra in EXTRAS.items():
+        missing = f"not installed: pip install 'verifai_jax[{extra}]'"
+        lines.append(f"{package:<12}{installed[package] or missing}")
+    lines += [f"  advice: {told}" for told in bad_pairs(installed)]
+    devices = jax.devices()
+    lines.append(f"devices     {len(devices)} x {devices[0].platform}")
+    cores = available_cores()
+    lines.append(f"cores       {cores} usable")
+    if devices[0].platform == "cpu" and len(devices) < cores:
+        lines.append(
+            f"  advice: only {len(devices)} of {cores} cores are used. JAX started before "
+            "verifai_jax was imported, or VERIFAI_JAX_CORES says so; import verifai_jax first"
+        )
+    lines.append(f"cache       {_cache_state()}")
+    if installed["mujoco"]:
+        lines.append(f"rendering   {_rendering()}")
+    return "\n".join(lines)
+
+
+def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
+    """What is known to go wrong between these versions."""
+    return [
+        f"{pair.package} {installed[pair.package]} with {pair.other} {installed[pair.other]}: "
+        f"{pair.what}"
+        for pair in BAD_PAIRS
+        if _within(installed.get(pair.package), *pair.versions)
+        and _within(installed.get(pair.other), *pair.others)
+    ]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _within(version: str | None, least: str | None, below: str | None) -> bool:
+    if version is None:
+        return False
+    number = _number(version)
+    return (least is None or number >= _number(least)) and (
+        below is None or number < _number(below)
+    )
+
+
+def _number(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
+
+
+RENDER = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+with mujoco.Renderer(model, 8, 8) as renderer:
+    renderer.update_scene(mujoco.MjData(model))
+    renderer.render()
+"""
+
+
+def _rendering() -> str:
+    # In a process of its own: a graphics library that fails may take the process with it.
+    wanted = os.environ.get("MUJOCO_GL", "egl")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", RENDER],
+            env={**os.environ, "MUJOCO_GL": wanted},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    except subprocess.TimeoutExpired:
+        return f"MUJOCO_GL={wanted} does not answer; MuJoCo scenes are not drawn"
+    if done.returncode == 0:
+        return f"MuJoCo scenes without a screen (MUJOCO_GL={wanted})"
+    last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    return (
+        f"no MuJoCo scenes with MUJOCO_GL={wanted} ({last[:100]}); install libEGL (Mesa), or try "
+        "MUJOCO_GL=osmesa"
+    )
+
+
+def _cache_state() -> str:
+    folder = cache_folder()
+    if folder is None:
+        return "off (VERIFAI_JAX_CACHE); every process compiles anew"
+    existing = next((p for p in (folder, *folder.parents) if p.exists()), folder)
+    if not os.access(existing, os.W_OK):
+        return (
+            f"{folder} cannot be written, so every process compiles anew; "
+            "set VERIFAI_JAX_CACHE to a folder that can"
+        )
+    files = [path for path in folder.glob("*") if path.is_file()]
+    size = sum(path.stat().st_size for path in files) / 1e6
+    return f"{folder} ({len(files)} files, {size:.1f} MB); VERIFAI_JAX_CACHE=off switches it off"

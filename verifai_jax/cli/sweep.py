@@ -1,0 +1,192 @@
+"""`verifai-jax sweep specs/mountain_car.py:safe_training --configurations 32`."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from verifai_jax.cli.arguments import plain_values
+
+_FIXED = (
+    "search",
+    "seed",
+    "samples",
+    "confidence",
+    "budget",
+    "attack",
+    "attacker",
+    "reduction",
+    "by",
+    "only",
+)
+_SHOWN = 12
+"""Rows of the table that are printed."""
+
+
+@click.command()
+@click.argument("target", required=False)
+@click.option("--configurations", type=int, help="How many, at most  [default: 32]")
+@click.option("--search", help="Of the hyper-parameters: a name, or optuna:tpe  [default: halton]")
+@click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
+@click.option("--seed", type=int, help="Of the search and the samples  [default: 0]")
+@click.option("--samples", type=int, help="Simulations of a policy at most  [default: 512]")
+@click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
+@click.option("--budget", type=int, help="Simulations of the certification in all.")
+@click.option("--attack", type=int, help="Simulations of each policy's attack  [default: 256]")
+@click.option("--attacker", help="Search that attacks  [default: cross_entropy]")
+@click.option("--halving", "reduction", type=float, help="Of so many configurations one goes on.")
+@click.option("--halving-by", "by", help="return or safety  [default: return]")
+@click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
+@click.option(
+    "--at", "nominal", multiple=True, metavar="NAME=VALUE", help="Where --only holds the others."
+)
+@click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
+@click.option("--store", type=click.Path(path_type=Path), help="Remembers work [in the folder].")
+@click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to go on with.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder [sweeps/NAME-1, -2, ...].")
+@click.option("--pictures/--no-pictures", default=True, help="Draw a picture into the folder.")
+def sweep(
+    target: str | None,
+    configurations: int | None,
+    options: tuple[str, ...],
+    nominal: tuple[str, ...],
+    max_seconds: float | None,
+    store: Path | None,
+    resume: Path | None,
+    out: Path | None,
+    pictures: bool,
+    **asked: Any,
+) -> None:
+    """Train configurations of the study TARGET (specs/FILE.py:NAME), certify what they learn."""
+    from verifai_jax.core.targets import load_study
+    from verifai_jax.sweeps._sweep import sweep as run_sweep
+
+    if resume is not None:
+        fixed = {f"--{name.replace('_', '-')}": asked[name] for name in _FIXED}
+        fixed |= {"--set": options or None, "--at": nominal or None, "--out": out}
+        for option, value in fixed.items():
+            if value is not None:
+                option = {"--reduction": "--halving", "--by": "--halving-by"}.get(option, option)
+                raise click.UsageError(f"{option} is fixed in the sweep that --resume goes on with")
+        out, store = resume, resume if store is None else store
+        before = _before(store)
+        target = target or _own(before["target"], resume)
+        asked, configurations = before["asked"], configurations or before["configurations"]
+        options, nominal = tuple(before["options"]), tuple(before["nominal"])
+    if target is None:
+        raise click.UsageError("Missing argument 'TARGET', such as specs/mountain_car.py:NAME.")
+    configurations = 32 if configurations is None else configurations
+    study = load_study(target)
+    if asked["only"] is not None:
+        names = [name.strip() for name in asked["only"].split(",")]
+        study = study.only(*names, nominal=plain_values("--at", nominal))
+    folder = out or _next_folder(study.name)
+    how = _understood(asked, options)
+    memory = folder if store is None else store
+    # What a later --resume needs to know.
+    note = {
+        "target": target,
+        "configurations": configurations,
+        "asked": asked,
+        "options": list(options),
+        "nominal": list(nominal),
+    }
+    found = run_sweep(
+        study,
+        configurations=configurations,
+        store=memory,
+        max_seconds=max_seconds,
+        note=note,
+        **how,
+    )
+    record = replace(found.record, options={**found.record.options, "target": target})
+    found = replace(found, record=record)
+    click.echo(str(found))
+    if len(found.table):
+        click.echo(_told(found))
+    found.save(folder)
+    click.echo(f"  table        {folder / 'table.parquet'}")
+    if pictures and record.certified:
+        picture = folder / "sweep.png"
+        found.plot(picture)
+        click.echo(f"  picture      {picture}")
+    if not record.complete:
+        click.echo(f"  go on        verifai-jax sweep --resume {folder}")
+
+
+def _understood(asked: dict[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
+    """Keywords of the sweep."""
+    from verifai_jax.search import named
+    from verifai_jax.sweeps.halving import Halving
+
+    how = {
+        name: asked[name]
+        for name in ("seed", "samples", "confidence", "budget", "attack", "attacker")
+        if asked[name] is not None
+    }
+    search, given = asked["search"] or "halton", plain_values("--set", options)
+    if search.startswith("optuna:"):
+        from verifai_jax.sweeps.optuna import OptunaSampler
+
+        how["search"] = OptunaSampler(search.removeprefix("optuna:"), given)
+    else:
+        how["search"] = named(search, **given)
+    if asked["reduction"] is not None:
+        how["halving"] = Halving(asked["reduction"], asked["by"] or "return")
+    elif asked["by"] is not None:
+        raise click.UsageError("--halving-by goes with --halving")
+    return how
+
+
+def _before(store: Path) -> dict[str, Any]:
+    """What the sweep was asked for that a store remembers."""
+    from verifai_jax.sweeps.cache import Store, StoreError, store_file
+
+    if not store_file(store).exists():
+        raise FileNotFoundError(f"no sweep to go on with in {store}")
+    with Store(store) as kept:
+        note = kept.note("command")
+    if note is None:
+        raise StoreError(f"{store} is not of this command; call sweep(..., store=...) again")
+    return note
+
+
+def _own(target: str, folder: Path) -> str:
+    """The target if it is a file of the user's own project.
+
+    Loading a target runs its file; a folder that came from elsewhere must not choose one.
+    """
+    here = Path.cwd().resolve()
+    if ".py" in target:
+        file = (here / target.rpartition(":")[0]).resolve()
+        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
+            return target
+    raise ValueError(
+        f"{folder} does not say which study of this project it is of; "
+        "give it: specs/FILE.py:NAME --resume ..."
+    )
+
+
+def _told(found: Any) -> str:
+    """The first rows, the ones to choose first, as text."""
+    from verifai_jax.sweeps.ranking import chosen_first
+
+    table = found.table
+    order = list(chosen_first(table))
+    order += [i for i in range(len(table)) if i not in set(order)]
+    names = [n for n in found.hyperparameters if n in table and n != "steps"]
+    columns = ["steps", *names, "nominal_return", "failures", "simulations", "failure_high"]
+    some = table.iloc[order[:_SHOWN]][[*columns, "worst_robustness", "verdict", "status"]]
+    if (some["status"] == "trained").all():
+        some = some.drop(columns="status")
+    text = some.to_string(float_format=lambda value: f"{value:.4g}", max_colwidth=40)
+    left = len(table) - len(some)
+    return text if not left else f"{text}\n  and {left} more in the table"
+
+
+def _next_folder(name: str) -> Path:
+    number = 1
+    while (folder := Path("sweeps") / f"{name}-{number}").exists():
+        number += 1
+    return folder

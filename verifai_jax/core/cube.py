@@ -1,0 +1,124 @@
+"""The unit cube, as searches see a feature space: for each coordinate its cells and its name."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+@dataclass(frozen=True)
+class Cube:
+    """The unit cube `[0, 1]^d` with the prior uniform on it.
+
+    **Arguments:** for each coordinate
+
+    - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
+      mean the same.
+    - `weights`: the probabilities of its cells, which are their widths; None where they are equal.
+    - `ordered`: whether its cells have an order; all of them when left out.
+    - `names`: what it is called, such as `cars[0].x`; nothing when left out.
+
+    and `lengths`: which coordinates are lengths of arrays, on which others depend; `signals`: the
+    coordinates of each function of time, in the order of its control points.
+
+    **Raises:** `ValueError` for a negative level, or entries that do not go with the levels.
+    """
+
+    levels: tuple[int, ...]
+    weights: tuple[tuple[float, ...] | None, ...] = ()
+    ordered: tuple[bool, ...] = ()
+    names: tuple[str, ...] = ()
+    lengths: tuple[int, ...] = ()
+    signals: tuple[tuple[int, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", tuple(int(level) for level in self.levels))
+        if any(level < 0 for level in self.levels):
+            raise ValueError(f"levels must not be negative; got {self.levels}")
+        for name, default in (("weights", None), ("ordered", True), ("names", "")):
+            given = tuple(getattr(self, name)) or (default,) * self.dim
+            if len(given) != self.dim:
+                raise ValueError(f"{name} must have {self.dim} entries, as levels; got {given}")
+            object.__setattr__(self, name, given)
+        for level, weights in zip(self.levels, self.weights, strict=True):
+            if weights is not None and not (
+                len(weights) == level
+                and all(weight > 0 for weight in weights)
+                and abs(math.fsum(weights) - 1) < 1e-6
+            ):
+                raise ValueError(
+                    f"{level} cells need {level} positive weights that sum to one; got {weights}"
+                )
+        if not all(0 <= i < self.dim and self.levels[i] for i in self.lengths):
+            raise ValueError(f"lengths must be discrete coordinates; got {self.lengths}")
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates."""
+        return len(self.levels)
+
+    @cached_property
+    def continuous(self) -> Int[np.ndarray, " c"]:
+        """Indices of the continuous coordinates."""
+        return np.flatnonzero(np.array(self.levels, np.int64) == 0)
+
+    @cached_property
+    def discrete(self) -> Int[np.ndarray, " k"]:
+        """Indices of the discrete coordinates."""
+        return np.flatnonzero(np.array(self.levels, np.int64) > 0)
+
+    @cached_property
+    def probabilities(self) -> tuple[Float[np.ndarray, " cells"], ...]:
+        """The prior of the cells, for each discrete coordinate."""
+        return tuple(
+            np.full(self.levels[i], 1 / self.levels[i])
+            if self.weights[i] is None
+            else np.array(self.weights[i], np.float64)
+            for i in self.discrete
+        )
+
+    def take(self, places: tuple[int, ...]) -> "Cube":
+        """The cube of these coordinates alone."""
+        return Cube(
+            levels=tuple(self.levels[i] for i in places),
+            weights=tuple(self.weights[i] for i in places),
+            ordered=tuple(self.ordered[i] for i in places),
+            names=tuple(self.names[i] for i in places),
+            lengths=tuple(j for j, i in enumerate(places) if i in self.lengths),
+            signals=tuple(
+                tuple(places.index(i) for i in signal)
+                for signal in self.signals
+                if set(signal) <= set(places)
+            ),
+        )
+
+    def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
+        """Which cell holds each discrete coordinate of these points."""
+        points = jnp.asarray(u)[..., self.discrete]
+        counts = np.array([self.levels[i] for i in self.discrete], np.int32)
+        found = jnp.clip((points * counts).astype(jnp.int32), 0, counts - 1)
+        for j, edges in self._edges:
+            place = jnp.searchsorted(edges[1:-1], points[..., j], side="right")
+            found = found.at[..., j].set(place.astype(jnp.int32))
+        return found
+
+    def centres(self, cells: Int[Array, "*n k"]) -> Float[Array, "*n k"]:
+        """The middles of these cells, as coordinates."""
+        counts = np.array([self.levels[i] for i in self.discrete], np.float32)
+        middles = ((jnp.asarray(cells) + 0.5) / counts).astype(jnp.float32)
+        for j, edges in self._edges:
+            centre = (edges[1:] + edges[:-1]) / 2
+            middles = middles.at[..., j].set(jnp.asarray(centre)[cells[..., j]])
+        return middles
+
+    @cached_property
+    def _edges(self) -> tuple[tuple[int, Float[np.ndarray, " edges"]], ...]:
+        """Where the unequal cells begin and end, by place among the discrete coordinates."""
+        return tuple(
+            (j, np.concatenate([[0], np.cumsum(self.probabilities[j])]).astype(np.float32))
+            for j, i in enumerate(self.discrete)
+            if self.weights[i] is not None
+        )

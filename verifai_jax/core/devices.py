@@ -1,0 +1,79 @@
+"""The machine: work spread over devices, and a compile cache that outlives the process.
+
+XLA runs the small loop bodies of a rollout on one thread. Splitting the batch over one host
+device per core (`core.cores`) is what keeps all cores busy.
+
+Environment variables: `VERIFAI_JAX_CORES` (how many cores to use), `VERIFAI_JAX_CACHE` (a folder
+for compiled programs, or `off`).
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+
+def spread_over_devices(
+    function: Callable[..., Any], split: Sequence[bool], devices: Sequence[Any] | None = None
+) -> Callable[..., Any]:
+    """Split the leading axis of some arguments, and of all results, over devices.
+
+    **Arguments:**
+
+    - `function`: of arrays whose leading axes are a device's share.
+    - `split`: for each argument whether its leading axis is split; the others are given whole.
+    - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
+      their number.
+
+    **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself where
+    there is one device.
+    """
+    devices = jax.local_devices() if devices is None else devices
+    if len(devices) == 1:
+        return function
+    part, whole = PartitionSpec("row"), PartitionSpec()
+    return jax.shard_map(
+        function,
+        mesh=Mesh(np.array(devices), ("row",)),
+        in_specs=tuple(part if each else whole for each in split),
+        out_specs=part,
+        # A user's scan need not say that its carry differs between devices.
+        check_vma=False,
+    )
+
+
+def _setting(name: str) -> Any:
+    return getattr(jax.config, name)
+
+
+def cache_folder() -> Path | None:
+    """Folder of the persistent compile cache; None when it is switched off."""
+    setting = os.environ.get("VERIFAI_JAX_CACHE", "").strip()
+    if setting.lower() in ("off", "0", "no", "false"):
+        return None
+    if setting:
+        return Path(setting).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "verifai_jax" / "compiled"
+
+
+def enable_compile_cache() -> None:
+    """Keep compiled programs on disk, unless the user has configured JAX's cache already."""
+    folder = cache_folder()
+    if folder is None or _setting("jax_compilation_cache_dir") is not None:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # A read-only home costs compile time, not results; `doctor` reports it.
+    from jax.experimental.compilation_cache import compilation_cache
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    # JAX decides once whether it has a cache; anything compiled before now said no.
+    compilation_cache.reset_cache()

@@ -1,0 +1,72 @@
+"""Errors that say what was wrong and what to do about it.
+
+>>> raise unknown_name("search", "halten", ["uniform", "halton"])
+UnknownNameError: unknown search 'halten'; did you mean 'halton'? Known: uniform, halton.
+"""
+
+import difflib
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class UnknownNameError(ValueError):
+    """A name that does not exist, with the nearest ones that do."""
+
+
+def nearest_names(name: object, known: Iterable[str]) -> str:
+    """Write the known names nearest to `name` as a question; empty where none is near."""
+    near = difflib.get_close_matches(str(name), list(known), n=2, cutoff=0.5)
+    return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownNameError:
+    """The error to raise for `name`, which is none of the `known` names of this `kind`."""
+    known = [str(k) for k in known]
+    hint = nearest_names(name, known) or "."
+    listing = f" Known: {', '.join(known)}." if known else f" There is no {kind} at all."
+    return UnknownNameError(f"unknown {kind} {name!r}{hint}{listing}")
+
+
+def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `UnknownNameError` for the first of `names` that is not `known`."""
+    known = list(known)
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known)
+
+
+def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords."""
+    known = list(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def checked(*arguments: P.args, **options: P.kwargs) -> R:
+        check_names(f"option of {function.__name__}", options, known)
+        return function(*arguments, **options)
+
+    return checked
+
+
+class MissingExtra(ImportError):
+    """An optional package that is not installed, with the command that installs it."""
+
+
+def require(module: str, extra: str) -> Any:
+    """Import an optional `module`, which the `extra` of verifai_jax installs.
+
+    **Raises:** `MissingExtra`, one line with the pip command.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        # A package that is there but lacks one of its own is missing all the same.
+        lacks = "is" if error.name == module else f"needs {error.name}, which is"
+        raise MissingExtra(
+            f"{module} {lacks} not installed: pip install 'verifai_jax[{extra}]'"
+        ) from error

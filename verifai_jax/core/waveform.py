@@ -1,0 +1,111 @@
+"""A function of time by its control points: what a `Signal` feature gives to a rollout.
+
+wind = Waveform(knots, hold="linear", duration=4.0)
+wind(time)                                                   # in seconds; traced or concrete
+features["wind"].over(4.0)(time)                             # where no duration was given
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.core.errors import unknown_name
+
+HOLDS = ("linear", "constant")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Waveform:
+    """Control points at equal distances, joined by lines or held until the next.
+
+    **Arguments:**
+
+    - `knots`: `[knots, ...]`. With `"linear"` the first is the value at time 0 and the last that
+      at the end; with `"constant"` each is held for an equal part of the duration, its beginning
+      included.
+    - `duration`: in seconds; None until `over` sets it. Before 0 and behind the end the first and
+      the last value hold.
+    """
+
+    knots: Float[Array, "knots *shape"]
+    hold: str = field(default="linear", metadata={"static": True})
+    duration: float | None = field(default=None, metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        if self.hold not in HOLDS:
+            raise unknown_name("hold", self.hold, HOLDS)
+
+    def over(self, duration: float) -> "Waveform":
+        """The same control points over so many seconds.
+
+        **Raises:** `ValueError` for a duration that is not positive.
+        """
+        return replace(self, duration=seconds(duration))
+
+    def __call__(self, time: Float[Array, ""] | float) -> Float[Array, "*shape"]:
+        """The value at a time in seconds.
+
+        **Raises:** `ValueError` without a duration.
+        """
+        if self.duration is None:
+            raise ValueError(
+                "a Signal without a duration cannot be evaluated: give Signal(..., duration=4.0), "
+                "or call features[...].over(4.0)(time)"
+            )
+        # A simulator on the host asks at every step: JAX op by op would take a millisecond each.
+        on_host = isinstance(self.knots, np.ndarray) and isinstance(time, float | int | np.number)
+        xp: Any = np if on_host else jnp
+        knots = xp.asarray(self.knots)
+        count = knots.shape[0]
+        place = xp.asarray(time).astype(knots.dtype) / self.duration
+        if count == 1:
+            return knots[0]
+        if self.hold == "constant":
+            # An instant at which a piece begins belongs to it, whatever its rounding.
+            piece = xp.floor(place * count + 1e-5).astype(np.int32)
+            return knots[xp.clip(piece, 0, count - 1)]
+        place = xp.clip(place, 0.0, 1.0) * (count - 1)
+        left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
+        share = (place - left).astype(knots.dtype)
+        return knots[left] * (1 - share) + knots[left + 1] * share
+
+    def refined(self, factor: int) -> "Waveform":
+        """The same function by more control points; see `Signal.refined`."""
+        knots = jnp.asarray(self.knots)
+        if self.hold == "constant" or knots.shape[0] == 1:
+            return replace(self, knots=jnp.repeat(knots, factor, axis=0))
+        share = np.arange(factor).reshape((1, factor) + (1,) * (knots.ndim - 1)) / factor
+        between = knots[:-1, None] * (1 - share) + knots[1:, None] * share
+        inner = between.reshape(-1, *knots.shape[1:]).astype(knots.dtype)
+        return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
+
+
+def seconds(duration: Any) -> float:
+    """A duration, checked.
+
+    **Raises:** `ValueError` unless it is a positive finite number.
+    """
+    number = isinstance(duration, int | float | np.number) and not isinstance(duration, bool)
+    if not (number and 0 < duration < math.inf):
+        raise ValueError(f"duration must be a positive number of seconds; got {duration!r}")
+    return float(duration)
+
+
+def bound(features: Any, duration: float) -> Any:
+    """The same features, in which every waveform without a duration has this one."""
+
+    def bind(leaf: Any) -> Any:
+        return leaf.over(duration) if is_waveform(leaf) and leaf.duration is None else leaf
+
+    return jax.tree.map(bind, features, is_leaf=is_waveform)
+
+
+def is_waveform(value: Any) -> bool:
+    """Whether this is a `Waveform`, a leaf to `jax.tree` functions that are told so."""
+    return isinstance(value, Waveform)

@@ -1,0 +1,10 @@
+"""What there is to know of a counterexample: whether it is real, how little it takes, and why."""
+
+from verifai_jax.counterexamples._confirm import Confirmation as Confirmation
+from verifai_jax.counterexamples._confirm import Confirmations as Confirmations
+from verifai_jax.counterexamples._confirm import confirm as confirm
+from verifai_jax.counterexamples._explain import Explained as Explained
+from verifai_jax.counterexamples._explain import Influence as Influence
+from verifai_jax.counterexamples._explain import explain as explain
+from verifai_jax.counterexamples._shrink import Shrunk as Shrunk
+from verifai_jax.counterexamples._shrink import shrink as shrink

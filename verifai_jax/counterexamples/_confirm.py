@@ -1,0 +1,232 @@
+"""Whether the counterexamples of a run are real.
+
+    print(confirm(run, run.best))                       # one row, in words
+    confirm(run).frame                                  # all of them, a row each
+    confirm(run, 12, simulator="native")                # also by another simulator
+
+`verifai_jax.evaluation.confirmation` says what is checked.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.evaluation.confirmation import IN_WORDS, MOST, VERDICTS, Checked, Confirmer
+from verifai_jax.falsification.run import Run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+BLOCK = 128
+"""Rows of a run that are checked at once; what is finished survives Ctrl-C."""
+SHOWN = 5
+
+MEANING = {
+    "confirmed": "it fails in every replay",
+    "fragile": "numerically fragile",
+    "refuted": "an artefact of the simulation",
+    "unchecked": "nothing finer to check it with",
+    "unexamined": "not replayed",
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Confirmation:
+    """What replays say of one counterexample; see `confirmation.Checked` for the parts.
+
+    - `row`: its number in the table; None for features without one.
+    - `rho`: robustness `as_run`, NaN where that is not known, and of each check by name.
+    """
+
+    name: str
+    row: int | None
+    verdict: str
+    rho: dict[str, float]
+    band: float
+    why: str
+    notes: tuple[str, ...]
+    precision: str = "float32"
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the counterexample may be claimed."""
+        return self.verdict == "confirmed"
+
+    def __str__(self) -> str:
+        which = f"row {self.row} of {self.name}" if self.row is not None else f"{self.name}"
+        told = f"{which}: {self.verdict}, {MEANING[self.verdict]}"
+        if self.why and self.why not in self.notes:
+            told += f": {self.why}"
+        words = {"as_run": f"as run ({self.precision})", **IN_WORDS}
+        values = [f"{rho:.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
+        told += f". Robustness {', '.join(values)}" if values else ""
+        return ". ".join([told, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmations:
+    """What replays say of all counterexamples of a run.
+
+    - `frame`: a row each, indexed by row number: `verdict`,
+      `rho` as run, `rho.NAME` of each check, `band`, `why`.
+    - `notes`: which checks could not be made, and why.
+    """
+
+    name: str
+    frame: "pd.DataFrame" = field(repr=False)
+    notes: tuple[str, ...]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many rows have which verdict, those that occur."""
+        counted = Counter(self.frame["verdict"])
+        return {verdict: counted[verdict] for verdict in VERDICTS if counted[verdict]}
+
+    @property
+    def confirmed(self) -> "pd.DataFrame":
+        """The rows that may be claimed."""
+        return self.frame.loc[self.frame["verdict"] == "confirmed"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __str__(self) -> str:
+        if not len(self):
+            return f"{self.name}: no counterexample to confirm"
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items())
+        lines = [f"{self.name}: of {_counted(len(self))}, {counts}"]
+        doubtful = self.frame.loc[~self.frame["verdict"].isin(["confirmed", "unexamined"])]
+        for row, entry in doubtful.head(SHOWN).iterrows():
+            lines.append(f"  row {row} {entry['verdict']}: {entry['why']}")
+        if len(doubtful) > SHOWN:
+            lines.append(f"  and {len(doubtful) - SHOWN} more: see .frame")
+        lines += [f"  note: {note}" for note in self.notes]
+        if len(self.confirmed):
+            worst = self.confirmed["rho"].idxmin()
+            lines.append(
+                f"  the worst confirmed is row {worst}, robustness "
+                f"{self.confirmed.loc[worst, 'rho']:.4g}: run.replay({worst}) shows it"
+            )
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+@suggests_options
+def confirm(
+    run: Run,
+    row: "int | pd.Series | Mapping[str, Any] | None" = None,
+    *,
+    simulator: Any = None,
+    most: int = MOST,
+) -> Any:
+    """Replay counterexamples more finely than they were found, and say which are real.
+
+    **Arguments:**
+
+    - `row`: a row number, a row of the table, or a mapping with its feature columns; all
+      counterexamples of the table when left out.
+    - `simulator`: another system for the same features and signals, a problem with one, or the
+      name of another backend, that has to agree.
+    - `most`: how many rows are replayed at least; of more, those nearest to zero, until the rest
+      is far from it (see `confirmation.Confirmer`).
+
+    A `Confirmation` for a row, `Confirmations` for all. Ctrl-C returns what is finished.
+
+    **Raises:** `ValueError` for a run without its problem, a row that is no counterexample, a
+    simulator that does not fit; `IndexError` for a row that is not in the table.
+    """
+    if not isinstance(run, Run):
+        raise TypeError(f"confirm needs a Run; got {type(run).__name__}")
+    if run.problem is None:
+        raise ValueError(
+            f"the run of {run.name!r} was loaded without its problem, which has to be simulated "
+            "again; give it: vj.load(path, problem)"
+        )
+    confirmer = Confirmer(run.problem, run.precision, run.seed, simulator=simulator, most=most)
+    if row is None:
+        return _all(run, confirmer)
+    return _one(run, confirmer, row)
+
+
+def _one(run: Run, confirmer: Confirmer, row: Any) -> Confirmation:
+    number: int | None
+    if isinstance(row, (int, np.integer)):
+        if not 0 <= row < len(run.table):
+            raise IndexError(f"row {row} is not in the table of {len(run.table)} simulations")
+        number, values = int(row), run.table.all.iloc[int(row)]
+    else:
+        number, values = getattr(row, "name", None), row
+    _check_fails(number, values)
+    columns = {str(name): np.asarray([value]) for name, value in values.items()}
+    checked = confirmer(columns, [0 if number is None else number])
+    rho = {"as_run": float(columns["rho"][0]) if "rho" in columns else float("nan")}
+    rho |= {name: float(values[0]) for name, values in checked.rho.items()}
+    return Confirmation(
+        run.name, number, str(checked.verdict[0]), rho, float(checked.band[0]), checked.why[0],
+        checked.notes, run.precision,
+    )  # fmt: skip
+
+
+def _check_fails(number: int | None, values: Any) -> None:
+    """Refuse a row of the table that did not fail."""
+    if "status" not in values or "violated" not in values:
+        return
+    which = "this row" if number is None else f"row {number}"
+    if values["status"] != "ok":
+        raise ValueError(
+            f"{which} is no counterexample: its simulation has no verdict ({values['status']})"
+        )
+    if not values["violated"]:
+        raise ValueError(
+            f"{which} is no counterexample: it keeps the property with robustness "
+            f"{values['rho']:.4g}; confirm(run) checks those that do not"
+        )
+
+
+def _all(run: Run, confirmer: Confirmer) -> Confirmations:
+    import pandas as pd
+
+    failing = run.table.counterexamples
+    numbers, rho = failing.index.to_numpy(), failing["rho"].to_numpy(np.float64)
+    columns = {str(name): failing[name].to_numpy() for name in failing.columns}
+    order = np.argsort(np.abs(rho), kind="stable")
+    parts: list[tuple[np.ndarray, Checked]] = []
+    stopped: tuple[str, ...] = ()
+    try:
+        for start in range(0, len(order), BLOCK):
+            block = order[start : start + BLOCK]
+            taken = {name: column[block] for name, column in columns.items()}
+            parts.append((block, confirmer(taken, numbers[block])))
+    except KeyboardInterrupt:
+        stopped = (f"interrupted after {sum(len(block) for block, _ in parts)} rows",)
+    count = len(order)
+    frame = pd.DataFrame(
+        {"verdict": np.full(count, "unexamined", object), "rho": rho}, index=failing.index
+    )
+    for name in parts[0][1].rho if parts else ():
+        frame[f"rho.{name}"] = _placed(parts, count, lambda checked, n=name: checked.rho[n])
+    frame["band"] = _placed(parts, count, lambda checked: checked.band)
+    frame["why"] = np.full(count, stopped[0] if stopped else "", object)
+    for block, checked in parts:
+        frame.iloc[block, frame.columns.get_loc("verdict")] = checked.verdict
+        frame.iloc[block, frame.columns.get_loc("why")] = np.array(checked.why, object)
+    notes = tuple(dict.fromkeys(note for _, checked in parts for note in checked.notes))
+    return Confirmations(run.name, frame, (*notes, *stopped))
+
+
+def _placed(parts: list[tuple[np.ndarray, Checked]], count: int, column: Any) -> np.ndarray:
+    values = np.full(count, np.nan)
+    for block, checked in parts:
+        values[block] = column(checked)
+    return values
+
+
+def _counted(count: int) -> str:
+    return "1 counterexample" if count == 1 else f"{count} counterexamples"

@@ -1,0 +1,196 @@
+"""Why a row fails: which predicate, when, and which features matter, for people.
+
+    why = explain(run)                                  # the worst row
+    print(why)                                          # a paragraph
+    why.plot("why.png")                                 # the signal, and the features beside it
+
+Which predicate and when: `mtl.explain` on the replayed trace. Which features: each back at its
+nominal value, all others as they are, and the slope of the robustness where there is one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.keys import run_keys
+from verifai_jax.counterexamples.candidates import Judge
+from verifai_jax.counterexamples.description import Span, paragraph, spans_of
+from verifai_jax.counterexamples.fixed_key import with_key_of
+from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.counterexamples.selection import problem_of, row_of
+from verifai_jax.falsification.run import Replay, Run, replay
+from verifai_jax.mtl import Explanation
+
+MATTERS = 0.05
+"""Share of the greatest influence below which a feature does not matter."""
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What one feature has to do with a failure.
+
+    **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
+    when each coordinate acts, for the control points of a signal, else None; `reverted`: the
+    robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
+    back; `slope` `[k]`: change of the smooth robustness over the whole range of each coordinate, as
+    seen from the row. What is not known is NaN. `gone`: whether the failure vanishes with the whole
+    feature back.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    value: tuple[Any, ...]
+    nominal: tuple[Any, ...]
+    spans: tuple[Span, ...] | None
+    reverted: float
+    gone: bool
+    departs: bool
+    each: Float[np.ndarray, " k"]
+    each_gone: tuple[bool, ...]
+    slope: Float[np.ndarray, " k"]
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """Why a row fails; `str()` is a paragraph, `plot` a picture.
+
+    **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:
+    the predicate, the instant and the path (`mtl.Explanation`); `influences`: the features, the one
+    that matters most first; `simulations` spent; `replay`: the trace; `notes`.
+    """
+
+    row: int
+    formula: str
+    rho: float
+    why: Explanation
+    influences: tuple[Influence, ...]
+    simulations: int
+    replay: Replay
+    notes: tuple[str, ...] = ()
+
+    def effect(self, influence: Influence) -> float:
+        """By how much a feature moves the robustness: back at nominal, or else by its slope."""
+        if np.isfinite(influence.reverted):
+            return influence.reverted - self.rho
+        return float(np.nan_to_num(np.abs(influence.slope)).max(initial=0.0))
+
+    @property
+    def matter(self) -> tuple[Influence, ...]:
+        """The features whose influence is 5 % or more of the greatest, the greatest first."""
+        most = max((abs(self.effect(i)) for i in self.influences), default=0.0)
+        return tuple(
+            i for i in self.influences if i.gone or abs(self.effect(i)) > MATTERS * max(most, 1e-12)
+        )
+
+    def plot(self, path: Any = None) -> Any:
+        """Draw the deciding signal with its bound and instant, and the features; the figure."""
+        from verifai_jax.plotting.counterexamples import draw_explained
+
+        return draw_explained(self, path)
+
+    def __str__(self) -> str:
+        return paragraph(self)
+
+    __repr__ = __str__
+
+
+@suggests_options
+def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = None) -> Explained:
+    """Why a counterexample fails: which predicate decides, when, and which features matter.
+
+    **Arguments:**
+
+    - `run`: a run of a problem, with a counterexample.
+    - `row`: the number of one, or a row of the table; the worst when left out.
+    - `nominal`: features that are ordinary, where the problem does not say or others are meant.
+
+    Takes one simulation for each feature and each unit coordinate, and one gradient. Without
+    nominal features only the gradient tells what matters.
+
+    **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
+    is none, or has no verdict when simulated again.
+    """
+    problem = problem_of(run)
+    number, entry = row_of(run, row)
+    notes = []
+    try:
+        at, known = Nominal.of(problem, nominal), True
+    except ValueError:
+        if nominal:
+            raise
+        at, known = Nominal(problem.space, np.full(problem.space.dim, 0.5, np.float32)), False
+        notes.append("the problem does not say what is nominal: only slopes tell what matters")
+    seen = replay(problem, entry, run_keys(run.seed)[1], number, run.precision)
+    if not seen.violated:
+        notes.append("simulated again alone the row does not fail; see what confirm says of it")
+    why = seen.explain()
+    keyed = with_key_of(problem, run, number)
+    features = problem.space.from_row(entry)
+    u = at.settle(np.asarray(jax.jit(problem.space.flatten)(features))[None])[0]
+    judge = Judge(keyed, at, 10**9, run.precision)
+    groups = at.groups
+    singles = list(range(len(u)))
+    points = np.repeat(u[None], 1 + len(groups) + len(singles), axis=0)
+    for point, (_, places) in zip(points[1:], groups, strict=False):
+        point[places] = at.u[places]
+    for point, i in zip(points[1 + len(groups) :], singles, strict=True):
+        point[i] = at.u[i]
+    rho, failing = judge(points if known else points[:1])
+    if not known:
+        rho = np.concatenate([rho, np.full(len(points) - 1, np.nan)])
+        failing = np.concatenate([failing, np.ones(len(points) - 1, bool)])
+    # A simulation without a verdict, or one that the constraint refuses, says nothing.
+    rho[~np.isfinite(rho)] = np.nan
+    spread = np.nanmax(np.abs(rho), initial=0.0)
+    # Near the hard robustness: the slope is told as a number.
+    judge.temperature = max(0.002 * float(spread), 1e-6)
+    linear = judge.linear(u[None])[0]
+    slope = np.full(len(u), np.nan) if linear is None else linear.slope
+    if judge.note:
+        notes.append(judge.note)
+    duration = float(np.asarray(seen.trace.clock())[-1])
+    influences = []
+    for n, (name, places) in enumerate(groups, start=1):
+        one = 1 + len(groups) + places
+        values, usual = values_of(problem.space, name, u), values_of(problem.space, name, at.u)
+        safe = ~failing & np.isfinite(rho)
+        influences.append(
+            Influence(
+                name=name,
+                coordinates=tuple(at.names[i] for i in places),
+                value=values,
+                nominal=usual if known else (),
+                spans=spans_of(problem.space.domains[name], duration),
+                reverted=float(rho[n]),
+                gone=bool(safe[n]),
+                departs=bool(at.departs(u[None])[0, places].any()),
+                each=rho[one],
+                each_gone=tuple(bool(gone) for gone in safe[one]),
+                slope=slope[places],
+            )
+        )
+    explained = Explained(
+        row=number,
+        formula=seen.worst,
+        rho=min(seen.rho.values()),
+        why=why,
+        influences=tuple(influences),
+        simulations=judge.simulations + 1,
+        replay=seen,
+        notes=tuple(notes),
+    )
+    ordered = sorted(influences, key=lambda i: (-i.gone, -abs(explained.effect(i))))
+    object.__setattr__(explained, "influences", tuple(ordered))
+    return explained
+
+
+def values_of(space: Any, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:
+    """The entries of the table's columns of one feature at a point."""
+    features = jax.tree.map(lambda leaf: np.asarray(leaf)[None], jax.jit(space.unflatten)(u))
+    columns = space.domains[name].to_columns(features[name], name)
+    return tuple(c[0].item() if isinstance(c[0], np.generic) else c[0] for c in columns.values())

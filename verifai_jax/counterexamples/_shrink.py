@@ -1,0 +1,429 @@
+"""The least departure from nominal that still fails: a counterexample made small.
+
+    small = shrink(run)                                 # from the worst row
+    small = shrink(run, 17, by="small", budget=5000)
+    print(small); small.features; small.replay().plot()
+
+As a property-testing library does with its failing example: first few features, then small values
+(MacIver and Donaldson, Test-case reduction via test-case generation, ECOOP 2020), with batches,
+and with gradients where there are some.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.keys import run_keys
+from verifai_jax.counterexamples.candidates import Judge
+from verifai_jax.counterexamples.fixed_key import with_key_of
+from verifai_jax.counterexamples.minimize_count import fewest, grown, reduced
+from verifai_jax.counterexamples.minimize_distance import nearest
+from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.counterexamples.selection import columns_at, other_failures, problem_of, row_of
+from verifai_jax.falsification.run import Replay, Run, replay
+from verifai_jax.problem.problem import Problem
+
+ORDERS = ("few", "small")
+STARTS = 32
+"""Other counterexamples of the run that are looked at,"""
+FOLLOWED = 5
+"""points that are followed along the boundary,"""
+DESCENTS = 8
+"""and descents at once towards a failure elsewhere."""
+AWAY = 0.002
+"""How much farther than the nearest failing point the result is, for rounding's sake."""
+
+
+class Step(NamedTuple):
+    """What was known after so many simulations: departing coordinates, and their distance."""
+
+    simulations: int
+    count: int
+    distance: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shrunk:
+    """The least departure from nominal that was found to fail.
+
+    **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
+    margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
+    name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
+    coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
+    `simulations` spent; `by`: what was made least first; `history`; `notes` for people.
+    """
+
+    problem: Problem
+    row: int
+    features: dict[str, Any]
+    u: Float[np.ndarray, " d"]
+    rho: float
+    changed: dict[str, tuple[Any, Any]]
+    distance: float
+    nominal: Float[np.ndarray, " d"]
+    start_count: int
+    start_distance: float
+    simulations: int
+    by: str
+    precision: str
+    history: tuple[Step, ...]
+    notes: tuple[str, ...] = ()
+    key: Key[Array, ""] | None = field(default=None, repr=False)
+
+    @property
+    def count(self) -> int:
+        """How many coordinates are not nominal."""
+        return len(self.changed)
+
+    def replay(self, precision: str | None = None) -> Replay:
+        """Simulate it again, with the random key of the row, and keep the trace."""
+        columns = columns_at(self.problem, self.u)
+        return replay(self.problem, columns, self.key, self.row, precision or self.precision)  # pyright: ignore[reportArgumentType]
+
+    def plot(self, path: Any = None) -> Any:
+        """Draw what departs, and the signals of the simulation; returns the figure."""
+        from verifai_jax.plotting.counterexamples import draw_shrunk
+
+        return draw_shrunk(self, path)
+
+    def __str__(self) -> str:
+        d = len(self.u)
+        name = self.problem.name
+        if not self.count:
+            lines = [
+                f"{name}: the nominal features fail themselves, with robustness {self.rho:.4g}; "
+                "there is nothing to shrink"
+            ]
+        else:
+            lines = [
+                f"{name}: {_of(self.count, d)} away from nominal "
+                f"{'is' if self.count == 1 else 'are'} enough for a failure, by "
+                f"{self.distance:.3g} of {'its' if self.count == 1 else 'their'} range "
+                f"(robustness {self.rho:.3g})"
+            ]
+            width = max(map(len, self.changed))
+            lines += [
+                f"  {name:<{width}}  {_shown(was)} -> {_shown(now)}"
+                for name, (was, now) in self.changed.items()
+            ]
+        lines.append(
+            f"  row {self.row} departed in {_of(self.start_count, d)}, by "
+            f"{self.start_distance:.3g}; {self.simulations} simulations"
+        )
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+@suggests_options
+def shrink(
+    run: Run,
+    row: Any = None,
+    *,
+    nominal: Mapping[str, Any] | None = None,
+    by: str = "few",
+    budget: int = 2000,
+    seed: int = 0,
+    others: bool = True,
+    stay: bool = False,
+) -> Shrunk:
+    """The least departure from the nominal features that still fails.
+
+    **Arguments:**
+
+    - `run`: a run of a problem, with a counterexample.
+    - `row`: the number of one, or a row of the table; the worst when left out.
+    - `nominal`: features that are ordinary, where the problem does not say or others are meant.
+    - `by`: `"few"`: first the fewest coordinates that are not exactly nominal, then, with so many,
+      the least distance; `"small"`: the least distance, whatever their number. The distance is
+      Euclidean in unit coordinates, of which each is 1 over its whole range (by probability, for a
+      distribution), between two choices 1, and by places in integers. Every control point of a
+      signal and every component of a vector is a coordinate of its own.
+    - `budget`: simulations at most; a gradient counts as one.
+    - `seed`: of the random candidates.
+    - `others`: whether other counterexamples of the run are looked at too.
+    - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
+      that failures of several kinds are shrunk each by itself.
+
+    All simulations have the random key of the row. The result was simulated alone and failed, in
+    the precision of the run, and in float64 too unless the system draws random numbers or is a
+    black box. It is 0.2 % farther than the nearest failing point, for rounding's sake. Ctrl-C ends
+    the search and returns the least so far.
+
+    **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
+    is none or does not fail when simulated again, a feature without a nominal value.
+    """
+    problem = problem_of(run)
+    if by not in ORDERS:
+        raise unknown_name("order", by, ORDERS)
+    if isinstance(budget, bool) or not isinstance(budget, int | np.integer) or budget < 1:
+        raise ValueError(f"budget must be an integer of at least 1; got {budget!r}")
+    number, first = row_of(run, row)
+    at = Nominal.of(problem, nominal)
+    problem = with_key_of(problem, run, number)
+    key = run_keys(run.seed)[1]
+    seen = replay(problem, first, key, number, run.precision)
+    if not seen.violated:
+        told = f"robustness {min(seen.rho.values()):.4g}" if seen.status == 0 else seen.status.name
+        raise ValueError(
+            f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
+            f"({told}); see what confirm says of it, and shrink another"
+        )
+    u = np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))
+    start = at.settle(u[None])
+    if stay:
+        at = at.on_the_side_of(start[0])
+    judge = Judge(problem, at, int(budget), run.precision)
+    shrinking = _Shrinking(judge, by, np.random.default_rng(seed))
+    points = np.concatenate([start, other_failures(run, at, number, STARTS)]) if others else start
+    notes = []
+    try:
+        shrinking.search(points)
+    except KeyboardInterrupt:
+        notes.append("interrupted: the least so far")
+    found = _verified(problem, shrinking, key, number, run.precision)
+    u = start[0] if found is None else found[0]
+    replayed = seen if found is None else found[1]
+    if judge.note:
+        notes.append(judge.note)
+    return Shrunk(
+        problem=problem,
+        row=number,
+        features=replayed.features,
+        u=u,
+        rho=min(replayed.rho.values()),
+        changed=_changed(at, u),
+        distance=float(at.distance(u[None])[0]),
+        nominal=at.u,
+        start_count=int(at.count(start)[0]),
+        start_distance=float(at.distance(start)[0]),
+        simulations=judge.simulations,
+        by=by,
+        precision=run.precision,
+        history=tuple(shrinking.history),
+        notes=tuple(notes),
+        key=key,
+    )
+
+
+class _Shrinking:
+    """The order of things: what is few, what is near, and whether another mode is nearer."""
+
+    def __init__(self, judge: Judge, by: str, rng: np.random.Generator) -> None:
+        self.judge, self.by, self.rng = judge, by, rng
+        self.history: list[Step] = []
+
+    def order(self, points: Float[np.ndarray, "n d"]) -> np.ndarray:
+        """Which come first."""
+        count, length = self.judge.nominal.count(points), self.judge.nominal.distance(points)
+        if self.by == "few":
+            return np.lexsort((length, count))
+        return np.lexsort((count, length))
+
+    def failures(self) -> Float[np.ndarray, "n d"]:
+        """All failing points so far, the least first."""
+        points = self.judge.points[self.judge.failing]
+        return points[self.order(points)]
+
+    def note(self) -> None:
+        points = self.failures()[:1]
+        if len(points):
+            nominal = self.judge.nominal
+            step = (int(nominal.count(points)[0]), float(nominal.distance(points)[0]))
+            if not self.history or self.history[-1][1:] != step:
+                self.history.append(Step(self.judge.simulations, *step))
+
+    def search(self, points: Float[np.ndarray, "n d"]) -> None:
+        """Spend the budget; what is found is in `judge`."""
+        judge, nominal = self.judge, self.judge.nominal
+        rho, _ = judge(np.concatenate([nominal.u[None], points]))
+        self.note()
+        failures = self.failures()
+        if not len(failures) or not nominal.count(failures[:1])[0]:
+            return
+        spread = [abs(r) for r in rho if math.isfinite(r)]
+        # Smooth enough for a slope where several instants compete, and near the hard value.
+        judge.temperature = max(0.02 * max(spread, default=1.0), 1e-6)
+        # Half for what decides where to go, so that some is left to go there.
+        judge.limit = judge.budget // 2
+        if self.by == "few":
+            own = points[:1][judge(points[:1])[1]]
+            fewest(judge, self.starts(own, alike=False), self.rng)
+        else:
+            grown(judge, failures[:1], 1)
+            reduced(judge, failures[0])
+        self.note()
+        self.follow(self.starts())
+        judge.limit = judge.budget - 2 * nominal.space.dim
+        self.follow(self.starts()[:1])
+        # A boundary of many pieces has a nearest point on each: some of those beside this one.
+        beyond(judge, self.failures()[0], self.rng)
+        self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
+        for _ in range(2):
+            if judge.left < judge.budget // 20:
+                break
+            before = self.failures()[0]
+            elsewhere(judge, before, self.by == "few", self.rng)
+            self.note()
+            if not np.array_equal(self.failures()[0], before):
+                self.follow(self.failures()[:1])
+        self.follow(self.failures()[:1])
+        # What departs by next to nothing need not depart.
+        judge.limit = judge.budget
+        reduced(judge, self.failures()[0])
+        self.note()
+
+    def starts(
+        self,
+        first: Float[np.ndarray, "m d"] | None = None,
+        *,
+        alike: bool = True,
+        cosine: float = 0.7,
+    ) -> Float[np.ndarray, "n d"]:
+        """The least failures in different directions, after those of `first`.
+
+        - `alike`: only with as few departures as the least one.
+        - `cosine`: of the angle between directions, at most.
+        """
+        failures, nominal = self.failures(), self.judge.nominal
+        if self.by == "few" and alike:
+            count = nominal.count(failures)
+            failures = failures[count == count[0]]
+        chosen = [] if first is None else list(first)
+        for u in failures:
+            if len(chosen) >= FOLLOWED:
+                break
+            v = u - nominal.u
+            ways = [w - nominal.u for w in chosen]
+            if all(v @ w < cosine * np.linalg.norm(v) * np.linalg.norm(w) for w in ways):
+                chosen.append(u)
+        return np.array(chosen)
+
+    def follow(self, starts: Float[np.ndarray, "n d"], rounds: int = 60) -> None:
+        """Bring these points nearer."""
+        if len(starts):
+            nearest(self.judge, starts, self.rng, few=self.by == "few", rounds=rounds)
+            self.note()
+
+
+def beyond(judge: Judge, u: Float[np.ndarray, " d"], rng: np.random.Generator) -> None:
+    """Look for failures on the same coordinates a little farther away, in other directions."""
+    nominal = judge.nominal
+    v = u.astype(np.float64) - nominal.u
+    v[np.array(nominal.cube.levels) > 0] = 0
+    reach = float(np.linalg.norm(v))
+    moved = v * (1 + 0.6 * rng.standard_normal((64, len(v))))
+    moved *= reach * rng.uniform(1, 1.2, (64, 1)) / _length(moved)
+    points = np.repeat(u[None].astype(np.float64), 64, axis=0)
+    judge(np.where(v != 0, nominal.u + moved, points))
+
+
+def elsewhere(
+    judge: Judge, u: Float[np.ndarray, " d"], few: bool, rng: np.random.Generator
+) -> None:
+    """Look for a failure nearer than `u` in other directions, with no more departures if `few`.
+
+    Descents of the robustness from random points that are nearer, each for itself, so that the
+    known failure does not draw them all.
+    """
+    nominal = judge.nominal
+    free = np.flatnonzero(np.array(nominal.cube.levels) == 0)
+    most = min(int(nominal.count(u[None])[0]), len(free)) if few else len(free)
+    reach = 0.98 * float(nominal.distance(u[None])[0])
+    if not most or not reach:
+        return
+    moved = np.zeros((40, nominal.space.dim))
+    for row in moved:
+        row[rng.permutation(free)[:most]] = rng.standard_normal(most)
+    moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
+    points = nominal.settle(nominal.u + moved)
+    rho, failing = judge(points)
+    if failing.any():
+        return
+    order = np.argsort(rho)[:DESCENTS]
+    here, level = points[order].astype(np.float64), rho[order]
+    for turn in range(5):
+        if judge.left <= 0:
+            return
+        children = []
+        for point, linear in zip(here, judge.linear(here), strict=True):
+            same = (point != nominal.u) | (not few)
+            noise = rng.standard_normal((5, len(point))) * same
+            noise[:, np.array(nominal.cube.levels) > 0] = 0
+            steps = 0.3 * 0.6**turn * reach * noise / _length(noise)
+            if linear is not None and (slope := linear.slope * same).any():
+                # To where the tangent is zero, half and twice as far.
+                full = -max(linear.value, 1e-9) * slope / (slope @ slope)
+                steps[:3] = np.outer([1.05, 0.5, 2.0], full)
+            away = point + steps - nominal.u
+            children.append(nominal.u + away * np.minimum(1, reach / _length(away)))
+        points = nominal.settle(np.concatenate(children))
+        rho, failing = judge(points)
+        if failing.any():
+            return
+        best = rho.reshape(len(here), -1).argmin(axis=1) + 5 * np.arange(len(here))
+        better = rho[best] < level
+        here[better], level[better] = points[best][better], rho[best][better]
+
+
+def _length(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
+    return np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+def _verified(
+    problem: Problem, shrinking: _Shrinking, key: Any, number: int, precision: str
+) -> tuple[np.ndarray, Replay] | None:
+    """The least failure that fails alone too, in float64 as well; None where none does.
+
+    It is taken a little farther from nominal than the boundary, where rounding would decide.
+    """
+    nominal = shrinking.judge.nominal
+    # In float64 other random numbers would be drawn, and a black box does not compute in it.
+    exact = not problem.black_box and not problem.draws()
+    for u in shrinking.failures()[:20]:
+        farther = nominal.settle(nominal.u + (1 + AWAY) * (u[None].astype(np.float64) - nominal.u))
+        for point in (farther[0], u):
+            if not nominal.space.accepts_points(point[None])[0]:
+                continue
+            columns = columns_at(problem, point)
+            again = replay(problem, columns, key, number, precision)
+            if again.violated and (
+                not exact or replay(problem, columns, key, number, "float64").violated
+            ):
+                return point, again
+    return None
+
+
+def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[Any, Any]]:
+    """What departs, by coordinate: its nominal value and that at `u`."""
+    pair = jax.jit(jax.vmap(nominal.space.unflatten))(np.stack([nominal.u, u]))
+    columns = nominal.space.rows(pair)
+    names = list(columns) if len(columns) == len(u) else []
+    changed = {}
+    for i in np.flatnonzero(nominal.departs(u[None])[0]):
+        name = nominal.names[i]
+        column = columns.get(name)
+        if column is None and names:
+            column = columns[names[i]]
+        values = (nominal.u[i], u[i]) if column is None else column
+        changed[name] = (_plain(values[0]), _plain(values[1]))
+    return changed
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _of(count: int, d: int) -> str:
+    return f"{count} of {d} features" if d != 1 else "its one feature"
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

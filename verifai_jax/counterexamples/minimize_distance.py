@@ -1,0 +1,299 @@
+"""The nearest failure to nominal over given features, by batches along the failure boundary.
+
+    points = nearest(judge, starts, rng)                # failing, each no farther than its start
+
+Each round a batch of candidates for each point that is followed:
+
+- on the segment to nominal (bisection, several points at once);
+- towards the nearest point of the linearised boundary, and part of the way: the iteration of
+  Hasofer and Lind (Exact and invariant second-moment code format, Journal of the Engineering
+  Mechanics Division 100, 1974) and of Rackwitz and Fiessler (Structural reliability under combined
+  random load sequences, Computers and Structures 9, 1978), with a line search by batch; where
+  several pieces of the boundary meet, nearest to all of their half-spaces (Lawson and Hanson,
+  Solving least squares problems, 1974, chapter 23: least distance programming);
+- beside it and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial attacks,
+  ICLR 2018), which needs no slope and no continuity;
+- one coordinate nearer alone; a cell nearer where discrete.
+
+The slope is that of the smooth robustness, or where there is none a least-squares fit to the
+points simulated nearby.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.counterexamples.candidates import Judge, Linear
+
+Point = Float[np.ndarray, " d"]
+Points = Float[np.ndarray, "n d"]
+
+TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
+"""Shares of the way to the linearised boundary's nearest point,"""
+STRETCHES = (1.0, 1.003, 1.015, 1.06)
+"""and how far beyond it: the boundary is curved."""
+ENOUGH = 5e-4
+"""Relative improvement that is not worth a round."""
+
+
+@dataclass
+class Track:
+    """A failing point that comes nearer to nominal, round by round.
+
+    `free`: which coordinates may depart; `gap`: the share of the way to nominal on which the last
+    failure lies, as far as is known; `sigma`: size of random steps, relative to the distance;
+    `dull`: rounds without progress; `pieces`: tangents of the boundary met so far, the latest last;
+    `aimed`: the nearest point of the last linearised boundary.
+    """
+
+    u: Point
+    free: Bool[np.ndarray, " d"]
+    gap: float = 1.0
+    sigma: float = 0.3
+    dull: int = 0
+    pieces: list[Linear] = field(default_factory=list)
+    aimed: Point | None = None
+
+
+def nearest(
+    judge: Judge, starts: Points, rng: np.random.Generator, *, few: bool, rounds: int = 60
+) -> Points:
+    """Follow these failing points until none comes nearer; the points reached, one for each.
+
+    - `few`: whether coordinates that are nominal stay so.
+    """
+    nominal = judge.nominal
+    d = nominal.space.dim
+    tracks = [Track(u, nominal.departs(u[None])[0] if few else np.ones(d, bool)) for u in starts]
+    active = list(tracks)
+    for _ in range(rounds):
+        if not active or judge.left <= 0:
+            break
+        each = max(12, min(40, 64 // len(active)))
+        batches = [candidates(judge, track, each, rng) for track in active]
+        _, failing = judge(np.concatenate(batches))
+        first = 0
+        for track, batch in zip(active, batches, strict=True):
+            advance(judge, track, nominal.settle(batch), failing[first : first + len(batch)])
+            first += len(batch)
+        follow(judge, active)
+        active = [track for track in active if track.dull < 3]
+        if len(active) > 1:
+            # What is far behind the best gets no more of the budget.
+            reach = min(float(nominal.distance(track.u[None])[0]) for track in tracks)
+            active = [
+                track
+                for track in active
+                if track.dull == 0 or nominal.distance(track.u[None])[0] < 1.3 * reach
+            ]
+    return np.array([track.u for track in tracks])
+
+
+def candidates(judge: Judge, track: Track, count: int, rng: np.random.Generator) -> Points:
+    """About so many points nearer to nominal than that of the track."""
+    nominal = judge.nominal
+    levels = np.array(nominal.cube.levels)
+    places = np.flatnonzero(track.free & (levels == 0))
+    u0 = nominal.u.astype(np.float64)
+    v = track.u.astype(np.float64)[places] - u0[places]
+    length = float(np.linalg.norm(v))
+    parts = [whole_cells(judge, track)]
+    if length > 0:
+        lines = rays(track)
+        aims = aimed(judge, track, places, v)
+        left = max(count - len(lines) - len(aims) - len(parts[0]), 6)
+        ones = single(track, v, left // 3, rng)
+        near = beside(track, v, left - len(ones), rng)
+        moved = np.concatenate([np.outer(lines, v), aims, ones, near])
+        moved = moved[np.linalg.norm(moved, axis=1) < length]
+        points = np.repeat(track.u[None].astype(np.float64), len(moved), axis=0)
+        points[:, places] = u0[places] + moved
+        parts.append(points)
+    return np.concatenate(parts)
+
+
+def rays(track: Track) -> Float[np.ndarray, " n"]:
+    """Shares of the way from nominal to the point, where the boundary may be."""
+    if track.gap >= 1:
+        return np.linspace(0, 1, 14)[1:-1]
+    return 1 - track.gap * np.linspace(0.2, 1, 5) if track.gap > 2e-4 else np.zeros(0)
+
+
+def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Departures at, and on the way to, the nearest points of the linearised boundary."""
+    u0 = judge.nominal.u.astype(np.float64)[places]
+    ends = np.zeros(len(track.u))
+    low, high = (ends + judge.nominal.low)[places], (ends + judge.nominal.high)[places]
+    pieces = track.pieces[-1:] or fitted(judge, track, places)
+    targets = []
+    for some in (pieces, track.pieces[-6:]) if len(track.pieces) > 1 else (pieces,):
+        rows = np.array([piece.slope[places] for piece in some])
+        if not len(rows) or not rows.any():
+            continue
+        levels = np.array([p.slope[places] @ (p.point[places] - u0) - p.value for p in some])
+        found = least(rows, levels, low - u0, high - u0)
+        if found is not None:
+            targets.append(found)
+    track.aimed = None
+    if not targets:
+        return np.zeros((0, len(v)))
+    track.aimed = track.u.astype(np.float64)
+    track.aimed[places] = u0 + targets[0]
+    steps = [
+        stretch * ((1 - turn) * v + turn * target)
+        for target in targets
+        for turn in TURNS
+        for stretch in (STRETCHES if turn == 1 else (1.0, 0.99))
+    ]
+    return np.array(steps)
+
+
+def least(
+    rows: Float[np.ndarray, "m k"],
+    levels: Float[np.ndarray, " m"],
+    low: Float[np.ndarray, " k"],
+    high: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " k"] | None:
+    """The shortest `v` with `rows v <= levels` and `low <= v <= high`; None where there is none.
+
+    Lawson and Hanson, chapter 23: the dual is a problem of non-negative least squares.
+    """
+    from scipy.optimize import nnls
+
+    scale = np.linalg.norm(rows, axis=1)
+    rows, levels = rows[scale > 0], levels[scale > 0]
+    scale = scale[scale > 0]
+    k = rows.shape[1]
+    over = np.concatenate([-rows / scale[:, None], np.eye(k), -np.eye(k)])
+    bounds = np.concatenate([-levels / scale, low, -high])
+    dual, target = np.vstack([over.T, bounds]), np.r_[np.zeros(k), 1.0]
+    try:
+        weights, residual = nnls(dual, target)
+    except RuntimeError:
+        return None
+    if residual < 1e-8:
+        return None
+    rest = dual @ weights - target
+    return np.clip(-rest[:k] / rest[k], low, high)
+
+
+def fitted(judge: Judge, track: Track, places: np.ndarray) -> list[Linear]:
+    """A tangent from the points that were simulated nearby; none where they are too few."""
+    others = np.ones(len(track.u), bool)
+    others[places] = False
+    alike = np.isfinite(judge.rho) & np.all(judge.points[:, others] == track.u[others], axis=1)
+    points, rho = judge.points[alike].astype(np.float64)[:, places], judge.rho[alike]
+    k = len(places)
+    if len(points) < k + 2:
+        return []
+    offsets = points - track.u[places]
+    far = np.linalg.norm(offsets, axis=1)
+    order = np.argsort(far)[: 3 * k + 4]
+    offsets, rho, far = offsets[order], rho[order], far[order]
+    weight = 1 / (far + 0.1 * far[-1] + 1e-9)
+    design = np.concatenate([np.ones((len(offsets), 1)), offsets], axis=1)
+    ridge = 1e-6 * float(weight @ (far**2 + 1e-12)) * np.eye(k + 1)
+    weighted = design * weight[:, None]
+    solution = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ rho)
+    slope = np.zeros(len(track.u))
+    slope[places] = solution[1:]
+    if not np.all(np.isfinite(slope)) or not slope.any():
+        return []
+    return [Linear(track.u.astype(np.float64), float(solution[0]), slope)]
+
+
+def single(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """One coordinate nearer to nominal than it is, the others as they are."""
+    chosen = np.flatnonzero(v)
+    if not len(chosen) or count < 1:
+        return np.zeros((0, len(v)))
+    chosen = rng.permutation(chosen)[:count]
+    moved = np.repeat(v[None], len(chosen), axis=0)
+    share = np.where(rng.random(len(chosen)) < 0.3, 0.0, 1 - rng.random(len(chosen)) * track.sigma)
+    moved[np.arange(len(chosen)), chosen] *= share
+    return moved
+
+
+def beside(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Random directions near that of `v`, a little shorter."""
+    length = np.linalg.norm(v)
+    k = len(v)
+    noise = rng.standard_normal((count, k))
+    # Half of them in few coordinates: boundaries are often aligned with some.
+    kept = rng.random((count, k)) < min(1.0, 2 / k)
+    kept |= (rng.random(count) < 0.5).reshape(-1, 1) | ~kept.any(axis=1, keepdims=True)
+    noise *= kept
+    size = track.sigma * rng.uniform(0.2, 1.5, (count, 1))
+    norm = np.maximum(np.linalg.norm(noise, axis=1, keepdims=True), 1e-12)
+    moved = v / length + size * noise / norm
+    moved /= np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
+    shorter = 1 - np.minimum(0.5, size * rng.random((count, 1)) ** 2)
+    return moved * length * shorter
+
+
+def whole_cells(judge: Judge, track: Track) -> Points:
+    """Each departing discrete coordinate back at nominal, and nearer where cells have an order."""
+    nominal = judge.nominal
+    cube = nominal.cube
+    tried = []
+    for place, i in enumerate(cube.discrete):
+        if not track.free[i] or track.u[i] == nominal.u[i]:
+            continue
+        here = int(nominal.cells(track.u)[place])
+        home = int(nominal.cells(nominal.u)[place])
+        nearer = {home}
+        if cube.ordered[i]:
+            nearer |= {here + int(np.sign(home - here)), (here + home) // 2}
+        for cell in nearer - {here}:
+            point = track.u.astype(np.float64)
+            cells = np.zeros((1, len(cube.discrete)), np.int32)
+            cells[0, place] = cell
+            point[i] = nominal.u[i] if cell == home else nominal.centres(cells)[0, place]
+            tried.append(point)
+    return np.array(tried).reshape(-1, nominal.space.dim)
+
+
+def advance(judge: Judge, track: Track, points: Points, failing: np.ndarray) -> None:
+    """Take the nearest failing candidate, and learn where on the segment there was none."""
+    nominal = judge.nominal
+    before = float(nominal.distance(track.u[None])[0])
+    lengths = np.where(failing, nominal.distance(points), np.inf)
+    after = float(lengths.min(initial=np.inf))
+    gain = 1 - after / before if after < before else 0.0
+    if gain:
+        u = points[int(np.argmin(lengths))]
+        straight = on_segment(judge, track.u, u) is not None
+        wider = min(1.0, 4 * track.gap) if straight else 0.1
+        track.u = u
+    else:
+        wider = track.gap
+    shares = [on_segment(judge, track.u, point) for point in points[~failing]]
+    safe = max((share for share in shares if share is not None and share < 1), default=None)
+    track.gap = wider if safe is None else 1 - safe
+    track.sigma = float(np.clip(track.sigma * (1.3 if gain > 0.02 else 0.6), 1e-3, 0.5))
+    settled = gain <= ENOUGH and track.gap <= 1e-3
+    track.dull = track.dull + 1 if settled else 0
+
+
+def on_segment(judge: Judge, u: Point, other: Point) -> float | None:
+    """What share of the way from nominal to `u` the other point is; None if it is beside."""
+    u0 = judge.nominal.u.astype(np.float64)
+    v, w = u - u0, other - u0
+    share = float(w @ v / max(v @ v, 1e-30))
+    return share if np.linalg.norm(w - share * v) < 1e-5 * np.linalg.norm(v) + 1e-7 else None
+
+
+def follow(judge: Judge, tracks: list[Track]) -> None:
+    """Tangents where the tracks are, and where those that do not get on had aimed."""
+    if not judge.gradients:
+        return
+    wanted = [(track, track.u) for track in tracks]
+    wanted = [
+        (track, track.aimed) for track in tracks if track.dull and track.aimed is not None
+    ] + wanted
+    for (track, _), linear in zip(
+        wanted, judge.linear(np.array([u for _, u in wanted])), strict=True
+    ):
+        if linear is not None and (not track.pieces or track.pieces[-1] is not linear):
+            track.pieces.append(linear)

@@ -1,0 +1,91 @@
+"""Which row of a run is meant, and what else the run has: where shrink and explain begin."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification.run import Run
+from verifai_jax.problem.problem import Problem
+
+
+def problem_of(run: Any) -> Problem:
+    """The problem of a run, on the backend on which it ran.
+
+    **Raises:** `TypeError` for what is no run; `ValueError` for one without its problem.
+    """
+    if not isinstance(run, Run):
+        raise TypeError(f"a run of falsify is needed; got {type(run).__name__}")
+    if run.problem is None:
+        raise ValueError(
+            f"the run of {run.name!r} was loaded without its problem; "
+            "give it: vj.load(path, problem)"
+        )
+    return resolved(run.problem, wanted=run.backend).problem
+
+
+def row_of(run: Run, row: Any) -> tuple[int, Any]:
+    """The number and the entries of a counterexample.
+
+    **Raises:** `ValueError` where there is none, or this is none.
+    """
+    failing = run.table.counterexamples
+    if not len(failing):
+        raise ValueError(
+            f"the run of {run.name!r} has no counterexample in {run.simulations} simulations"
+        )
+    number = failing["rho"].idxmin() if row is None else getattr(row, "name", row)
+    if isinstance(number, bool) or not isinstance(number, int | np.integer):
+        raise TypeError(f"row must be the number of a row of the table; got {row!r}")
+    number = int(number)
+    if not 0 <= number < run.simulations:
+        raise IndexError(f"row {number} is not in the table of {run.simulations} simulations")
+    entry = run.table.all.iloc[number]
+    # A row that was not confirmed is none that the run claims; it may be asked for all the same.
+    if number not in failing.index and not bool(entry.get("violated", False)):
+        some = ", ".join(map(str, failing.index[:5]))
+        raise ValueError(
+            f"row {number} is no counterexample: status {entry['status']}, robustness "
+            f"{entry['rho']:.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
+        )
+    return number, entry
+
+
+def other_failures(run: Run, nominal: Nominal, number: int, most: int) -> Float[np.ndarray, "n d"]:
+    """Other counterexamples than row `number`, at most so many: half of them the nearest."""
+    failing = run.table.counterexamples
+    failing = failing.loc[failing.index != number]
+    if not len(failing):
+        return np.zeros((0, nominal.space.dim), np.float32)
+    order = np.argsort(_roughly(nominal, failing), kind="stable")
+    if len(order) > most:
+        half = most // 2
+        rest = np.linspace(half, len(order) - 1, most - half).astype(int)
+        order = np.concatenate([order[:half], order[rest]])
+    return nominal.settle(nominal.space.points(failing.iloc[order]))
+
+
+def _roughly(nominal: Nominal, rows: Any) -> Float[np.ndarray, " n"]:
+    """About how far rows are from nominal, without their points, which take time to compute."""
+    at = jax.jit(nominal.space.unflatten)(nominal.u)
+    columns = nominal.space.rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], at))
+    total = np.zeros(len(rows))
+    for name, value in columns.items():
+        entries = rows[name].to_numpy()
+        if entries.dtype.kind in "iuf" and value.dtype.kind in "iuf":
+            spread = np.nanstd(entries) or 1.0
+            total += np.nan_to_num((entries - value[0]) / spread) ** 2
+        else:
+            total += entries != value[0]
+    return total
+
+
+def columns_at(problem: Problem, u: Float[np.ndarray, " d"]) -> dict[str, Any]:
+    """The row of a table with the features at this point."""
+    features = jax.tree.map(
+        lambda leaf: np.asarray(leaf)[None], jax.jit(problem.space.unflatten)(u)
+    )
+    return {name: column[0] for name, column in problem.space.rows(features).items()}

@@ -1,0 +1,109 @@
+"""A problem as the methods see it: points of the unit cube in double precision, and verdicts.
+
+    evaluate = Simulated(problem, batch=448, precision="float32", seed=0)
+    rho, failing, proper = evaluate(u)              # u [n, d], float64
+
+Rare failures lie near the ends of the coordinates, where single precision has no numbers: next to 1
+its probabilities are multiples of 6e-8. So features are computed from the points in double
+precision, and simulated in that of the run.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from verifai_jax.core.precision import in_precision
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+
+EXACT = 2**24
+"""Integers up to here are float32 numbers."""
+BEYOND = (2.0**-27, 2.0**-32)
+"""Probabilities between which a distribution that has an outermost value has only that."""
+
+
+class Held(FeatureSpace):
+    """The features of a space as plain float32 numbers `[size]`, computed already."""
+
+    def __init__(self, space: FeatureSpace, precision: str) -> None:
+        self.root, self.where = space.root, None
+        with in_precision(precision):
+            form = jax.eval_shape(space.unflatten, jnp.zeros(space.dim, precision))
+        self._leaves, self._tree = jax.tree.flatten(form)
+        self._ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in self._leaves])
+
+    @property
+    def dim(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def unflatten(self, u: Float[Array, " size"]) -> dict[str, Any]:
+        parts = jnp.split(u, self._ends[:-1])
+        leaves = [
+            part.reshape(leaf.shape).astype(
+                u.dtype if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf.dtype
+            )
+            for part, leaf in zip(parts, self._leaves, strict=True)
+        ]
+        return jax.tree.unflatten(self._tree, leaves)
+
+
+class Simulated:
+    """See the module's docstring.
+
+    `clamped` says for each coordinate whether its domain ends in one outermost value, beyond which
+    no simulation sees.
+    """
+
+    def __init__(self, problem: Problem, batch: int, precision: str, seed: int) -> None:
+        space = problem.space
+        self._held = max(space.levels, default=0) <= EXACT
+        if self._held:
+            if ("held", precision) not in problem.engines:
+                held = Held(space, precision)
+                problem.engines["held", precision] = _with_space(problem, held)
+            problem = problem.engines["held", precision]
+        self._evaluator = Evaluator(problem, batch, precision=precision, seed=seed)
+        self._numbers = jax.jit(jax.vmap(lambda u: _flat(space.unflatten(u))))
+        self._batch = batch
+        self.clamped = self._clamped(space)
+
+    def __call__(
+        self, u: Float[np.ndarray, "n d"]
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        points: Any = u
+        if self._held:
+            padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
+            with in_precision("float64"):
+                points = np.asarray(self._numbers(padded))[: len(u)]
+        judged = self._evaluator(points)
+        return judged.rho, judged.failing, judged.proper
+
+    def compile(self) -> None:
+        """Compile now."""
+        self._evaluator.engine.compile()
+
+    def _clamped(self, space: FeatureSpace) -> Bool[np.ndarray, " d"]:
+        if not self._held:
+            return np.ones(space.dim, bool)
+        points = np.full((2, space.dim, space.dim), 0.5)
+        for side, value in enumerate(BEYOND):
+            points[side, np.arange(space.dim), np.arange(space.dim)] = value
+        with in_precision("float64"):
+            ends = np.stack([np.asarray(self._numbers(side)) for side in points])
+        same = np.all(ends[0] == ends[1], axis=1)
+        return same & (np.array(space.levels) == 0)
+
+
+def _flat(features: Any) -> Array:
+    leaves = [jnp.ravel(leaf).astype(jnp.float64) for leaf in jax.tree.leaves(features)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
+
+
+def _with_space(problem: Problem, space: FeatureSpace) -> Problem:
+    from dataclasses import replace
+
+    return replace(problem, space=space, nominal=None)

@@ -1,0 +1,1 @@
+"""Points in, verdicts out: simulation and judgement of batches, on devices and on the host."""

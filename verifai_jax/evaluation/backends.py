@@ -1,0 +1,115 @@
+"""Which backend simulates a problem whose system has several, such as MJX and native MuJoCo.
+
+    problem = resolved(problem, gradient=False, batch=1024, budget=20_000)
+    problem = resolved(problem, wanted="native")
+
+A gradient needs a backend that JAX can trace. Without one the faster backend is taken, as measured
+on this machine with this problem, unless the run is over before a compiler would be; what was
+chosen, and why, is told in the run.
+"""
+
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from verifai_jax.core.keys import run_keys
+from verifai_jax.evaluation.engine import engine_for
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.problem.problem import Problem
+
+WORTH_MEASURING = 30.0
+"""Seconds that a run must take natively before a slow compiler is asked for a quicker program,"""
+WORTH_TRYING = 5.0
+"""or so many where the system says that the compiled program is likely the quicker one."""
+
+
+class Choice(NamedTuple):
+    """A problem on one backend; its name, None for a system without; and why, for people."""
+
+    problem: Problem
+    backend: str | None
+    why: str = ""
+
+
+def resolved(
+    problem: Problem,
+    *,
+    gradient: bool = False,
+    batch: int = 1024,
+    budget: int = 10_000,
+    precision: str = "float32",
+    wanted: str | None = None,
+) -> Choice:
+    """The problem on the backend that suits the run.
+
+    - `wanted`: a backend by name; chosen here when left out, unless the system names one itself.
+
+    **Raises:** `UnknownNameError` for a backend that the system lacks; `ValueError` for one whose
+    system has none to choose from.
+    """
+    system: Any = problem.system
+    candidates: tuple[str, ...] = getattr(system, "backends", ())
+    if not candidates:
+        if wanted is not None:
+            raise ValueError(
+                f"the system of problem {problem.name!r} has no backends to choose from; "
+                f"got backend {wanted!r}"
+            )
+        return Choice(problem, None)
+    if wanted in (None, "auto"):
+        wanted = None if system.backend == "auto" else system.backend
+    if wanted is not None:
+        return Choice(problem.on_backend(wanted), wanted)
+    on_host = [name for name in candidates if problem.on_backend(name).black_box]
+    traced = [name for name in candidates if name not in on_host]
+    device = jax.default_backend()
+    if traced and (gradient or device != "cpu"):
+        why = "the search needs gradients" if gradient else f"runs on the {device}"
+        return Choice(problem.on_backend(traced[0]), traced[0], why)
+    if not traced or not on_host:
+        return Choice(problem.on_backend(candidates[0]), candidates[0])
+    return _fastest(problem, on_host[0], traced[0], batch, precision, budget)
+
+
+def _fastest(
+    problem: Problem, on_host: str, traced: str, batch: int, precision: str, budget: int
+) -> Choice:
+    # Measured once for a problem, so that its runs in one process agree on the backend.
+    known = problem.engines.setdefault("speeds", {})
+    host, compiled = problem.on_backend(on_host), problem.on_backend(traced)
+    kinds = [(name, batch, precision) for name in (on_host, traced)]
+    if kinds[0] not in known:
+        known[kinds[0]] = _measured(HostEngine(host, precision), host, batch)
+    speed = known[kinds[0]]
+    if kinds[1] not in known:
+        likely = getattr(problem.system, "likely", None) == traced
+        if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
+            seconds = f"{budget / speed:.1f} s for all simulations"
+            return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
+        try:
+            engine = engine_for(compiled, batch, precision=precision)
+            engine.compile()
+        except Exception as error:
+            first = (str(error).splitlines() or [type(error).__name__])[0]
+            return Choice(host, on_host, f"{traced} cannot simulate this model: {first}")
+        known[kinds[1]] = _measured(engine, compiled, batch)
+    other = known[kinds[1]]
+    told = f"measured {speed:,.0f} simulations/s on {on_host}, {other:,.0f} on {traced}"
+    return Choice(compiled, traced, told) if other > speed else Choice(host, on_host, told)
+
+
+def _measured(engine: Any, problem: Problem, batch: int) -> float:
+    """Simulations a second: the best of three batches after one to warm up."""
+    key = run_keys(0)[1]
+    u = np.random.default_rng(0).random((batch, problem.space.dim), np.float32)
+    engine.evaluate(u, key, 0)
+    best = float("inf")
+    for _ in range(3):
+        started = time.perf_counter()
+        engine.evaluate(u, key, 0)
+        best = min(best, time.perf_counter() - started)
+        if best > 2.0:
+            break  # A slow simulator is told from a quick one by one batch.
+    return batch / best

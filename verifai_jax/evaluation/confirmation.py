@@ -1,0 +1,359 @@
+"""Whether counterexamples are real: each is replayed more finely than it was found.
+
+    confirmer = Confirmer(problem, precision="float32", seed=0)
+    checked = confirmer(rows, numbers)                  # columns [n] of the table, row numbers [n]
+    checked.verdict                                     # [n]: "confirmed", "fragile", ...
+    checked.rho["quarter_step"]                         # [n], robustness at a quarter of the step
+
+A search simulates in single precision at the model's step; both may break a property that the
+model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
+quarter of the step, there in single precision too, and with features that are one rounding away;
+and if it fails by more than the finer step has moved it, and by far more than rounding has.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.keys import run_keys
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.text import format_error
+from verifai_jax.evaluation.replays import HostReplays, Replayed, Replays
+from verifai_jax.problem.problem import Problem
+
+VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
+"""See `Checked`."""
+FINER = {"half_step": 2, "quarter_step": 4}
+"""Checks at a finer step, and how many times finer."""
+SINGLE = "quarter_step_float32"
+AMPLIFIED = 4.0
+"""A row must fail by so many times what rounding has moved it: a chaotic system turns roundings
+into any of its outcomes, and two or three programs may agree by chance."""
+MOST = 256
+"""Rows that are examined whatever comes; each costs as much as 15 simulations of the run,"""
+SAFE = 10.0
+"""Others are left out only if so many times farther from zero than replays have moved any row,"""
+BLOCK = 64
+"""and that is looked at after so many rows."""
+
+
+IN_WORDS = {
+    "float64": "in float64",
+    "again": "simulated again",
+    "half_step": "at half the step",
+    "quarter_step": "at a quarter of the step",
+    SINGLE: "at a quarter of the step in float32",
+    "nudged": "one rounding of the features away",
+    "simulator": "in the other simulator",
+}
+
+
+class Checked(NamedTuple):
+    """What came of checking rows, `[n]` each.
+
+    - `verdict`: `confirmed`: it fails in every check, and by more than replays move it; `fragile`:
+      the checks disagree, one of them gave no robustness, or it fails by less than that;
+      `refuted`: none of the finer checks fails (half and quarter of the step and the other
+      simulator, or where the step stays, double precision); `unchecked`: there was nothing finer to
+      check with; `unexamined`: left out, see `Confirmer`.
+    - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
+      are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
+      `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
+      away) and `simulator`.
+    - `band`: how much the robustness moved: between half and quarter of the step, which is what a
+      method of order 1 is still off at the quarter (Richardson's extrapolation), or by rounding:
+      between two precisions, two neighbouring features, or the run and its replay where `rho` of
+      the run is known. A row is confirmed if it fails by more than the first and by four times the
+      second.
+    - `why`: the reason, for people; empty where confirmed.
+    - `notes`: which checks could not be made, and why.
+    """
+
+    verdict: np.ndarray
+    rho: dict[str, Float[np.ndarray, " n"]]
+    band: Float[np.ndarray, " n"]
+    why: list[str]
+    notes: tuple[str, ...]
+
+
+class Confirmer:
+    """Checks rows of a run's table; what it compiles is kept with the problem.
+
+    **Arguments:**
+
+    - `problem`: on the backend that it ran on.
+    - `precision`: of the run.
+    - `seed`: of the run; a simulation gets the random key that it had.
+    - `simulator`: another system for the same features and signals, or a problem with one, that
+      has to agree.
+    - `most`: how many rows are examined whatever comes. Of more, those nearest to zero are, and
+      further ones until the rest is ten times farther from zero than any replay has moved a row;
+      these stay `unexamined`. Only where rows have a column `rho`.
+
+    **Raises:** what `Problem.check` does, for a simulator that does not fit.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        precision: str = "float32",
+        seed: int = 0,
+        *,
+        simulator: Any = None,
+        most: int = MOST,
+    ) -> None:
+        if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
+            raise ValueError(f"most must be a positive integer; got {most!r}")
+        in_precision(precision)
+        self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
+        self.other = None if simulator is None else _other(problem, simulator)
+        self.examined, self.band = 0, 0.0
+        self._plan: _Plan | None = None
+
+    def __call__(self, rows: Mapping[str, Any], numbers: Sequence[int] | np.ndarray) -> Checked:
+        """Check these rows of the table.
+
+        - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
+        - `numbers`: `[n]`, of the rows, which decide on their random keys.
+
+        **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
+        """
+        numbers = np.asarray(numbers, int)
+        rows = {name: np.asarray(column) for name, column in rows.items()}
+        if not len(numbers):
+            return Checked(np.empty(0, object), {}, np.zeros(0), [], ())
+        run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
+        order = np.arange(len(numbers)) if run is None else np.argsort(np.abs(run), kind="stable")
+        parts: list[tuple[np.ndarray, _Found]] = []
+        while len(order):
+            free = self.most - self.examined
+            if run is None:
+                free = len(order)
+            elif free <= 0 and self.far(float(run[order[0]])):
+                break
+            block, order = np.split(order, [max(free, BLOCK)])
+            taken = {name: column[block] for name, column in rows.items()}
+            parts.append((block, self._examined(taken, numbers[block], taken.get("rho"))))
+            self.examined += len(block)
+            self.band = max(self.band, float(np.max(parts[-1][1].band)))
+        return self._together(parts, order, run)
+
+    @property
+    def finer(self) -> bool:
+        """Whether there is more to do for a black box than to simulate it once more.
+
+        What JAX traces can always be looked at in double precision.
+        """
+        if not self.problem.black_box or self.other is not None:
+            return True
+        replays = HostReplays(self.problem, self.precision, run_keys(self.seed)[1])
+        return replays.refiner.why_not(FINER.values()) is None
+
+    def far(self, rho: float) -> bool:
+        """Whether a robustness is so far from zero that no replay will have another sign.
+
+        That is ten times as far as any replay has moved a row so far.
+        """
+        return bool(abs(rho) > SAFE * self.band)
+
+    def _examined(
+        self, rows: Mapping[str, np.ndarray], numbers: np.ndarray, run: np.ndarray | None
+    ) -> "_Found":
+        if self._plan is None:
+            self._plan = _planned(self, rows)
+        features: dict[str, Any] = {}
+        found = {}
+        for name, check in self._plan.checks.items():
+            if check.precision not in features:
+                features[check.precision] = self.problem.space.features_of(rows, check.precision)
+            values = features[check.precision]
+            if name == "nudged":
+                values = self.problem.space.nudged(values)
+            found[name] = check.replays(check.factor, values, numbers)
+        return _decided(len(numbers), found, run, self._plan)
+
+    def _together(
+        self, parts: list[tuple[np.ndarray, "_Found"]], rest: np.ndarray, run: Any
+    ) -> Checked:
+        """The rows of all parts in their order, and those that were left out."""
+        count = sum(len(block) for block, _ in parts) + len(rest)
+        assert self._plan is not None
+        verdict = np.full(count, "unexamined", object)
+        rho = {name: np.full(count, np.nan) for name in self._plan.checks}
+        band, why, notes = np.full(count, np.nan), [""] * count, list(self._plan.notes)
+        for block, found in parts:
+            verdict[block], band[block] = found.verdict, found.band
+            for name in rho:
+                rho[name][block] = found.replayed[name].rho
+            for place, reason in zip(block.tolist(), found.why, strict=True):
+                why[place] = reason
+        if len(rest):
+            nearest = np.min(np.abs(run[rest]))
+            note = (
+                f"{len(rest)} of {count} were not replayed: {nearest:.3g} or more from zero, where "
+                f"none of {self.examined} replays moved a row by more than {self.band:.2g}"
+            )
+            notes.append(note)
+            for place in rest.tolist():
+                why[place] = note
+        return Checked(verdict, rho, band, why, tuple(notes))
+
+
+class _Check(NamedTuple):
+    """One kind of replay: of features in this precision, with a so many times smaller step."""
+
+    replays: Any
+    factor: int
+    precision: str
+
+
+class _Plan(NamedTuple):
+    """The checks by name, what was decided, and whether any says more than the run itself did."""
+
+    checks: dict[str, _Check]
+    notes: tuple[str, ...]
+    independent: bool
+
+
+def _planned(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
+    problem, run = confirmer.problem, confirmer.precision
+    checks: dict[str, _Check] = {}
+    base, precision, notes = _replays(problem, confirmer, rows)
+    refined = False
+    if base is not None:
+        name = "float64" if precision == "float64" else "again"
+        checks[name] = _Check(base, 1, precision)
+        reason = base.refiner.why_not(FINER.values())
+        refined = reason is None
+        if refined:
+            for name, factor in FINER.items():
+                checks[name] = _Check(base, factor, precision)
+            if precision != run:
+                first = {column: values[:1] for column, values in rows.items()}
+                single = Replays(problem, run, base.key, problem.space.features_of(first, run))
+                checks[SINGLE] = _Check(single, FINER["quarter_step"], run)
+        else:
+            notes.append(f"not checked at a finer step: {reason}")
+        if not problem.black_box:
+            checks["nudged"] = _Check(base, FINER["quarter_step"] if refined else 1, precision)
+    if confirmer.other is not None:
+        other, precision, said = _replays(confirmer.other, confirmer, rows)
+        notes += [f"the other simulator: {note}" for note in said]
+        if other is not None:
+            checks["simulator"] = _Check(other, 1, precision)
+    finer = refined or "simulator" in checks or ("float64" in checks and run != "float64")
+    # A black box that is asked again may well answer something else.
+    return _Plan(checks, tuple(notes), finer or (problem.black_box and base is not None))
+
+
+def _replays(
+    problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarray]
+) -> tuple[Any, str, list[str]]:
+    """What replays a problem's rows, in which precision, and what there is to say about it."""
+    run, key = confirmer.precision, run_keys(confirmer.seed)[1]
+    if problem.black_box:
+        return HostReplays(problem, run, key), run, ["not checked in float64: a black box"]
+    # All of one form: one row is enough to trace.
+    first = {name: column[:1] for name, column in rows.items()}
+    notes: list[str] = []
+    try:
+        replays = Replays(problem, "float64", key, problem.space.features_of(first, "float64"))
+        if not (replays.draws and run != "float64"):
+            return replays, "float64", notes
+        notes.append("not checked in float64: in it the system would draw other random numbers")
+    except Exception as error:
+        notes.append(f"not checked in float64: {format_error(error)}")
+        if run == "float64":
+            return None, run, notes
+    try:
+        return Replays(problem, run, key, problem.space.features_of(first, run)), run, notes
+    except Exception as error:
+        return None, run, [*notes, f"not simulated again: {format_error(error)}"]
+
+
+class _Found(NamedTuple):
+    """What was decided of some rows, and their replays by check."""
+
+    verdict: np.ndarray
+    band: Float[np.ndarray, " n"]
+    why: list[str]
+    replayed: dict[str, Replayed]
+
+
+def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _Found:
+    base = next((name for name in ("float64", "again") if name in found), "")
+    finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
+    rho = {name: replayed.rho for name, replayed in found.items()}
+    step = rounding = np.zeros(count)
+    if "half_step" in found:
+        step = _moved(rho["half_step"], rho["quarter_step"])
+    for name in (SINGLE, "nudged"):
+        if name in found:
+            rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
+    if run is not None and base:
+        rounding = np.maximum(rounding, _moved(run, rho[base]))
+    band = np.maximum(step, rounding)
+    if not plan.independent:
+        reason = "; ".join(plan.notes) or "the run was in float64 already"
+        return _Found(np.full(count, "unchecked", object), band, [reason] * count, found)
+    deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
+    deciding = [name for name in (*deciding, "simulator") if name in found]
+    failing = {name: replayed.failing for name, replayed in found.items()}
+    holding = {name: r.proper & ~r.failing for name, r in found.items()}
+    clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
+    confirmed = np.all(list(failing.values()), axis=0) & clear
+    refuted = np.all([holding[name] for name in deciding], axis=0) & (deciding[0] != "again")
+    verdict = np.where(confirmed, "confirmed", np.where(refuted, "refuted", "fragile"))
+    why = [""] * count
+    for i in np.flatnonzero(~confirmed).tolist():
+        why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
+    return _Found(verdict.astype(object), band, why, found)
+
+
+def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """By how much a robustness moved: without end where one of the two is missing."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)
+
+
+def _reason(i: int, found: dict[str, Replayed], rho: float, band: float) -> str:
+    lost = [name for name, replayed in found.items() if not replayed.proper[i]]
+    if lost:
+        message = next((m for name in lost if (m := found[name].messages[i])), "")
+        return f"no verdict {_and(lost)}{f': {message}' if message else ', it is not finite'}"
+    holds = [name for name, replayed in found.items() if not replayed.failing[i]]
+    if len(holds) == len(found):
+        return "it holds in every replay"
+    if holds:
+        fails = [name for name in found if name not in holds]
+        few = len(holds) <= len(fails)
+        return f"it holds {_and(holds)}" if few else f"it fails only {_and(fails)}"
+    return f"its robustness {rho:.3g} moves by {band:.2g} between replays"
+
+
+def _and(names: Sequence[str]) -> str:
+    words = [IN_WORDS[name] for name in names]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _other(problem: Problem, simulator: Any) -> Problem:
+    """The problem with another system."""
+    if isinstance(simulator, str):
+        if not getattr(problem.system, "backends", ()):
+            raise ValueError(
+                f"the system of problem {problem.name!r} has no backends; simulator must be a "
+                f"system or a Problem, got {simulator!r}"
+            )
+        other = problem.on_backend(simulator)
+    else:
+        system = simulator.system if isinstance(simulator, Problem) else simulator
+        if isinstance(simulator, Problem):
+            check_names("feature of the simulator", simulator.space.columns, problem.space.columns)
+            check_names("feature", problem.space.columns, simulator.space.columns)
+        other = replace(problem, system=system)
+    other.check()
+    return other

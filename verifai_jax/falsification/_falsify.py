@@ -1,0 +1,372 @@
+"""The falsification loop: budgets, stopping, progress, storing, resuming.
+
+run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
+run = falsify(problem, search=search.Gradient(learning_rate=0.2), stop_after=10)
+run = resume(run, budget=50_000)
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from verifai_jax import search as searches
+from verifai_jax._version import __version__
+from verifai_jax.core.errors import check_names, suggests_options
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import Progress
+from verifai_jax.evaluation.backends import Choice, resolved
+from verifai_jax.falsification.loop import Rounds
+from verifai_jax.falsification.run import Run, load, write_record
+from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.falsification.validation import (
+    check_gradient,
+    check_options,
+    check_rule,
+    check_same_space,
+    check_search,
+    described,
+    earlier_rows,
+    needs_slopes,
+    new_folder,
+    usable,
+    usual_batch,
+    writing,
+)
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.statistics.binomial import StoppingRule
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class RunError(RuntimeError):
+    """The loop broke down; `run` holds every batch finished before."""
+
+    def __init__(self, message: str, run: Run) -> None:
+        super().__init__(message)
+        self.run = run
+
+
+@suggests_options
+def falsify(
+    problem: Problem,
+    search: str | Search = "portfolio",
+    budget: int = 10_000,
+    *,
+    batch: int | None = None,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    stop_after: int | None = None,
+    stop_when: StoppingRule | None = None,
+    warm_start: "Run | ErrorTable | pd.DataFrame | None" = None,
+    folder: str | Path | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+    confirm: bool = True,
+    diverse: bool = False,
+    progress: bool | None = None,
+    target: str | None = None,
+) -> Run:
+    """Search the feature space for inputs under which the system breaks its property.
+
+    **Arguments:**
+
+    - `problem`: what to break.
+    - `search`: a name (`verifai_jax.search.names()`), or a search with its options.
+    - `budget`: simulations at most; the last batch is cut to fit.
+    - `batch`: simulations a round. Active searches learn once a round: a small batch spends
+      fewer simulations, a large one less time. By default 1024, and for a search that learns at
+      most a twentieth of the budget, so that it can (16 for `bayes`).
+    - `seed`: the same seed gives the same table, bit for bit, on the same machine.
+    - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
+    - `stop_after`: stop after the round in which that many counterexamples are reached.
+    - `stop_when`: stop when the failure rate is known well enough: `Within(0.005)`,
+      `Decided(0.01)`; only for searches that sample the prior.
+    - `warm_start`: an earlier run or table with the same features, from which a search that learns
+      starts. Its rows are not copied.
+    - `folder`: where rows are kept on disk as they come; must not hold another run.
+    - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
+    - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
+      can use when left out, as measured here. Name it for the same table on every machine.
+    - `confirm`: replay what violates the property in double precision and at a half and a quarter
+      of the step, and claim only what still does (`vj.confirm` says more of a row). The others
+      stay in the table, as `unconfirmed`.
+    - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
+      failures that are far from each other (`search.Diverse`).
+    - `progress`: show a progress bar; by default on a terminal or in a notebook.
+    - `target`: how the command line names the problem, for the record.
+
+    Ctrl-C ends the run and returns what is finished.
+
+    **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
+    problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
+    work on the space, a folder that cannot be written; `RunError` with the finished part of the run
+    when the loop breaks down.
+    """
+    started = time.perf_counter()
+    check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    search = check_search(problem, search)
+    check_rule(search, stop_when)
+    earlier = earlier_rows(warm_start, problem)
+    in_precision(precision)
+    # Far from what is found already takes rounds, more than many at once.
+    usual = min(16, budget) if diverse else usual_batch(search, budget, stop_after)
+    batch = min(usual if batch is None else batch, budget)
+    choice = resolved(
+        problem, gradient=needs_slopes(search), batch=batch, budget=budget, precision=precision,
+        wanted=backend,
+    )  # fmt: skip
+    problem = choice.problem
+    check_gradient(problem, search)
+    problem.check()
+    search, notes = usable(problem, search)
+    if diverse:
+        search = searches.Diverse(search, capacity=max(256, stop_after or 0))
+    place = new_folder(folder)
+    table = ErrorTable(tuple(problem.space.columns), place)
+    rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)
+
+    def prepare() -> None:
+        if earlier is not None:
+            rounds.warm(earlier)
+
+    ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
+    return _play(rounds, ends, seed, choice, progress, target, prepare, notes)
+
+
+@suggests_options
+def simulate(
+    problem: Problem,
+    rows: "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]",
+    *,
+    batch: int = 1024,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Simulate given features, in their order: no search, a row of the table for each.
+
+    **Arguments:**
+
+    - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
+      file), or features as a person writes them, one or several.
+    - the others as in `falsify`.
+
+    Features pass through the unit cube, which changes the last digit of some real ones.
+
+    **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
+    """
+    if hasattr(rows, "columns"):
+        check_names("column", problem.space.columns, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
+        points = problem.space.points(rows)  # pyright: ignore[reportArgumentType]
+    else:
+        listed = [rows] if isinstance(rows, Mapping) else list(rows)
+        points = np.stack([problem.space.flatten(problem.space.coerce(row)) for row in listed])
+    return falsify(
+        problem, searches.Listed(points), len(points),
+        batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
+        confirm=False, progress=progress,
+    )  # fmt: skip
+
+
+@suggests_options
+def resume(
+    run: Run | str | Path,
+    problem: Problem | None = None,
+    *,
+    search: Search | None = None,
+    budget: int | None = None,
+    max_seconds: float | None = None,
+    stop_after: int | None = None,
+    stop_when: StoppingRule | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
+
+    **Arguments:**
+
+    - `run`: a run, or the folder of one; a folder is written on.
+    - `problem`: needed for a folder, which names no code to run.
+    - `search`: needed only if it is none of `verifai_jax.search`.
+    - `budget`: simulations in all, those done included; the run's own when left out.
+    - the others as in `falsify`.
+
+    The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
+    of a search that learns does a larger one go on with a new batch.
+
+    **Raises:** `ValueError` for a run without its problem or its state, or a budget that is spent;
+    as `falsify` otherwise.
+    """
+    started = time.perf_counter()
+    if isinstance(run, str | Path):
+        run = load(run, problem)
+    problem = problem or run.problem
+    if problem is None:
+        raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
+    if search is None:
+        if run.search_data is None:
+            raise ValueError(
+                f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
+            )
+        search = searches.from_json(run.search_data)
+    search = check_search(problem, search)
+    check_same_space(run, problem)
+    check_rule(search, stop_when)
+    budget = run.budget if budget is None else budget
+    check_options(budget, run.batch, run.seed, max_seconds, stop_after)
+    snapshot = run.snapshot or {}
+    rows = int(snapshot.get("rows", 0))
+    if budget <= rows:
+        raise ValueError(
+            f"the run of {run.name!r} has {rows} simulations already; resume it with a larger "
+            f"budget than {budget}"
+        )
+    if not snapshot and len(run.table) and run.stopped != "running":
+        raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+    if rows > len(run.table):
+        raise ValueError(
+            f"the run of {run.name!r} cannot go on: its search had seen {rows} simulations, of "
+            f"which its table has {len(run.table)}; files of {run.folder} are missing or damaged"
+        )
+    choice = resolved(problem, wanted=run.backend)
+    problem = choice.problem
+    check_gradient(problem, search)
+    problem.check()
+    with writing(run.folder):
+        table = run.table.resumed(rows, run.folder)
+    rounds = Rounds(
+        problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm
+    )
+
+    def prepare() -> None:
+        if snapshot:
+            rounds.resume(snapshot)
+
+    ends = _Ends(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
+    told = [note for note in run.notes if note.startswith("portfolio ")]
+    return _play(rounds, ends, run.seed, choice, progress, run.target, prepare, told)
+
+
+class _Ends(NamedTuple):
+    """What ends a run."""
+
+    started: float
+    budget: int
+    max_seconds: float | None
+    stop_after: int | None
+    stop_when: StoppingRule | None
+    earlier: float = 0.0  # Seconds that an earlier part of the run has taken.
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self.started
+
+    def reached(self, rounds: Rounds) -> str | None:
+        """What ends the run after this round, if anything does."""
+        if self.stop_after is not None and rounds.distinct >= self.stop_after:
+            return "stop_after"
+        if self.stop_when is not None and self.stop_when.done(rounds.found, rounds.judged):
+            return "stop_when"
+        if len(rounds.table) >= self.budget:
+            return "budget"
+        if rounds.exhausted:
+            return "exhausted"
+        if self.max_seconds is not None and self.seconds >= self.max_seconds:
+            return "max_seconds"
+        return None
+
+
+def _play(
+    rounds: Rounds,
+    ends: _Ends,
+    seed: int,
+    choice: Choice,
+    progress: bool | None,
+    target: str | None,
+    prepare: Callable[[], None],
+    told: Sequence[str] = (),
+) -> Run:
+    """Compile, `prepare`, and play rounds until something ends them."""
+    problem, search, place = rounds.problem, rounds.search, rounds.folder
+    chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
+
+    def run(stopped: str) -> Run:
+        return Run(
+            name=problem.name,
+            formulas={name: str(formula) for name, formula in problem.formulas.items()},
+            table=rounds.table,
+            search=repr(search),
+            seed=int(seed),
+            batch=rounds.batch,
+            stopped=stopped,
+            compile_seconds=rounds.compile_seconds,
+            run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds,
+            version=__version__,
+            prior=search.samples_prior,
+            folder=place,
+            target=target,
+            problem=problem,
+            budget=int(ends.budget),
+            search_data=searches.to_json(search),
+            space_data=described(problem),
+            acceptance=rounds.acceptance,
+            snapshot=rounds.snapshot,
+            precision=rounds.precision,
+            backend=choice.backend,
+            confirm=rounds.confirms,
+            notes=(*chosen, *told, *rounds.notes),
+        )
+
+    if place is not None:
+        with writing(place):
+            write_record(run("running"), place)
+    stopped, cause = None, None
+    try:
+        with Progress(problem.name, ends.budget, progress) as bar:
+            rounds.compile()
+            prepare()
+            # Checking and tracing are part of what a second run of the problem does not repeat.
+            rounds.compile_seconds = ends.seconds
+            stopped = "exhausted" if rounds.exhausted else None
+            while stopped is None:
+                rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)))
+                bar.update(len(rounds.table), rounds.found, rounds.best)
+                stopped = ends.reached(rounds)
+                if stopped is None:
+                    rounds.save(seldom=True)
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    except Exception as error:
+        stopped, cause = f"{type(error).__name__}: {error}", error
+    result = run(stopped)
+    try:
+        rounds.table.close()
+        rounds.save()
+        if place is not None:
+            write_record(result, place)
+    except OSError as error:
+        cause = cause or error
+    if cause is not None:
+        raise RunError(
+            _broke_down(problem.name, len(rounds.table), place, cause), result
+        ) from cause
+    return result
+
+
+def _broke_down(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
+    told = f"the run of {name!r} broke down after {simulations} simulations: {cause}. "
+    if place is None:
+        return f"{told}They are in the .run of this error"
+    if isinstance(cause, OSError):
+        return (
+            f"{told}All of them are in the .run of this error, and in {place} those up to the last "
+            "whole batch that could be written: make room there and resume it, or save the run "
+            "elsewhere"
+        )
+    return f"{told}They are in the .run of this error and in {place}, which can be resumed"

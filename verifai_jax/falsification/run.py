@@ -1,0 +1,419 @@
+"""The result of a falsification: its table, its statistics, and how to see a row again.
+
+run.summary()                      what failed, how often, the worst case
+run.table.counterexamples          a DataFrame
+run.replay(run.best)               the trace behind a row
+run.save("runs/mine"); vj.load("runs/mine", problem)
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.text import format_features
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.evaluation.engine import judge, verdict
+from verifai_jax.falsification.checkpoint import read_snapshot, write_snapshot
+from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.mtl import Explanation, explain
+from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.rulebook import Rulebook
+from verifai_jax.statistics.binomial import Rate, at_any_time, clopper_pearson
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RECORD = "run.json"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One simulation, looked at again.
+
+    `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
+    random key of the simulation.
+    """
+
+    problem: Problem
+    row: int | None
+    features: dict[str, Any]
+    trace: Trace
+    rho: dict[str, float]
+    status: Status
+    key: Key[Array, ""] | None = None
+
+    @property
+    def violated(self) -> bool:
+        """Whether the simulation ended properly and breaks a formula."""
+        if self.status != Status.OK or min(self.rho.values()) != 0:
+            return self.status == Status.OK and min(self.rho.values()) < 0
+        return not bool(jnp.all(verdict(self.problem, self.trace)))
+
+    @property
+    def worst(self) -> str:
+        """Name of the formula with the least robustness."""
+        return min(self.rho, key=lambda name: float(np.nan_to_num(self.rho[name], nan=np.inf)))
+
+    def explain(self) -> Explanation:
+        """Which predicate decides the worst formula, when, and through which sub-formulas.
+
+        **Raises:** `ValueError` for a simulation without a verdict.
+        """
+        if self.status != Status.OK:
+            raise ValueError(f"no verdict to explain: the simulation is {self.status.name.lower()}")
+        formula = self.problem.formulas[self.worst]
+        return explain(formula, self.trace, end=self.problem.end)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the signals with the violated bound and instant marked; returns the figure."""
+        from verifai_jax.plotting import plot_replay
+
+        return plot_replay(self, path)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What `falsify` returns.
+
+    **Fields:** `name` and `formulas` (texts) of the problem; `table`; `search` (its repr), `seed`
+    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`,
+    `"exhausted"` (a finite search came to its end), `"interrupted"`, the error that ended it, or
+    `"running"` for one that was cut off;
+    `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
+    independent samples of the feature space; `folder` on disk, if any; `target`: how the command
+    line names the problem; `problem` itself, None for a loaded run without one; `budget`;
+    `search_data` and `space_data`: the search and the space as plain data, None for one of the
+    user's own; `acceptance`: share of
+    proposed points that the constraint of the space let through, None without one; `snapshot`: what
+    `resume` goes on from; `precision` of the simulations; `backend` that simulated, None for a
+    system that has one only; `notes` on what was decided by itself, for people; `confirm`: whether
+    what violates the property was looked at closely before it was claimed.
+    """
+
+    name: str
+    formulas: dict[str, str]
+    table: ErrorTable
+    search: str
+    seed: int
+    batch: int
+    stopped: str
+    compile_seconds: float
+    run_seconds: float
+    version: str
+    prior: bool
+    folder: Path | None = None
+    target: str | None = None
+    problem: Problem | None = None
+    budget: int = 0
+    search_data: Mapping[str, Any] | None = None
+    space_data: Mapping[str, Any] | None = None
+    acceptance: float | None = None
+    snapshot: Mapping[str, Any] | None = None
+    precision: str = "float32"
+    backend: str | None = None
+    notes: Sequence[str] = ()
+    confirm: bool = False
+
+    @property
+    def simulations(self) -> int:
+        """Simulations in the table."""
+        return len(self.table)
+
+    @property
+    def best(self) -> "pd.Series":
+        """The row with the least robustness among the counterexamples, or among all that ended.
+
+        **Raises:** `ValueError` when no simulation ended properly.
+        """
+        table = self.table.all
+        proper = table.loc[table["status"] == "ok"]
+        if len(claimed := self.table.counterexamples):
+            return claimed.loc[claimed["rho"].idxmin()]
+        if not len(proper):
+            raise ValueError(
+                f"run of {self.name!r} has no simulation with a verdict: "
+                f"{len(table)} simulated, {len(self.table.failed)} of them failed"
+            )
+        return proper.loc[proper["rho"].idxmin()]
+
+    @property
+    def failure_rate(self) -> Rate | None:
+        """Failures per simulation with a 95 % interval.
+
+        Clopper-Pearson where the number of simulations was not decided by their outcomes, else
+        one that holds whenever sampling stops. None unless the rows are independent samples of
+        the feature space and at least one of them has a verdict: an active search may refute, it
+        never certifies. Simulations without a verdict do not count.
+        """
+        # The rate is that of the system as simulated: what is not confirmed counts as a failure.
+        failures = len(self.table.counterexamples) + len(self.table.unconfirmed)
+        safe = len(self.table.safe)
+        if not self.prior or failures + safe == 0:
+            return None
+        if self.stopped in ("stop_after", "stop_when"):
+            return at_any_time(failures, failures + safe)
+        return clopper_pearson(failures, failures + safe)
+
+    @property
+    def front(self) -> "pd.DataFrame":
+        """The counterexamples that no other one outdoes: with several formulas, the Pareto set.
+
+        Compared by how much each formula is broken, in the order of the problem's priority;
+        without one no formula makes up for another. With one formula: the worst row.
+
+        **Raises:** `ValueError` for a run loaded without its problem.
+        """
+        if self.problem is None:
+            raise ValueError(
+                f"the run of {self.name!r} was loaded without its problem, which has the priority "
+                "of its formulas; give it: vj.load(path, problem)"
+            )
+        failing = self.table.counterexamples
+        names = [f"rho.{name}" for name in self.formulas] if len(self.formulas) > 1 else ["rho"]
+        broken = np.maximum(-failing[names].to_numpy(np.float64), 0.0)
+        rulebook = self.problem.rulebook or Rulebook(self.formulas)
+        return failing.loc[rulebook.front(broken)] if len(failing) else failing
+
+    def analyze(self, **options: Any) -> Any:
+        """What the table says: rules, importance, clusters, coverage; see `analysis.analyze`."""
+        from verifai_jax.analysis import analyze
+
+        return analyze(self, **options)
+
+    def replay(
+        self, row: "int | pd.Series | Mapping[str, Any]", precision: str | None = None
+    ) -> Replay:
+        """Simulate a row of the table again and keep its trace.
+
+        - `row`: a row number, or a row of `table.all` (its index is the row number), or any
+          mapping with the feature columns.
+        - `precision`: `"float32"` or `"float64"`; that of the run when left out.
+
+        **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
+        in the table.
+        """
+        if self.problem is None:
+            raise ValueError(
+                f"the run of {self.name!r} was loaded without its problem; "
+                "give it: vj.load(path, problem)"
+            )
+        number: int | None
+        if isinstance(row, (int, np.integer)):
+            if not 0 <= row < len(self.table):
+                raise IndexError(f"row {row} is not in the table of {len(self.table)} simulations")
+            number, values = int(row), self.table.all.iloc[int(row)]
+        else:
+            number, values = getattr(row, "name", None), row
+        precision = self.precision if precision is None else precision
+        return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+
+    def summary(self) -> str:
+        """What failed, how often, the worst case and how to see it again, for people."""
+        return _summary(self)
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """Draw the feature space with safe and failing samples; returns the figure."""
+        from verifai_jax.plotting import plot_features
+
+        return plot_features(self, path)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the run to a folder: its record, table and state; returns the folder."""
+        folder = Path(path)
+        self.table.save(folder)
+        write_record(self, folder)
+        if self.snapshot:
+            write_snapshot(self.snapshot, folder)
+        return folder
+
+    def __repr__(self) -> str:
+        return self.summary()
+
+
+def replay(
+    problem: Problem,
+    row: Any,
+    key: Key[Array, ""],
+    number: int | None = None,
+    precision: str = "float32",
+) -> Replay:
+    """Simulate the features of `row` with the random key that simulation `number` had.
+
+    **Raises:** `ValueError` for a precision other than float32 and float64.
+    """
+    key = simulation_key(key, 0 if number is None else number)
+    with in_precision(precision):
+        features = problem.space.from_row(row)
+        if problem.black_box:
+            trace = problem.system(features, key)
+        else:
+            precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
+            trace = jax.jit(problem.system)(precise, key)
+        rho, status = jax.jit(judge, static_argnums=0)(problem, trace)
+        return Replay(
+            problem=problem,
+            row=number,
+            features=features,
+            trace=trace.trim(),
+            rho={name: float(value) for name, value in zip(problem.formulas, rho, strict=True)},
+            status=Status(int(status)),
+            key=key,
+        )
+
+
+def _cast(leaf: Any, precision: str) -> Any:
+    leaf = jnp.asarray(leaf)
+    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
+
+
+def write_record(run: Run, folder: Path) -> None:
+    """Write everything about a run but its table to `run.json`."""
+    record = {"format": FORMAT, "features": list(run.table.features)}
+    for name in (*_RECORDED, *_ADDED):
+        record[name] = getattr(run, name)
+    partial = folder / f"{RECORD}.part"
+    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.replace(folder / RECORD)
+
+
+_RECORDED = (
+    "name",
+    "formulas",
+    "search",
+    "seed",
+    "batch",
+    "stopped",
+    "compile_seconds",
+    "run_seconds",
+    "version",
+    "prior",
+    "target",
+)
+# Absent from the records of 0.1.
+_ADDED = (
+    "budget",
+    "search_data",
+    "space_data",
+    "acceptance",
+    "precision",
+    "backend",
+    "notes",
+    "confirm",
+)
+
+
+def load(path: str | Path, problem: Problem | None = None) -> Run:
+    """Read a run back from its folder, also one that was cut off.
+
+    - `problem`: needed to replay rows; a file names no code to run.
+
+    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record of
+    another format, or a problem whose name, formulas or features differ from the recorded ones.
+    """
+    folder = Path(path)
+    if not (folder / RECORD).exists():
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
+    record = json.loads((folder / RECORD).read_text())
+    if record.get("format") != FORMAT:
+        raise ValueError(
+            f"{folder / RECORD} has format {record.get('format')!r}; this version reads {FORMAT}"
+        )
+    features = tuple(record["features"])
+    if problem is not None:
+        texts = {name: str(formula) for name, formula in problem.formulas.items()}
+        for what, recorded, given in (
+            ("name", record["name"], problem.name),
+            ("formulas", record["formulas"], texts),
+            ("features", features, tuple(problem.space.columns)),
+        ):
+            if recorded != given:
+                raise ValueError(
+                    f"the run in {folder} is of another problem: its {what} is {recorded!r}, "
+                    f"the given one's {given!r}"
+                )
+        if record.get("backend") is not None:
+            problem = problem.on_backend(record["backend"])
+    begun = ErrorTable.exists(folder) or record["stopped"] != "running"
+    return Run(
+        # A run that was cut off before its first batch came to the disk has no rows yet.
+        table=ErrorTable.load(folder, features) if begun else ErrorTable(features),
+        folder=folder,
+        problem=problem,
+        snapshot=read_snapshot(folder),
+        **{name: record[name] for name in _RECORDED},
+        **{name: record[name] for name in _ADDED if name in record},
+    )
+
+
+def _summary(run: Run) -> str:
+    failures, failed = len(run.table.counterexamples), run.table.failed
+    lines = [f"{run.name}: {failures} of {run.simulations} simulations violate the property"]
+    for name, text in run.formulas.items():
+        lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
+    if verdicts := _verdicts(run):
+        lines.append(f"  confirmed    {verdicts}")
+    rate = run.failure_rate
+    if rate is not None:
+        lines.append(f"  failure rate {rate}")
+    elif not run.prior:
+        lines.append(
+            "  failure rate not given: this search goes where failures are; "
+            "use search='uniform' for a rate"
+        )
+    if failures + len(run.table.safe) + len(run.table.unconfirmed):
+        best = run.best
+        where = format_features({name: best[name] for name in run.table.features})
+        lines.append(
+            f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
+            f"robustness {best['rho']:.4g} at {where}"
+        )
+    if len(failed):
+        counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
+        lines.append(f"  no verdict   {counts}")
+        if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
+            number, message = raised.index[0], raised["message"].iloc[0]
+            lines.append(f"               first in row {number}: {message}")
+    if "gradient_finite" in run.table.all:
+        lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
+        if lost:
+            lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
+    lines.extend(f"  note         {note}" for note in run.notes)
+    if run.acceptance is not None:
+        lines.append(f"  constraint   let through {100 * run.acceptance:.3g} % of all proposals")
+    speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
+    lines.append(
+        f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "
+        f"{speed:,.0f} simulations/s; stopped by {run.stopped}"
+    )
+    lines.append(f"  search       {run.search}, seed {run.seed}")
+    return "\n".join(lines)
+
+
+def _verdicts(run: Run) -> str:
+    """What closer looks said of the rows that violate the property."""
+    table = run.table.all
+    if "verdict" not in table:
+        return ""
+    counts = table.loc[table["violated"], "verdict"].value_counts().to_dict()
+    parts = [
+        f"{counts[verdict]} {words}"
+        for verdict, words in (
+            ("confirmed", "in double precision and at a quarter of the step"),
+            ("unexamined", "so far from zero that no replay was needed"),
+            ("unchecked", "could not be replayed more finely"),
+            ("fragile", "fragile and not claimed: closer replays disagree"),
+            ("refuted", "refuted and not claimed: closer replays hold"),
+        )
+        if verdict in counts
+    ]
+    return "; ".join(parts)

@@ -1,0 +1,204 @@
+"""What `falsify` and `resume` are asked for, checked before anything compiles."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from verifai_jax import search as searches
+from verifai_jax.core.errors import check_names
+from verifai_jax.falsification.run import RECORD, Run
+from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.problem.dependence import informative
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.statistics.binomial import StoppingRule
+
+
+@contextmanager
+def writing(place: Path | None) -> Iterator[None]:
+    """Turn what a file system refuses into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(
+            f"folder {str(place)!r} cannot be written ({error.strerror or error}); give one that "
+            "can be, or none to keep the run in memory"
+        ) from error
+
+
+def usual_batch(search: Search, budget: int, stop_after: int | None = None) -> int:
+    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few.
+
+    One that stops at few counterexamples gets small batches: it is likely to end in its first.
+    """
+    if not search.learns:
+        return search.most_at_once
+    most = search.most_at_once if stop_after is None else min(search.most_at_once, 16 * stop_after)
+    return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
+    """Refuse numbers out of range.
+
+    **Raises:** `ValueError`.
+    """
+    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
+        if name == "stop_after" and value is None:
+            continue
+        if not _is_integer(value) or value < 1:
+            raise ValueError(f"{name} must be an integer of at least 1; got {value!r}")
+    if not _is_integer(seed) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
+    if max_seconds is not None and not max_seconds > 0:
+        raise ValueError(f"max_seconds must be positive; got {max_seconds!r}")
+
+
+def check_search(problem: Any, search: Any) -> Search:
+    """The search, by its name or itself, if it can work on this problem.
+
+    **Raises:** `TypeError` for what is no problem or no search; `ValueError` for one that cannot.
+    """
+    if not isinstance(problem, Problem):
+        raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
+    if isinstance(search, str):
+        search = searches.named(search)
+    if not isinstance(search, Search):
+        raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
+    if not getattr(problem.system, "backends", ()):
+        check_gradient(problem, search)
+    problem.space.check_where()
+    search.check(problem.space.cube)
+    return search
+
+
+def _why_not_traced(system: Any) -> str:
+    """What a system with several backends says of those that JAX could trace."""
+    if "mjx" in getattr(system, "backends", ("mjx",)) or not hasattr(system, "why_not"):
+        return ""
+    return f". It does not run on mjx: {system.why_not('mjx')}"
+
+
+def needs_slopes(search: Search) -> bool:
+    """Whether this search can do nothing without derivatives; a portfolio can."""
+    clauses = search.wants_clauses and not isinstance(search, searches.Portfolio)
+    return search.wants_gradient or clauses
+
+
+def check_gradient(problem: Problem, search: Search) -> None:
+    """Refuse a search that needs gradients of a system that has none.
+
+    **Raises:** `ValueError`.
+    """
+    wants = needs_slopes(search)
+    if wants and problem.rulebook is not None and search.wants_clauses:
+        raise ValueError(
+            f"search {search!r} descends on clauses, which have no order; problem "
+            f"{problem.name!r} has a priority. Use 'portfolio' or 'cross_entropy'"
+        )
+    if problem.black_box and wants:
+        why = _why_not_traced(problem.system)
+        raise ValueError(
+            f"the system of problem {problem.name!r} is a black box, which has no gradient, and "
+            f"search {search!r} needs one; use one that does not, such as 'cross_entropy'{why}"
+        )
+
+
+def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
+    """The search as it can work on this problem, and notes on what it does without.
+
+    A portfolio does without slopes where there are none.
+    """
+    if not isinstance(search, searches.Portfolio) or not search.slopes:
+        return search, ()
+    if problem.black_box:
+        why = "the system is a black box"
+    elif problem.rulebook is not None:
+        why = "a priority has no gradient"
+    elif not len(problem.space.cube.continuous):
+        why = "all features are discrete"
+    elif not informative(problem):
+        why = "the robustness is constant almost everywhere"
+    else:
+        return search, ()
+    return search.without_slopes(), (f"portfolio without slopes: {why}",)
+
+
+def check_rule(search: Search, rule: StoppingRule | None) -> None:
+    """Refuse a rule that is none, or that the samples of this search say nothing to.
+
+    **Raises:** `TypeError`, `ValueError`.
+    """
+    if rule is None:
+        return
+    if not hasattr(rule, "done"):
+        raise TypeError(f"stop_when must be a rule such as Within(0.005); got {rule!r}")
+    if not search.samples_prior:
+        raise ValueError(
+            f"stop_when needs independent samples of the space, which search {search!r} does not "
+            "give; use search='uniform'"
+        )
+
+
+def described(problem: Problem) -> dict[str, Any] | None:
+    """The feature space as plain data; None where it has no such form."""
+    try:
+        return problem.space.to_json()
+    except ValueError:
+        return None  # It has domains that only the user knows.
+
+
+def check_same_space(run: Run, problem: Problem) -> None:
+    """Refuse to go on with a run in another space than it was in.
+
+    **Raises:** `ValueError` that names the first difference.
+    """
+    data = described(problem)
+    if run.space_data is None or data is None or run.space_data == data:
+        return
+    was, now = dict(run.space_data["features"]), dict(data["features"])
+    for name in now:
+        if was.get(name) != now[name]:
+            raise ValueError(
+                f"the run of {run.name!r} was over another space: its feature {name!r} was "
+                f"{was.get(name)}, that of the given problem is {now[name]} (a run with --only is "
+                "resumed with the same --only)"
+            )
+    # The name of a constraint may change with the line it is written in.
+    if list(was) != list(now) or bool(run.space_data["where"]) != bool(data["where"]):
+        raise ValueError(f"the run of {run.name!r} was over a space of another order or constraint")
+
+
+def earlier_rows(warm_start: Any, problem: Problem) -> Any:
+    """The rows of an earlier table, as a DataFrame with the columns that are needed."""
+    if warm_start is None:
+        return None
+    table = warm_start.table if isinstance(warm_start, Run) else warm_start
+    frame = table.all if isinstance(table, ErrorTable) else table
+    if not hasattr(frame, "columns"):
+        raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
+    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, frame.columns))
+    return frame
+
+
+def new_folder(folder: str | Path | None) -> Path | None:
+    """The folder for a new run, made now.
+
+    **Raises:** `ValueError` for one that is not empty or cannot be made.
+    """
+    if folder is None:
+        return None
+    place = Path(folder)
+    # A process that dies before its first record leaves a part of one.
+    leftover = {f"{RECORD}.part"}
+    if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
+        raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
+    with writing(place):
+        place.mkdir(parents=True, exist_ok=True)
+    return place

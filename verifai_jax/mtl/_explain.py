@@ -1,0 +1,318 @@
+"""Why a trace satisfies or breaks a formula: which predicate, when, and through which path.
+
+    why = explain("always[0, 4] (abs(x) <= 2.4 & abs(theta) <= 0.2095)", trace)
+    print(why)                                        # the path, the tree, the critical instants
+    why.predicate, why.time, why.robustness
+    draw(why)                                         # see `picture.py`
+
+The hard robustness is the value of one predicate at one instant. Walking from the root to the
+operand that decides each minimum or maximum finds it.
+"""
+
+import functools
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._robustness import prepared, satisfied, seconds
+from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.printing import sugared
+from verifai_jax.mtl.semantics import hard
+
+
+@dataclass(frozen=True)
+class Node:
+    """A sub-formula at the instant at which its parent asked for it.
+
+    `decides` says whether it lies on the path to the responsible predicate. `series` is its
+    robustness at every sample.
+    """
+
+    formula: Formula
+    time: float
+    robustness: float
+    decides: bool
+    children: tuple["Node", ...]
+    series: Float[np.ndarray, " time"] = field(repr=False)
+
+    def path(self) -> tuple["Node", ...]:
+        """From here down to the responsible leaf."""
+        below = next((child for child in self.children if child.decides), None)
+        return (self,) if below is None else (self, *below.path())
+
+    def flat(self, depth: int = 0) -> list[tuple[int, "Node"]]:
+        """Itself and all nodes below with their depths, parents first."""
+        return [(depth, self)] + [e for child in self.children for e in child.flat(depth + 1)]
+
+
+@dataclass(frozen=True)
+class Instant:
+    """A predicate at an instant that matters, with its share of the robustness.
+
+    The shares are those of the smooth robustness's gradient: all predicates and instants add to 1.
+    """
+
+    predicate: Formula
+    time: float
+    robustness: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why a formula holds or fails on a trace. `str()` tells it; `draw` shows it."""
+
+    formula: Formula
+    holds: bool
+    robustness: float
+    tree: Node
+    critical: tuple[Instant, ...]
+    trace: Trace = field(repr=False)
+
+    @property
+    def path(self) -> tuple[Node, ...]:
+        """From the formula down to the responsible predicate."""
+        return self.tree.path()
+
+    @property
+    def predicate(self) -> Formula:
+        """The predicate whose value is the robustness, up to sign."""
+        return self.path[-1].formula
+
+    @property
+    def time(self) -> float:
+        """When, in seconds."""
+        return self.path[-1].time
+
+    def __str__(self) -> str:
+        lines = [
+            f"{'Holds' if self.holds else 'Fails'} with robustness {self.robustness:.4g}, decided "
+            f"by  {self.predicate}  at {self.time:g} s",
+            "",
+        ]
+        for depth, node in self.tree.flat():
+            mark = "*" if node.decides else " "
+            name = node.formula if not node.children else heading(node.formula)
+            lines.append(
+                f"{mark} {node.robustness:>10.4g} at {node.time:<8.6g} {'  ' * depth}{name}"
+            )
+        lines += ["", "Most critical instants:"]
+        lines += [
+            f"  {i.share:>6.1%} at {i.time:<8.6g} {i.robustness:>10.4g}  {i.predicate}"
+            for i in self.critical
+        ]
+        return "\n".join(lines)
+
+
+def heading(f: Formula) -> str:
+    """The operator alone, as in `always[0,4]`; a leaf in full."""
+    if not f.operands():
+        return str(f)
+    word, _, interval = sugared(f)
+    return word if interval is None or interval.everything else f"{word}{interval}"
+
+
+def explain(
+    formula: Formula | str,
+    trace: Trace,
+    k: int = 5,
+    end: End = "hold",
+    tau: float | None = None,
+) -> Explanation:
+    """Find out why a formula holds or fails on one trace.
+
+    **Arguments:**
+
+    - `formula`, `trace`, `end`: as for `robustness`; the trace is concrete, not under `jit`.
+    - `k`: how many critical instants to report at most: the peaks, over time, of each predicate's
+      influence.
+    - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
+      left out.
+
+    **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
+    """
+    trace = trace.trim()
+    holds = bool(satisfied(formula, trace, end))
+    setting, signals, _, _ = prepared(formula, trace, hard, end, None)
+    formula = setting.formula
+    series = dict(
+        zip(_distinct(formula), map(np.asarray, _all_values(setting, signals)), strict=True)
+    )
+    walk = _Walk(Evaluator(signals, setting.length, setting.dt, end=end), series, trace)
+    tree = walk.node(formula, 0, True)
+    leaves: dict[Formula, np.ndarray] = {
+        f: series[f] for f in series if isinstance(f, ast.Predicate | ast.Atom)
+    }
+    critical: tuple[Instant, ...] = ()
+    if leaves:
+        if tau is None:
+            finite = np.concatenate([v[np.isfinite(v)] for v in leaves.values()])
+            tau = 0.1 * float(np.std(finite)) or 1e-3
+        shares = [np.asarray(s) for s in _influence(setting, signals, tau)]
+        critical = _critical(list(leaves), leaves, shares, walk, k)
+    return Explanation(formula, holds, tree.robustness, tree, critical, trace)
+
+
+def _distinct(formula: Formula) -> tuple[Formula, ...]:
+    return tuple(dict.fromkeys(formula.subformulas()))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _all_values(setting: Any, signals: Any) -> list[Any]:
+    """Values of every sub-formula, each to where it settles and at least to the last sample."""
+    e = Evaluator(signals, setting.length, setting.dt, end=setting.end)
+    values = []
+    for f in _distinct(setting.formula):
+        value = e.value(f, 0, max(e.settles(f), setting.length - 1))
+        values.append(value)
+    return values
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _influence(setting: Any, signals: Any, tau: Any) -> list[Any]:
+    """Gradient of the smooth robustness with respect to every leaf at every sample."""
+    leaves = [f for f in _distinct(setting.formula) if isinstance(f, ast.Predicate | ast.Atom)]
+    dtype = next(iter(signals.values())).dtype if signals else jnp.result_type(float)
+
+    def rho(nudges: list[Any]) -> Any:
+        e = Evaluator(
+            signals,
+            setting.length,
+            setting.dt,
+            "smooth",
+            jnp.asarray(tau, dtype),
+            setting.end,
+            nudges=dict(zip(leaves, nudges, strict=True)),
+        )
+        return e.value(setting.formula, 0, 0)[0]
+
+    return jax.grad(rho)([jnp.zeros(setting.length, dtype) for _ in leaves])
+
+
+class _Walk:
+    """Follows the operand that decides each minimum and maximum."""
+
+    def __init__(
+        self, evaluator: Evaluator, series: dict[Formula, np.ndarray], trace: Trace
+    ) -> None:
+        self.evaluator = evaluator
+        self.series = series
+        self.clock = seconds(trace)
+        self.last = evaluator.length - 1
+
+    def time(self, i: int) -> float:
+        # Beyond the end a trace repeats its last sample, so that is where to look.
+        return float(self.clock[min(i, self.last)])
+
+    def at(self, f: Formula, i: int) -> float:
+        values = self.series[f]
+        return float(values[min(i, len(values) - 1)])
+
+    def node(self, f: Formula, i: int, decides: bool) -> Node:
+        asked = self.asked(f, i)
+        chosen = self.chosen(f, i, asked) if decides else None
+        if not asked:
+            children = ()
+        else:
+            children = tuple(
+                self.node(part, j, decides and n == chosen) for n, (part, j) in enumerate(asked)
+            )
+        return Node(
+            f, self.time(i), self.at(f, i), decides, children, self.series[f][: self.last + 1]
+        )
+
+    def asked(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
+        """Each operand of `f` at the instant that matters for `f` at `i`; none if vacuous."""
+        match f:
+            case ast.Not(p):
+                return [(p, i)]
+            case ast.And(parts) | ast.Or(parts):
+                return [(p, i) for p in parts]
+            case ast.Next(p):
+                return [(p, i + 1 if self.evaluator.end != "truncate" else min(i + 1, self.last))]
+            case ast.Prev(p):
+                return [(p, i - 1)] if i > 0 else []
+            case ast.Always(p, span) | ast.Eventually(p, span):
+                return self.best(p, self.ahead(span, i, p), isinstance(f, ast.Always))
+            case ast.Historically(p, span) | ast.Once(p, span):
+                return self.best(p, self.behind(span, i), isinstance(f, ast.Historically))
+            case ast.Until(p, q, span):
+                return self.witness(p, q, self.ahead(span, i, p, q), i, 1)
+            case ast.Since(p, q, span):
+                return self.witness(p, q, self.behind(span, i), i, -1)
+        return []
+
+    def chosen(self, f: Formula, i: int, asked: list[tuple[Formula, int]]) -> int | None:
+        """Which of the operands has the value of `f`."""
+        if not asked:
+            return None
+        values = [self.at(p, j) for p, j in asked]
+        if isinstance(f, ast.Or):
+            return int(np.argmax(values))
+        return int(np.argmin(values)) if len(values) > 1 else 0
+
+    def ahead(self, span: ast.Interval, i: int, *parts: Formula) -> range:
+        a, b = self.evaluator.span(span)
+        if self.evaluator.end == "truncate":
+            stop = self.last
+        else:
+            stop = max(i + a, *(len(self.series[p]) - 1 for p in parts))
+        return range(i + a, (stop if math.isinf(b) else min(i + int(b), stop)) + 1)
+
+    def behind(self, span: ast.Interval, i: int) -> range:
+        a, b = self.evaluator.span(span)
+        return range(0 if math.isinf(b) else max(0, i - int(b)), i - a + 1)
+
+    def best(self, p: Formula, window: range, least: bool) -> list[tuple[Formula, int]]:
+        if not window:
+            return []
+        values = [self.at(p, j) for j in window]
+        return [(p, window[int(np.argmin(values) if least else np.argmax(values))])]
+
+    def witness(
+        self, p: Formula, q: Formula, window: range, i: int, step: int
+    ) -> list[tuple[Formula, int]]:
+        """Where until (since) is most nearly fulfilled: the witness and the weakest link to it."""
+        if not window:
+            return []
+        best, found = -math.inf, None
+        weakest, link = math.inf, i
+        ordered = window if step > 0 else reversed(window)
+        k = i
+        for j in ordered:
+            while k != j:
+                if self.at(p, k) < weakest:
+                    weakest, link = self.at(p, k), k
+                k += step
+            value = min(self.at(q, j), weakest)
+            if found is None or value > best:
+                best, found = value, (j, link)
+        assert found is not None
+        return [(p, found[1]), (q, found[0])] if found[0] != i else [(q, i)]
+
+
+def _critical(
+    leaves: list[Formula],
+    values: dict[Formula, np.ndarray],
+    shares: list[np.ndarray],
+    walk: _Walk,
+    k: int,
+) -> tuple[Instant, ...]:
+    """The greatest local peaks of each leaf's share over time."""
+    total = sum(float(np.abs(share).sum()) for share in shares) or 1.0
+    found = []
+    for leaf, share in zip(leaves, shares, strict=True):
+        share = np.abs(share) / total
+        padded = np.concatenate([[-1.0], share, [-1.0]])
+        peaks = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (share > 1e-4)
+        for i in map(int, np.flatnonzero(peaks)):
+            found.append(Instant(leaf, walk.time(i), float(values[leaf][i]), float(share[i])))
+    return tuple(sorted(found, key=lambda instant: -instant.share)[:k])

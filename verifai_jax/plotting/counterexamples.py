@@ -1,0 +1,215 @@
+"""Pictures of an explanation and of a shrunk counterexample.
+
+draw_explained(explain(run), "why.png")             # what broke, when, and which features did it
+draw_shrunk(shrink(run), "small.png")               # what departs from nominal, and what broke
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.core.waveform import is_waveform
+from verifai_jax.counterexamples.description import close, number
+from verifai_jax.mtl import Explanation, robustness_signal
+from verifai_jax.mtl.formula import Arithmetic, Atom, Number, Predicate
+from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+if TYPE_CHECKING:
+    from verifai_jax.counterexamples._explain import Explained, Influence
+    from verifai_jax.counterexamples._shrink import Shrunk
+
+QUIET = "#8d99ae"
+MOST_BARS = 12
+MOST_SIGNALS = 3
+
+
+def draw_explained(explained: "Explained", path: str | Path | None = None) -> Any:
+    """The deciding signal with its bound and instant, signals that were fed in, and the features.
+
+    Returns the figure.
+    """
+    features = explained.replay.features
+    fed = [i for i in explained.influences if is_waveform(features.get(i.name))][:MOST_SIGNALS]
+    figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(fed)))
+    left, right = figure.subfigures(1, 2, width_ratios=(1.6, 1))
+    heights = [2.2] + [1.0] * len(fed)
+    panels = left.subplots(
+        1 + len(fed), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
+    ).ravel()
+    draw_decision(panels[0], explained.why)
+    for axes, influence in zip(panels[1:], fed, strict=True):
+        _draw_fed(axes, influence, explained)
+    panels[-1].set_xlabel("time [s]")
+    _draw_bars(right.subplots(), explained)
+    figure.suptitle(
+        _short(f"{explained.replay.problem.name}, row {explained.row}: {explained.why.formula}"),
+        fontsize=10,
+    )
+    return show_or_save(figure, path)
+
+
+def draw_decision(axes: Any, why: Explanation) -> None:
+    """The deciding predicate's left side over time, its bound, where it is broken, and when."""
+    trace, predicate = why.trace, why.predicate
+    clock = np.asarray(trace.clock())
+    expression: Any = predicate.left if isinstance(predicate, Predicate) else None
+    bounds: list[float] = []
+    if isinstance(predicate, Predicate) and isinstance(predicate.right, Number):
+        limit, bounds = predicate.right.value, [predicate.right.value]
+        absolute = isinstance(expression, Arithmetic) and expression.name == "abs"
+        if absolute and predicate.comparison in ("<", "<="):
+            # A person looks at x, not at its absolute value.
+            expression, bounds = expression.arguments[0], [limit, -limit]
+    if expression is None:
+        values, label = (
+            np.asarray(robustness_signal(predicate, trace)),
+            f"robustness of {predicate}",
+        )
+        bounds = [0.0]
+    else:
+        values = np.asarray(robustness_signal(Atom(expression), trace))
+        label = str(expression)
+    values, margin = values[: len(clock)], np.asarray(robustness_signal(predicate, trace))
+    axes.plot(clock, values, color=BOUND, linewidth=1.7)
+    if isinstance(predicate, Predicate) and not bounds:
+        other = np.asarray(robustness_signal(Atom(predicate.right), trace))[: len(clock)]
+        axes.plot(clock, other, "--", color=QUIET, linewidth=1.2, label=str(predicate.right))
+        axes.legend(fontsize=8, frameon=False)
+    reach = max(float(np.nanmax(np.abs(values))), 1e-9)
+    for bound in bounds:
+        if abs(bound) <= 4 * reach:
+            axes.axhline(bound, color=BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
+    axes.fill_between(
+        clock, 0, 1, where=margin[: len(clock)] < 0, transform=axes.get_xaxis_transform(),
+        color=FAILING, alpha=0.13, linewidth=0, step="mid",
+    )  # fmt: skip
+    if np.isfinite(why.time):
+        place = int(np.argmin(np.abs(clock - why.time)))
+        axes.axvline(clock[place], color=FAILING, linewidth=1, linestyle=":")
+        axes.plot([clock[place]], [values[place]], "o", color=FAILING, markersize=6)
+        shown = number(float(values[place]))
+        if bounds:
+            nearest = min(bounds, key=lambda b: abs(b - values[place]))
+            shown = close(float(values[place]), nearest)[0]
+        low, high = axes.get_ylim()
+        late = place > len(clock) / 2
+        # Beside the instant's line, at the end of it that is away from the curve.
+        axes.annotate(
+            f"{shown} at {clock[place]:.4g} s",
+            (clock[place], 0.05 if values[place] > (low + high) / 2 else 0.93),
+            xycoords=("data", "axes fraction"),
+            xytext=(-5 if late else 5, 0),
+            textcoords="offset points",
+            ha="right" if late else "left",
+            va="center",
+            fontsize=8,
+            color=FAILING,
+        )
+    axes.set_ylabel(_short(label, 28))
+    axes.set_title(f"decides: {_short(str(predicate), 60)}", fontsize=9, color=FAILING, loc="left")
+    tidy(axes)
+
+
+def _draw_fed(axes: Any, influence: "Influence", explained: "Explained") -> None:
+    """A signal that was fed in, its nominal value, and which parts of it matter."""
+    wave = explained.replay.features[influence.name]
+    clock = np.asarray(explained.replay.trace.clock())
+    length = wave.duration or float(clock[-1])
+    knots = np.asarray(wave.knots, np.float64)
+    knots = knots.reshape(len(knots), -1)
+    if wave.hold == "constant":
+        edges = np.linspace(0, length, len(knots) + 1)
+        axes.stairs(knots[:, 0], edges, color=BOUND, linewidth=1.5, baseline=None)
+    else:
+        axes.plot(np.linspace(0, length, len(knots)), knots[:, 0], ".-", color=BOUND, linewidth=1.4)
+    if influence.nominal and knots.shape[1] == 1:
+        usual = np.array(influence.nominal, float)
+        axes.plot(
+            np.linspace(0, length, len(usual)),
+            usual,
+            "--",
+            color=SAFE,
+            linewidth=1,
+            label="nominal",
+        )
+        axes.legend(fontsize=7, frameon=False, loc="upper right")
+    gain = np.nan_to_num(influence.each - explained.rho)
+    every = [np.nan_to_num(i.each - explained.rho) for i in explained.influences]
+    most = max((float(g.max(initial=0.0)) for g in every), default=0.0)
+    for span, one in zip(influence.spans or (), gain, strict=False):
+        if most > 0 and one > 0.02 * most:
+            axes.axvspan(*span, color=FAILING, alpha=0.25 * one / most, linewidth=0)
+    axes.set_ylabel(_short(influence.name, 14))
+    tidy(axes)
+
+
+def _draw_bars(axes: Any, explained: "Explained") -> None:
+    """What the robustness becomes with each feature back at nominal; or slopes, if not known."""
+    shown = explained.influences[:MOST_BARS]
+    names = [i.name for i in shown]
+    where = np.arange(len(shown))
+    if any(np.isfinite(i.reverted) for i in shown):
+        ends = np.array([i.reverted for i in shown])
+        colors = [SAFE if i.gone else FAILING for i in shown]
+        axes.barh(where, ends - explained.rho, left=explained.rho, color=colors, height=0.6)
+        axes.axvline(0, color=BOUND, linewidth=0.9, linestyle="--")
+        axes.axvline(explained.rho, color=FAILING, linewidth=1, linestyle=":")
+        for y, end in zip(where, ends, strict=True):
+            if np.isfinite(end):
+                inside = end - explained.rho > 0.5 * (np.nanmax(ends) - explained.rho)
+                axes.annotate(
+                    number(float(end), 3), (max(end, explained.rho), y), fontsize=8, va="center",
+                    xytext=(-4 if inside else 4, 0), textcoords="offset points",
+                    ha="right" if inside else "left", color="white" if inside else BOUND,
+                )  # fmt: skip
+            else:
+                axes.annotate("no verdict", (explained.rho, y), fontsize=8, va="center")
+        axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:.3g})")
+        axes.set_title("what removes the failure", fontsize=9, loc="left")
+    else:
+        sizes = [float(np.abs(np.nan_to_num(i.slope)).max(initial=0.0)) for i in shown]
+        axes.barh(where, sizes, color=QUIET, height=0.6)
+        axes.set_xlabel("change of robustness over the feature's range")
+        axes.set_title("steepest features", fontsize=9, loc="left")
+    axes.set_yticks(where, [_short(name, 18) for name in names])
+    axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+
+
+def draw_shrunk(shrunk: "Shrunk", path: str | Path | None = None) -> Any:
+    """What departs from nominal, in its range, beside the signal that breaks; the figure."""
+    replay = shrunk.replay()
+    names = list(shrunk.changed) or ["nothing departs"]
+    shown = names[:24]
+    figure = new_figure(figsize=(10.5, max(3.2, 1.2 + 0.32 * len(shown))))
+    right, left = figure.subplots(1, 2, width_ratios=(1.3, 1))
+    draw_decision(right, replay.explain())
+    right.set_xlabel("time [s]")
+    space = shrunk.problem.space
+    places = [space.coordinates.index(name) for name in shown if name in space.coordinates]
+    for y, (i, name) in enumerate(zip(places, shown, strict=False)):
+        was, now = shrunk.changed[name]
+        left.plot([0, 1], [y, y], color=QUIET, linewidth=3, alpha=0.25, solid_capstyle="round")
+        left.plot([shrunk.nominal[i], shrunk.u[i]], [y, y], color=FAILING, linewidth=2)
+        left.plot([shrunk.nominal[i]], [y], "o", color=SAFE, markersize=6)
+        left.plot([shrunk.u[i]], [y], "o", color=FAILING, markersize=7)
+        left.annotate(
+            f"{number(was)} to {number(now)}", (0.5, y), xytext=(0, 5), ha="center",
+            textcoords="offset points", fontsize=7, color=BOUND,
+        )  # fmt: skip
+    left.set_yticks(range(len(places)), [_short(name, 18) for name in shown[: len(places)]])
+    left.set_ylim(max(len(places), 1) - 0.4, -0.8)
+    left.set_xlim(-0.03, 1.03)
+    left.set_xlabel("share of the range: green nominal, red failing")
+    title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:.3g}"
+    left.set_title(title, fontsize=9, loc="left")
+    tidy(left)
+    left.grid(visible=False, axis="y")
+    figure.suptitle(_short(f"{shrunk.problem.name}: the least departure that fails"), fontsize=10)
+    return show_or_save(figure, path)
+
+
+def _short(text: str, most: int = 110) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."

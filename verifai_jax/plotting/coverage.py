@@ -1,0 +1,52 @@
+"""Coverage as a picture: how often each cell of each feature was tried, and the pair with holes."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+if TYPE_CHECKING:
+    from verifai_jax.analysis._coverage import Coverage
+
+MOST_SHOWN = 12
+
+
+def plot_coverage(found: "Coverage", path: str | Path | None = None) -> Any:
+    """Draw the share of cells occupied, and samples with the largest hole; returns the figure."""
+    from verifai_jax.plotting.panels import draw_samples, two_features
+
+    samples = found.samples
+    worst = found.table.sort_values("occupied", kind="stable")
+    figure = new_figure(figsize=(9.6, 4.2))
+    left, right = figure.subplots(1, 2)
+    shown = worst.head(MOST_SHOWN)
+    place = np.arange(len(shown))
+    several = len(found.table) > 1
+    for k, (column, label, color) in enumerate(
+        [("occupied", "its cells", SAFE), ("pairs", "pairs of cells with others", "#8d99ae")]
+    ):
+        if column == "pairs" and not several:
+            continue
+        at = place + (0.38 * k - 0.19) * several
+        left.barh(at, np.nan_to_num(shown[column]), 0.34, color=color, label=label)
+        expected = shown["expected_pairs" if k else "expected"]
+        left.plot(expected, at, "|", color=BOUND, markersize=10, markeredgewidth=1.5)
+    left.plot([], [], "|", color=BOUND, label="of as many uniform samples")
+    left.set_yticks(place, [str(name) for name in shown.index])
+    left.invert_yaxis()
+    left.set_xlim(0, 1.02)
+    left.set_xlabel("share occupied")
+    tidy(left)
+    left.grid(visible=False, axis="y")
+    left.legend(frameon=False, fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 1.14), ncols=3)
+    ordered = [column.name for column in samples.ordered]
+    across, up = two_features(samples, [name for name in worst.index if name in ordered])
+    draw_samples(right, samples, across, up, size=6)
+    if found.hole is not None and across in found.hole and (up in found.hole or across == up):
+        y = found.hole[up] if across != up else float(np.nanmean(right.get_ylim()))
+        right.plot(found.hole[across], y, "X", color=FAILING, markeredgecolor="white", ms=12)
+        right.set_title("cross: middle of the largest hole", fontsize=8)
+    figure.suptitle(str(found).splitlines()[0][:160], fontsize=9, wrap=True)
+    return show_or_save(figure, path)

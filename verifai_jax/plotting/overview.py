@@ -1,0 +1,70 @@
+"""The overview of a run as one picture."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.plotting.bars import draw_bars
+from verifai_jax.plotting.panels import draw_rule, draw_samples, places, two_features
+from verifai_jax.plotting.style import BOUND, new_figure, show_or_save
+
+if TYPE_CHECKING:
+    from verifai_jax.analysis.overview import Analysis
+
+MOST_BARS = 10
+MOST_MARKED = 6
+MOST_RULES = 2
+
+
+def plot_overview(found: "Analysis", path: str | Path | None = None) -> Any:
+    """Draw failures over the two most important features, and the importances as bars."""
+    samples = found.samples
+    title = found.parts[0].words.splitlines()[0]
+    if samples is None:
+        figure = new_figure(figsize=(6, 1.2))
+        figure.text(0.5, 0.5, f"{found.name}: {title}"[:120], ha="center", va="center", fontsize=9)
+        return show_or_save(figure, path)
+    weighed, rules = found["importance"], found["rules"]
+    bars = 0 if weighed is None else min(len(weighed.table), MOST_BARS)
+    figure = new_figure(figsize=(10.4 if bars else 6.2, 4.8))
+    widths = [1.5, 1] if bars else [1]
+    panels = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
+    axes = panels[0]
+    used = [c.feature for rule in rules.rules for c in rule.conditions] if rules else []
+    preferred = weighed.ranked[:2] if weighed is not None else used
+    across, up = two_features(samples, preferred)
+    draw_samples(axes, samples, across, up)
+    for number, rule in enumerate(rules.rules[:MOST_RULES] if rules else (), 1):
+        draw_rule(axes, samples, rule, across, up, f"rule {number}")
+    _mark_representatives(axes, found, across, up)
+    if weighed is not None:
+        columns = {target: _NAMES[target] for target in weighed.scores}
+        draw_bars(panels[1], weighed.table.head(MOST_BARS), columns)
+        panels[1].set_xlabel("loss of a model's score without the feature")
+    lines = [f"{found.name}: {title}"]
+    if rules is not None and rules.rules:
+        first = rules.rules[0]
+        lines.append(f"rule 1: {first.words} ({100 * first.coverage:.0f} % of the failures)")
+    figure.suptitle("\n".join(line[:130] for line in lines), fontsize=9.5)
+    return show_or_save(figure, path)
+
+
+_NAMES = {"failing": "failing", "rho": "robustness"}
+
+
+def _mark_representatives(axes: Any, found: "Analysis", across: str, up: str) -> None:
+    """Number the rows that stand for the clusters of failures."""
+    samples = found.samples
+    assert samples is not None
+    rows = found.representatives[:MOST_MARKED]
+    x, y = places(samples, across, up)
+    for number, row in enumerate(rows):
+        place = int(np.flatnonzero(samples.rows == row)[0])
+        if not np.isfinite([x[place], y[place]]).all():
+            continue
+        axes.plot(x[place], y[place], "o", ms=13, mfc="white", mec=BOUND, mew=1.2)
+        axes.annotate(str(number), (x[place], y[place]), ha="center", va="center", fontsize=8)
+    if rows:
+        axes.plot([], [], "o", mfc="white", mec=BOUND, label="typical row of a cluster of failures")
+        axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(0, 1.1))

@@ -1,0 +1,156 @@
+"""Samples over two features, and the boxes that rules make there."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.analysis.data.columns import Column
+from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+
+if TYPE_CHECKING:
+    from verifai_jax.analysis._rules import Rule, Rules
+
+DOTS = 3000
+JITTER = 0.25
+MOST_LABELS = 12
+
+
+def plot_rules(found: "Rules", path: str | Path | None = None) -> Any:
+    """Draw samples over the features that the rules use most, with the rules' boxes."""
+    samples = found.samples
+    used = [c.feature for rule in found.rules for c in rule.conditions]
+    across, up = two_features(samples, used)
+    figure = new_figure(figsize=(6.4, 4.9))
+    axes = figure.subplots()
+    draw_samples(axes, samples, across, up)
+    for number, rule in enumerate(found.rules, 1):
+        draw_rule(axes, samples, rule, across, up, str(number))
+    lines = [f"{i}  {rule}" for i, rule in enumerate(found.rules[:3], 1)]
+    title = "\n".join(_wrapped(line) for line in lines) or f"{samples.name}: no rule"
+    figure.suptitle(title, fontsize=8, x=0.02, ha="left")
+    return show_or_save(figure, path)
+
+
+def two_features(samples: Samples, preferred: list[str]) -> tuple[str, str]:
+    """The first two different ones of `preferred` and then of all features; one twice if alone."""
+    names = list(dict.fromkeys([*preferred, *samples.names]))
+    return names[0], names[1] if len(names) > 1 else names[0]
+
+
+def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float = 9) -> None:
+    """Draw safe rows (green) and then failing ones (red) over two features, 3000 each at most.
+
+    Unordered values are spread a little around their place.
+    """
+    columns = {column.name: column for column in samples.columns}
+    x, y = places(samples, across, up)
+    for part, color, dot in (
+        (~samples.failing, SAFE, size * 0.6),
+        (samples.failing, FAILING, size),
+    ):
+        shown = _thinned(part)
+        axes.scatter(x[shown], y[shown], c=color, s=dot, alpha=0.55, linewidths=0)
+    axes.set_xlabel(across)
+    axes.set_ylabel(up if up != across else "robustness" if np.any(y) else "")
+    tidy(axes)
+    drawn = [(across, axes.xaxis), (up, axes.yaxis)][: 1 + (up != across)]
+    for name, axis in drawn:
+        column = columns[name]
+        if not column.ordered:
+            step = -(-len(column.choices) // MOST_LABELS)
+            ticks = np.arange(0, len(column.choices), max(step, 1))
+            axis.set_ticks(ticks, [str(column.choices[i])[:16] for i in ticks])
+        elif column.integer:
+            axis.get_major_locator().set_params(integer=True)
+
+
+def places(
+    samples: Samples, across: str, up: str
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Where the rows are drawn; over a single feature the robustness is the other axis."""
+    columns = {column.name: column for column in samples.columns}
+    x = _positions(samples, columns[across], seed=0)
+    if up != across:
+        return x, _positions(samples, columns[up], seed=1)
+    return x, samples.rho if np.isfinite(samples.rho).any() else np.zeros(len(samples))
+
+
+def draw_rule(
+    axes: Any, samples: Samples, rule: "Rule", across: str, up: str, label: str = ""
+) -> None:
+    """Draw the boxes of a rule over two features, dashed where it has conditions on others."""
+    from matplotlib.patches import Rectangle
+
+    features = {condition.feature for condition in rule.conditions}
+    projected = bool(features - {across, up})
+    if not features & {across, up}:
+        return
+    limits = axes.get_xlim(), axes.get_ylim()
+    first = True
+    for x0, x1 in _spans(samples, rule, across, limits[0]):
+        rows = [limits[1]] if up == across else _spans(samples, rule, up, limits[1])
+        for y0, y1 in rows:
+            axes.add_patch(
+                Rectangle(
+                    (x0, y0),
+                    x1 - x0,
+                    y1 - y0,
+                    fill=False,
+                    edgecolor=BOUND,
+                    linewidth=1.6,
+                    linestyle="--" if projected else "-",
+                )
+            )
+            if first and label:
+                axes.annotate(
+                    label, (x0, y1), xytext=(4, -11), textcoords="offset points", color=BOUND
+                )
+                first = False
+    axes.set_xlim(limits[0])
+    axes.set_ylim(limits[1])
+
+
+def _spans(
+    samples: Samples, rule: "Rule", name: str, limits: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Intervals of an axis that a rule allows, inside its limits."""
+    inset = 0.006 * (limits[1] - limits[0])
+    low, high = limits[0] + inset, limits[1] - inset
+    for j, column in enumerate(samples.ordered):
+        if column.name == name:
+            # A whole number is drawn as wide as the step to the next one.
+            step = 0.5 * column.integer
+            above, upto = rule.region.above[j] + step, rule.region.upto[j] + step
+            return [(max(low, above), min(high, upto))]
+    for j, column in enumerate(samples.unordered):
+        allowed = rule.region.allowed[j] if column.name == name else None
+        if allowed is not None:
+            return [(i - 1.5 * JITTER, i + 1.5 * JITTER) for i in sorted(allowed)]
+    return [(low, high)]
+
+
+def _positions(samples: Samples, column: Column, seed: int) -> Float[np.ndarray, " n"]:
+    if column.ordered:
+        values = samples.frame[column.name].to_numpy(np.float64)
+        if not column.integer:
+            return values
+    else:
+        values = column.codes(samples.frame[column.name]).astype(np.float64)
+    generator = np.random.default_rng(seed)
+    return values + generator.uniform(-JITTER, JITTER, len(values))
+
+
+def _thinned(part: Bool[np.ndarray, " n"]) -> np.ndarray:
+    rows = np.flatnonzero(part)
+    if len(rows) <= DOTS:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, DOTS).astype(int)]
+
+
+def _wrapped(line: str, width: int = 100) -> str:
+    import textwrap
+
+    return textwrap.fill(line, width, subsequent_indent="    ")

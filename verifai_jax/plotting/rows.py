@@ -1,0 +1,94 @@
+"""Rows among others, over the two features that vary most."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from verifai_jax.analysis.data.samples import Samples
+
+DOTS = 3000
+# The first eight are told apart by colour-blind readers (Okabe and Ito, 2008).
+PALETTE = (
+    "#0072b2",
+    "#e69f00",
+    "#009e73",
+    "#d55e00",
+    "#cc79a7",
+    "#56b4e9",
+    "#8c6d31",
+    "#000000",
+)
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
+
+
+def two_columns(samples: Samples) -> tuple[str, str]:
+    """The two columns over which to draw: ordered ones that vary most relative to their range."""
+    spread = samples.matrix().std(axis=0)
+    ordered = [samples.ordered[j].name for j in np.argsort(-spread, kind="stable")]
+    names = [*ordered, *(column.name for column in samples.unordered)]
+    return pair(samples, names)
+
+
+def pair(samples: Samples, names: Sequence[str]) -> tuple[str, str]:
+    """The first two of the columns; of a single one with the robustness, if there is any."""
+    if len(names) > 1:
+        return names[0], names[1]
+    return names[0], "rho" if np.isfinite(samples.rho).any() else names[0]
+
+
+def positions(samples: Samples, name: str, frame: Any) -> np.ndarray:
+    """Where rows are drawn along a column; a choice by its place, an absent entry nowhere."""
+    place = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
+    if place is None or samples.columns[place].ordered:
+        return frame[name].to_numpy(np.float64)
+    codes = samples.columns[place].codes(frame[name])
+    # Rows with the same choice lie side by side: shifted by row number, not at random.
+    step = np.sqrt(_PRIMES[place % len(_PRIMES)])
+    shift = 0.5 * (frame.index.to_numpy() * step % 1 - 0.5)
+    return np.where(codes < 0, np.nan, codes + shift)
+
+
+def draw_rows(
+    axes: Any,
+    samples: Samples,
+    rows: np.ndarray,
+    color: str,
+    label: str,
+    names: Sequence[str] | None = None,
+) -> np.ndarray:
+    """Draw all samples faintly and `rows` (numbers) as rings; returns their places `[k, 2]`."""
+    across, up = names or two_columns(samples)
+    everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]
+    chosen = samples.at(rows[:DOTS])
+    places = np.stack([positions(samples, name, chosen) for name in (across, up)], axis=1)
+    axes.scatter(
+        positions(samples, across, everything),
+        positions(samples, up, everything),
+        c="#b8b8b8",
+        s=9,
+        linewidths=0,
+        alpha=0.7,
+        label="others",
+    )
+    axes.scatter(*places.T, facecolors="none", edgecolors=color, s=36, label=label)
+    name_axes(axes, samples, across, up)
+    axes.legend(frameon=False, fontsize=8)
+    return places
+
+
+def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
+    """Label the two axes; choices by their names."""
+    columns = {column.name: column for column in samples.columns}
+    for name, axis in ((across, axes.xaxis), (up, axes.yaxis)):
+        axis.set_label_text(name)
+        if name in columns and not columns[name].ordered:
+            choices = columns[name].choices
+            axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])
+        else:
+            axis.get_major_locator().set_params(nbins=5)
+
+
+def shortened(text: str, most: int = 60) -> str:
+    """At most so many characters; the end of a name says more than its middle."""
+    return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"

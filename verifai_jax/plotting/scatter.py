@@ -1,0 +1,127 @@
+"""The feature space with its safe and failing samples, two features a panel."""
+
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.plotting.style import (
+    FAILING,
+    SAFE,
+    WITHOUT_VERDICT,
+    new_figure,
+    show_or_save,
+    tidy,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.falsification.run import Run
+
+DOTS = 3000
+
+
+def plot_features(
+    run: "Run",
+    path: str | Path | None = None,
+    features: list[str] | None = None,
+    most: int = 4,
+) -> Any:
+    """Draw safe (green) and failing (red) samples over pairs of features.
+
+    - `features`: which; by default the `most` that tell failing from safe samples best.
+
+    Returns the figure. **Raises:** `ValueError` for a feature that is not in the table.
+    """
+    table = run.table.all
+    if features is None:
+        features = telling_features(run)[:most]
+    else:
+        from verifai_jax.core.errors import check_names
+
+        check_names("feature", features, run.table.features)
+    if not features:
+        figure = new_figure(figsize=(4, 1))
+        figure.text(0.5, 0.5, f"{run.name}: no feature varies", ha="center", va="center")
+        return show_or_save(figure, path)
+    if len(features) == 1:
+        features = [features[0], features[0]]
+    pairs = list(combinations(features, 2))
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    figure = new_figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5))
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (across, up) in zip(panels, pairs, strict=False):
+        for part, color, size in (
+            (run.table.safe, SAFE, 5),
+            (run.table.failed, WITHOUT_VERDICT, 8),
+            (run.table.counterexamples, FAILING, 9),
+        ):
+            shown = (
+                part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))]
+                if len(part)
+                else part
+            )
+            axes.scatter(
+                _positions(table, shown, across),
+                _positions(table, shown, up),
+                c=color,
+                s=size,
+                alpha=0.55,
+                linewidths=0,
+            )
+        axes.set_xlabel(across)
+        axes.set_ylabel("" if across == up else up)
+        tidy(axes)
+    for axes in panels[len(pairs) :]:
+        axes.set_visible(False)
+    failing, safe = len(run.table.counterexamples), len(run.table.safe)
+    rate = run.failure_rate
+    told = f"search {run.search.split('(')[0]}" if rate is None else f"failure rate {rate}"
+    figure.suptitle(
+        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples\n{told}",
+        fontsize=10,
+    )
+    return show_or_save(figure, path)
+
+
+def telling_features(run: "Run") -> list[str]:
+    """Feature columns, those first whose distributions differ most between failing and safe rows.
+
+    The difference is the Kolmogorov-Smirnov distance; without failing rows, the correlation of
+    ranks with the robustness.
+    """
+    table = run.table.all
+    varying = [name for name in run.table.features if len(np.unique(table[name].to_numpy())) > 1]
+    numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
+    failing, safe = run.table.counterexamples, run.table.safe
+    if len(failing) and len(safe):
+
+        def score(name: str) -> float:
+            return _distance(failing[name].to_numpy(), safe[name].to_numpy())
+    else:
+        proper = table.loc[table["status"] == "ok"]
+        if len(np.unique(proper["rho"].to_numpy())) < 2:
+            return varying or list(run.table.features)
+        rho = proper["rho"].rank()
+
+        def score(name: str) -> float:
+            return abs(float(proper[name].rank().corr(rho)))
+
+    ranked = sorted(numeric, key=score, reverse=True)
+    return ranked or list(run.table.features)
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    points = np.concatenate([a, b])
+    below_a = np.searchsorted(np.sort(a), points, side="right") / len(a)
+    below_b = np.searchsorted(np.sort(b), points, side="right") / len(b)
+    return float(np.max(np.abs(below_a - below_b)))
+
+
+def _positions(table: "pd.DataFrame", part: "pd.DataFrame", name: str) -> Any:
+    if np.issubdtype(table[name].to_numpy().dtype, np.number):
+        return part[name].to_numpy(float)
+    return part[name].astype(str).to_numpy()

@@ -1,0 +1,300 @@
+"""A sweep as a picture: return against safety, learning curves, and what matters."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.plotting.rows import shortened
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    WITHOUT_VERDICT,
+    new_figure,
+    show_or_save,
+    tidy,
+)
+from verifai_jax.sweeps.importance import HyperparameterImportance
+from verifai_jax.sweeps.ranking import chosen_first, is_safe, last_snapshots, least_full_return
+from verifai_jax.sweeps.summary import failures, lead, percent
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from verifai_jax.sweeps.result import Sweep
+
+LOOKS = {"safe": (SAFE, "o"), "undecided": (WITHOUT_VERDICT, "D"), "unsafe": (FAILING, "X")}
+"""Colour and marker of each verdict."""
+RETURN = "#31688e"
+BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
+"""Colour, name and hatching of what depends on hyper-parameters."""
+MOST_BARS = 8
+
+
+def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
+    """Draw the three panels; the second and third only where there is something to show."""
+    curves = _worth_drawing(sweep)
+    importance = sweep.importance()
+    bars = bool(importance.scores)
+    widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
+    figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
+    panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
+    draw_safety(panels.pop(0), sweep)
+    if curves:
+        draw_curves(panels.pop(0), sweep, curves)
+    if bars:
+        trusted = any(importance.trusted(target) for target in importance.scores)
+        (draw_importance if trusted else draw_trends)(panels.pop(0), importance)
+    title = f"{shortened(sweep.name, 40)}: {lead(sweep)}"
+    if len(title) > 10 * figure.get_figwidth():
+        title = title.replace("; ", "\n", 1)
+    figure.suptitle(title, fontsize=11)
+    return show_or_save(figure, path)
+
+
+def draw_safety(axes: Any, sweep: "Sweep") -> None:
+    """Each policy by its nominal return and its failure probability, with the interval."""
+    table = sweep.table.iloc[chosen_first(sweep.table)]
+    table = table.loc[np.isfinite(table["nominal_return"].to_numpy(np.float64))]
+    if not len(table):
+        axes.text(0.5, 0.5, "no policy was certified", ha="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    crowded = len(table) > 60
+    least = _least_shown(table, sweep.p)
+    shown = _spread(table, least)
+    final = shown.index.isin(last_snapshots(sweep.table).index)
+    for verdict, (colour, marker) in LOOKS.items():
+        of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
+        for rows, weight in ((shown.loc[of_kind & ~final], 0.3), (shown.loc[of_kind & final], 1.0)):
+            if not len(rows):
+                continue
+            when = "" if weight == 1.0 else ", earlier snapshot"
+            if weight == 1.0:
+                _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
+            axes.scatter(
+                rows["nominal_return"],
+                rows["failure_rate"],
+                c=colour,
+                marker=marker,
+                s=26 if crowded else 42,
+                alpha=weight,
+                edgecolors="white",
+                linewidths=0.6,
+                label=f"{verdict}{when} ({len(rows)})",
+                zorder=2 + weight,
+            )
+    front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
+    axes.scatter(
+        front["nominal_return"],
+        front["failure_rate"],
+        facecolors="none",
+        edgecolors=BOUND,
+        s=110 if crowded else 130,
+        linewidths=1.1,
+        label=f"Pareto front ({len(front)})",
+        zorder=4,
+    )
+    # Linear up to the least rate, so that none at all has a place; logarithmic from there on.
+    axes.set_yscale("symlog", linthresh=least, linscale=0.6)
+    axes.set_ylim(-0.25 * least, 1.6)
+    ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
+    axes.set_yticks(ticks, [percent(tick) for tick in ticks])
+    axes.set_yticks([], minor=True)
+    if sweep.p is not None:
+        label = f"wanted: below {percent(sweep.p)}"
+        axes.axhline(sweep.p, color=BOUND, linewidth=0.9, linestyle="--", zorder=0, label=label)
+    axes.set_xlabel("nominal return of the policy")
+    axes.set_ylabel("failure probability")
+    axes.set_title("Return is not safety", fontsize=10)
+    tidy(axes)
+    _legend_below(axes, 3)
+
+
+def _draw_intervals(axes: Any, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
+    rate = rows["failure_rate"]
+    axes.errorbar(
+        rows["nominal_return"],
+        rate,
+        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate],
+        fmt="none",
+        ecolor=colour,
+        elinewidth=0.9,
+        alpha=alpha,
+        zorder=1,
+    )
+
+
+def _legend_below(axes: Any, columns: int) -> None:
+    """Where it hides nothing."""
+    axes.legend(
+        frameon=False,
+        fontsize=8,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.16),
+        ncols=columns,
+        columnspacing=1.0,
+        handletextpad=0.4,
+    )
+
+
+def _least_shown(table: "pd.DataFrame", wanted: float | None) -> float:
+    """The power of ten below which the axis is linear: the least rate of any lies above it."""
+    rates = table["failure_rate"].to_numpy(np.float64)
+    least = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
+    return float(10.0 ** np.floor(np.log10(least)))
+
+
+def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
+    """The rows, points that would hide each other at no failure shifted a little to the side."""
+    shown = table.copy()
+    shown["nominal_return"] = shown["nominal_return"].astype(float)
+    span = float(np.ptp(shown["nominal_return"])) or 1.0
+    cell = list(zip(
+        np.round(shown["nominal_return"] / span * 60),
+        np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), least / 3)) * 8),
+        strict=True,
+    ))  # fmt: skip
+    seen: dict[Any, int] = {}
+    for i, place in zip(shown.index, cell, strict=True):
+        turn = seen.get(place, 0)
+        seen[place] = turn + 1
+        side = (turn + 1) // 2 * (-1 if turn % 2 else 1)
+        shown.loc[i, "nominal_return"] += np.clip(side, -4, 4) * span / 200
+    return shown
+
+
+def _worth_drawing(sweep: "Sweep") -> list[int]:
+    """The best row, and a policy with a high return that is unsafe, if there is one."""
+    table = sweep.table
+    if not len(order := chosen_first(table)):
+        return []
+    rows = [int(table.index[order[0]])]
+    others = last_snapshots(table)
+    others = others.loc[~_same_training(others, table.loc[rows[0]])]
+    unsafe = others.loc[others["verdict"] == "unsafe"]
+    unsafe = unsafe.loc[unsafe["nominal_return"] >= least_full_return(table)]
+    if len(unsafe):
+        rows.append(int(unsafe["failure_rate"].idxmax()))  # pyright: ignore[reportArgumentType]
+    return [row for row in rows if np.isfinite(sweep._points(row)[1]).any()]
+
+
+def _same_training(table: "pd.DataFrame", row: Any) -> Any:
+    """Which rows are snapshots of the training that a row is of."""
+    return (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+
+
+def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
+    """The learning curves of some rows over environment steps; the whole training of each."""
+    last = last_snapshots(sweep.table)
+    for row in rows:
+        entry: Any = sweep.table.loc[row]
+        verdict = str(entry["verdict"])
+        colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
+        end = int(last.index[_same_training(last, entry)][0])
+        trace, steps = sweep.curve(end), int(entry["steps"])
+        clock, values = np.asarray(trace.clock()), np.asarray(trace["return"])
+        axes.plot(
+            clock / 1000,
+            values,
+            color=colour,
+            marker=marker,
+            markevery=max(1, len(clock) // 8),
+            markersize=4,
+            linewidth=1.5,
+            label=f"row {row}, {verdict}: {_failures(entry)}",
+        )
+        if end != row:
+            at = min(int(np.searchsorted(clock, steps)), len(clock) - 1)
+            axes.plot(
+                clock[at] / 1000,
+                values[at],
+                color=colour,
+                marker="*",
+                markersize=12,
+                markeredgecolor=BOUND,
+                linestyle="none",
+                label=f"row {row}: snapshot at {steps:,} steps",
+            )
+    axes.set_xlabel("environment steps in thousands")
+    axes.set_ylabel("mean return of training episodes")
+    axes.set_title("How they learnt", fontsize=10)
+    tidy(axes)
+    _legend_below(axes, 1)
+
+
+def _failures(row: Any) -> str:
+    if row["simulations"] > 0:
+        return failures(row)
+    return f"fails in {percent(row['failure_rate'])}"
+
+
+def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
+    """The share of the variance of failing and of the return that each hyper-parameter explains."""
+    targets = [target for target in found.scores if found.trusted(target)] or list(found.scores)
+    shown = found.table.head(MOST_BARS)
+    height, place = 0.76 / len(targets), np.arange(len(shown))
+    for k, target in enumerate(targets):
+        colour, what, hatch = BARS[target]
+        at = place + (k - (len(targets) - 1) / 2) * height
+        axes.barh(
+            at,
+            shown[f"{target}_total"].to_numpy(float),
+            height * 0.9,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0,
+            label=f"{what} (model: R² {found.scores[target]:.2f})",
+        )
+        alone = shown[f"{target}_first"].to_numpy(float)
+        axes.vlines(
+            alone,
+            at - 0.45 * height,
+            at + 0.45 * height,
+            color=BOUND,
+            linewidth=1.6,
+            label="without interactions" if k == len(targets) - 1 else None,
+        )
+    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.02)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
+    axes.set_xlabel("share of the variance, with interactions")
+    axes.set_title("What matters", fontsize=10)
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+    _legend_below(axes, 1)
+
+
+def draw_trends(axes: Any, found: HyperparameterImportance) -> None:
+    """Rank correlations of single hyper-parameters, and how great they get by chance."""
+    names = [f"{target}_trend" for target in found.scores]
+    shown = found.table.loc[found.table[names].notna().any(axis=1)]
+    order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
+    shown = shown.loc[order[:MOST_BARS]]
+    height, place = 0.76 / len(names), np.arange(len(shown))
+    chance = max(found.chance.values())
+    axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
+    for k, target in enumerate(found.scores):
+        colour, what, hatch = BARS[target]
+        axes.barh(
+            place + (k - (len(names) - 1) / 2) * height,
+            shown[f"{target}_trend"].to_numpy(float),
+            height * 0.9,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0,
+            label=what,
+        )
+    axes.axvline(0, color=BOUND, linewidth=0.8)
+    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.invert_yaxis()
+    axes.set_xlim(-1, 1)
+    axes.set_xlabel("rank correlation with each alone")
+    axes.set_title("What goes along (no model predicts)", fontsize=10)
+    tidy(axes)
+    axes.grid(visible=False, axis="y")
+    _legend_below(axes, 3)

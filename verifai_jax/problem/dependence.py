@@ -1,0 +1,42 @@
+"""Whether a problem's robustness has a slope at all, told without simulating.
+
+A signal that is a whole number (a gear, a count) or a truth value is constant between its jumps:
+its derivative is zero wherever there is one. Where formulas speak of nothing else, slopes would
+cost simulations and say nothing. JAX knows: what does not depend differentiably on the features has
+a derivative that does not depend on them either.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from verifai_jax.problem.problem import Problem
+
+
+def informative(problem: Problem) -> bool:
+    """Whether a monitored signal depends differentiably on a feature; traced once, and kept."""
+    if "informative" not in problem.engines:
+        problem.engines["informative"] = _depends(problem)
+    return problem.engines["informative"]
+
+
+def _depends(problem: Problem) -> bool:
+    key = jax.random.key(0)
+
+    def signals(u: Any) -> list[Any]:
+        trace = problem.system(problem.space.unflatten(u), key)
+        found = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
+        return [signal for signal in found if jnp.issubdtype(signal.dtype, jnp.inexact)]
+
+    def along(u: Any, direction: Any) -> list[Any]:
+        return jax.jvp(signals, (u,), (direction,))[1]
+
+    u = jnp.zeros(problem.space.dim)
+    program = jax.make_jaxpr(along)(u, u).jaxpr
+    # Which values depend on the direction: a forward sweep over the steps of the program.
+    moved = {program.invars[1]}
+    for step in program.eqns:
+        if any(not hasattr(value, "val") and value in moved for value in step.invars):
+            moved.update(step.outvars)
+    return any(not hasattr(value, "val") and value in moved for value in program.outvars)

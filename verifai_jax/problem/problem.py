@@ -1,0 +1,201 @@
+"""A falsification problem: which inputs, which system, which property.
+
+    Problem("balance", space={"x0": Box(-1, 1)}, system=simulate, spec="always[0, 4] x <= 2.4")
+    Problem("drive", ..., spec={"safe": "always dist > 2", "arrives": "eventually x > 90"})
+
+`Problem.check()` says everything that is wrong with it before anything compiles.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from verifai_jax.core.trace import Trace
+from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import Formula, parse, robustness
+from verifai_jax.mtl.evaluate import End
+from verifai_jax.problem.rulebook import Rulebook
+
+System = Callable[..., Trace]
+
+
+class ProblemError(ValueError):
+    """The parts of a problem do not fit together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A feature space, a system and the properties it must keep, under a name.
+
+    **Arguments:**
+
+    - `name`: how the command line and the report call it.
+    - `space`: a `FeatureSpace`, or a dictionary of domains.
+    - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a
+      `blackbox`.
+    - `spec`: a formula (text or `Formula`), or several by name; the overall robustness of a
+      simulation is the least of them.
+    - `nominal`: features of an ordinary day; must lie in the space.
+    - `description`: one line for `verifai-jax list`.
+    - `end`: what a formula sees behind the end of a trace; `"hold"` repeats the last sample.
+    - `priority`: which of several formulas matter more: names in falling order, or pairs
+      `(higher, lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest
+      counterexamples instead of the least robustness.
+    - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
+
+    `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
+    `engines` what has been compiled for this problem.
+
+    **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, nominal
+    features outside the space, or a priority that names no formula or goes round in a circle.
+    """
+
+    name: str
+    space: FeatureSpace
+    system: System
+    spec: Formula | str | Mapping[str, Formula | str]
+    nominal: Mapping[str, Any] | None = None
+    description: str = ""
+    end: End = "hold"
+    draw: Callable[..., None] | None = None
+    priority: Sequence[str] | Sequence[tuple[str, str]] | None = None
+    formulas: Mapping[str, Formula] = field(init=False, repr=False)
+    rulebook: Rulebook | None = field(init=False, repr=False, default=None)
+    engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name.strip():
+            raise ProblemError(f"a problem needs a name; got {self.name!r}")
+        if isinstance(self.space, Mapping):
+            object.__setattr__(self, "space", FeatureSpace(self.space))
+        if not isinstance(self.space, FeatureSpace):
+            raise ProblemError(
+                f"space must be a FeatureSpace or a dictionary of domains; got {self.space!r}"
+            )
+        if not callable(self.system):
+            raise ProblemError(
+                f"system must be a function (features, key) -> Trace; got {self.system!r}"
+            )
+        spec = self.spec if isinstance(self.spec, Mapping) else {"spec": self.spec}
+        if not spec:
+            raise ProblemError("spec has no formula; give a formula or a dictionary of them")
+        formulas = {name: _formula(name, formula) for name, formula in spec.items()}
+        object.__setattr__(self, "formulas", formulas)
+        if self.priority is not None:
+            object.__setattr__(self, "rulebook", _rulebook(self.priority, formulas))
+        if self.nominal is not None:
+            self.space.check(self.nominal)
+
+    @property
+    def monitored(self) -> tuple[str, ...]:
+        """Names of the signals that the formulas speak of."""
+        return tuple(dict.fromkeys(n for f in self.formulas.values() for n in f.signals()))
+
+    @property
+    def black_box(self) -> bool:
+        """Whether the system runs on the host, out of JAX's sight."""
+        return bool(getattr(self.system, "black_box", False))
+
+    def draws(self) -> bool:
+        """Whether the system uses its random key; abstract evaluation, nothing compiles.
+
+        JAX draws other numbers in float64 than in float32, so a replay of such a system is only
+        the same simulation in the precision of its run. A black box gets an integer seed.
+        """
+        if self.black_box:
+            return False
+        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        program = jax.make_jaxpr(lambda key, features: self.system(features, key))(key, features)
+        drawn = program.jaxpr.invars[0]
+        return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
+
+    def on_backend(self, backend: str) -> "Problem":
+        """The same problem on one backend of its system, made once: it keeps what it compiles.
+
+        A problem whose system has no backends, or is on this one already, is itself.
+
+        **Raises:** what the system's `with_backend` does, for one that it lacks.
+        """
+        system: Any = self.system
+        if not getattr(system, "backends", ()) or system.backend == backend:
+            return self
+        made = self.engines.setdefault("backends", {})
+        if backend not in made:
+            made[backend] = replace(self, system=system.with_backend(backend))
+        return made[backend]
+
+    def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
+        """The same problem with these features varied alone, all others at their nominal values.
+
+        - `nominal`: values to fix the others at, where they differ from the problem's own.
+
+        **Raises:** `ValueError` for an unknown feature, or one to be fixed without a nominal value.
+        """
+        fixed = {**(self.nominal or {}), **(nominal or {})}
+        own = None if self.nominal is None else fixed
+        return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
+
+    def check(self) -> None:
+        """Trace the system and its monitor abstractly: no simulation, nothing compiles.
+
+        A system may have its own say: `check(features)`, with features as `jax.ShapeDtypeStruct`s,
+        and `abstract(features)`, the form of its traces, for one that JAX does not trace or not
+        quickly.
+
+        **Raises:** what the system's own check does; `ProblemError` for a system that raises or
+        returns no `Trace`; what the monitor says for a formula over a signal that the system does
+        not produce.
+        """
+        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        key = jax.eval_shape(lambda: jax.random.key(0))
+        if callable(fits := getattr(self.system, "check", None)):
+            fits(features)
+        abstract: Any = getattr(self.system, "abstract", None)
+        if self.black_box and abstract is None:
+            return
+        try:
+            if abstract is not None:
+                trace = abstract(features)
+            else:
+                trace = jax.eval_shape(self.system, features, key)
+        except Exception as error:
+            raise ProblemError(
+                f"the system of problem {self.name!r} raised {type(error).__name__} when JAX "
+                f"traced it with features {list(features)}: {error}"
+            ) from error
+        if not isinstance(trace, Trace):
+            raise ProblemError(
+                f"the system of problem {self.name!r} must return a Trace; "
+                f"it returned {type(trace).__name__}"
+            )
+        for formula in self.formulas.values():
+            jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
+
+    def __str__(self) -> str:
+        lines = [f"{self.name}: {self.description}" if self.description else self.name]
+        for name, formula in self.formulas.items():
+            lines.append(f"  {name}: {formula}")
+        lines.append(f"  features: {', '.join(self.space.columns)}")
+        return "\n".join(lines)
+
+
+def _rulebook(priority: Any, formulas: Mapping[str, Formula]) -> Rulebook:
+    entries = [priority] if isinstance(priority, str) else list(priority)
+    if all(isinstance(entry, str) for entry in entries):
+        return Rulebook(formulas, list(pairwise(entries)))
+    return Rulebook(formulas, entries)
+
+
+def _formula(name: str, formula: Formula | str) -> Formula:
+    if isinstance(formula, str):
+        return parse(formula)
+    if isinstance(formula, Formula):
+        return formula
+    raise ProblemError(
+        f"spec {name!r} must be a formula or its text; got {type(formula).__name__} {formula!r}"
+    )

@@ -1,0 +1,165 @@
+"""Which rules matter more than others: several formulas, compared where a sum would mislead.
+
+    rulebook = Rulebook(("safe", "legal", "comfort"), [("safe", "comfort"), ("legal", "comfort")])
+    rulebook.graver([1, 0, 0], [0, 0, 1])                    # True: breaking safety is worse
+    rulebook.front(violations)                               # rows that no other row outdoes
+
+An edge `(higher, lower)` says that breaking `higher` is graver than breaking `lower` by any amount;
+without a path between them two rules cannot be traded for each other (Censi et al., Liability,
+ethics, and culture-aware behavior specification using rulebooks, ICRA 2019). A row of robustness
+becomes one number for a search through a linear extension of that order, so that a graver
+counterexample always scores lower.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from graphlib import CycleError, TopologicalSorter
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.core.errors import check_names
+
+MOST_RULES = 30
+"""Rules at most: beyond, a lexicographic number would not be exact."""
+
+
+@dataclass(frozen=True)
+class Rulebook:
+    """Rules by name, and pairs `(higher, lower)` of which the first matters more.
+
+    `order` lists the rules so that each comes behind all that matter more: topologically, in the
+    order of `names` where the edges leave it open.
+
+    **Raises:** `ValueError` for a name that is no rule, edges that go round in a circle, or more
+    than `MOST_RULES` rules.
+    """
+
+    names: tuple[str, ...]
+    edges: tuple[tuple[str, str], ...] = ()
+    order: tuple[str, ...] = field(init=False, repr=False, compare=False)
+
+    def __init__(self, names: Iterable[str], edges: Iterable[Sequence[str]] = ()) -> None:
+        object.__setattr__(self, "names", tuple(names))
+        pairs = []
+        for edge in edges:
+            if isinstance(edge, str) or len(edge) != 2:
+                raise ValueError(f"an edge of a rulebook is a pair (higher, lower); got {edge!r}")
+            check_names("rule", edge, self.names)
+            pairs.append((edge[0], edge[1]))
+        object.__setattr__(self, "edges", tuple(pairs))
+        if len(self.names) > MOST_RULES:
+            raise ValueError(f"a rulebook has at most {MOST_RULES} rules; got {len(self.names)}")
+        object.__setattr__(self, "order", self._sorted())
+
+    def graver(self, one: Sequence[Any], other: Sequence[Any]) -> bool:
+        """Whether `one` is a graver counterexample than `other`.
+
+        Each says by how much every rule is broken, in the order of `names`: a number that is 0
+        where the rule is kept, or a truth value. One is graver if they differ and wherever the
+        other breaks a rule by more, `one` breaks a rule above it by more.
+        """
+        first, second = np.asarray(one, np.float64), np.asarray(other, np.float64)
+        return bool(self._outdone(second[None], first[None])[0, 0])
+
+    def front(self, violations: Bool[Any, "n k"] | Float[Any, "n k"]) -> Bool[np.ndarray, " n"]:
+        """Which rows no other row outdoes: the Pareto set of counterexamples.
+
+        Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
+        """
+        broken = np.asarray(violations, np.float64).reshape(-1, len(self.names))
+        unique, place = np.unique(broken, axis=0, return_inverse=True)
+        kept = np.ones(len(unique), bool)
+        # In blocks, so that memory stays small with thousands of different rows.
+        for start in range(0, len(unique), 256):
+            block = slice(start, start + 256)
+            kept[block] = ~np.any(self._outdone(unique[block], unique), axis=1)
+        return kept[place.ravel()]
+
+    def grade(self, violated: Bool[Any, "n k"]) -> Float[np.ndarray, " n"]:
+        """One number for what is broken: larger for a graver row, equal for equal rows.
+
+        A linear extension of the order: of two rows that cannot be compared one is larger too.
+        """
+        places = [self.names.index(name) for name in self.order]
+        weights = 2.0 ** np.arange(len(places) - 1, -1, -1)
+        return np.asarray(violated, np.float64)[..., places] @ weights
+
+    def _outdone(self, rows: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, "n m"]:
+        """Whether row i is less grave than other row j."""
+        more = others[None] > rows[:, None]  # Rules that the other breaks by more.
+        less = others[None] < rows[:, None]
+        excused = more.astype(np.float32) @ self._above.astype(np.float32).T > 0
+        return np.any(more, axis=-1) & np.all(~less | excused, axis=-1)
+
+    @property
+    def _above(self) -> Bool[np.ndarray, "k k"]:
+        """`[lower, higher]`: whether a path leads from the higher to the lower rule."""
+        k = len(self.names)
+        above = np.zeros((k, k), bool)
+        for higher, lower in self.edges:
+            above[self.names.index(lower), self.names.index(higher)] = True
+        for via in range(k):
+            above |= above[:, via : via + 1] & above[via : via + 1, :]
+        return above
+
+    def _sorted(self) -> tuple[str, ...]:
+        sorter = TopologicalSorter({name: set() for name in self.names})
+        for higher, lower in self.edges:
+            sorter.add(lower, higher)
+        try:
+            sorter.prepare()
+        except CycleError as error:
+            circle = " > ".join(reversed(error.args[1]))
+            raise ValueError(f"the edges of a rulebook go round in a circle: {circle}") from None
+        found: list[str] = []
+        ready = list(sorter.get_ready())
+        while ready:
+            ready.sort(key=self.names.index)
+            name = ready.pop(0)
+            found.append(name)
+            sorter.done(name)
+            ready += sorter.get_ready()
+        return tuple(found)
+
+
+class Objective:
+    """What a search is told of simulations with several rules, in one number.
+
+    Positive for what is less grave than the gravest counterexample so far, negative for what is
+    as grave: as soon as an important rule is broken, breaking lesser ones is no success any more.
+    Within one grade the margins of the rules decide, weighed in the same order. `state` is all
+    that it remembers; keep it to go on later.
+    """
+
+    def __init__(self, rulebook: Rulebook) -> None:
+        self.rulebook = rulebook
+        k = len(rulebook.names)
+        self.state: dict[str, np.ndarray] = {
+            "gravest": np.zeros(()),
+            "scale": np.zeros(k),  # Typical size of each rule's robustness; 0 until a batch shows.
+        }
+
+    def __call__(
+        self, rho: Float[Any, "n k"], violated: Bool[Any, "n k"]
+    ) -> Float[np.ndarray, " n"]:
+        """Score rows `[n, k]` of robustness and verdicts; NaN stays NaN."""
+        rho = np.asarray(rho, np.float64)
+        proper = np.all(np.isfinite(rho), axis=1)
+        score = np.full(len(rho), np.nan)
+        if not proper.any():
+            return score
+        rho, violated = rho[proper], np.asarray(violated)[proper]
+        if not self.state["scale"].all():
+            size = np.mean(np.abs(rho), axis=0)
+            self.state["scale"] = np.where(size > 0, size, 1.0)
+        grade = self.rulebook.grade(violated)
+        self.state["gravest"] = np.maximum(self.state["gravest"], grade.max())
+        margin = self.rulebook.grade(np.tanh(rho / self.state["scale"]))
+        margin /= 2.0 ** len(self.rulebook.names) - 1  # From -1 to 1.
+        if self.state["gravest"] == 0:
+            score[proper] = 0.5 * (1 + margin)
+        else:
+            score[proper] = np.log2(1 + self.state["gravest"] - grade) + 0.5 * (margin - 1)
+        return score

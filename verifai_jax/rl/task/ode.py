@@ -1,0 +1,153 @@
+"""Train on an `ode` that is then tested: its dynamics, with the control as the action.
+
+loop = ode(dynamics, initial, dt=0.02, duration=4.0, terminate=fallen)
+task = ode_task(loop, Continuous(-10.0, 10.0), reward=lambda time, state, force, after: 1.0)
+tested = replace(loop, controller=lambda time, state, features: trained.policy.act(...)[0])
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.rl.task.task import Action, Continuous, Discrete
+from verifai_jax.systems.ode._ode import Ode
+from verifai_jax.systems.ode.integrators import integrator
+from verifai_jax.systems.structure import floating, outline
+
+
+class Moment(NamedTuple):
+    """Where an episode stands: seconds since its start, the state, and its features."""
+
+    time: Float[Array, ""]
+    state: Any
+    features: Any
+
+
+@dataclass(frozen=True, eq=False)
+class OdeTask:
+    """A task; made by `ode_task`, which says what its parts are."""
+
+    loop: Ode
+    action: Action
+    time_limit: int
+    reward: Callable[..., Any]
+    control: Callable[..., Any]
+    observe_state: Callable[..., Any]
+    features: Callable[..., Any]
+
+    def reset(self, key: Key[Array, ""]) -> Moment:
+        """The loop's own start, under features of this episode."""
+        features_key, start_key = jax.random.split(key)
+        features = jax.tree.map(jnp.asarray, self.features(features_key))
+        state = floating(self.loop.initial(features, start_key), "initial")
+        return Moment(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
+
+    def step(
+        self, key: Key[Array, ""], state: Moment, action: Array
+    ) -> tuple[Moment, Float[Array, ""], Bool[Array, ""]]:
+        """One period of the control, cut short where the loop ends."""
+        loop, start = self.loop, state
+        features, control = start.features, self.control(action)
+        advance = integrator(loop.method)
+        dt = loop.dt / loop.substeps
+
+        def slope(time: Any, state: Any) -> Any:
+            return loop.dynamics(time, state, control, features)
+
+        def ended(state: Any) -> Bool[Array, ""]:
+            over = False if loop.terminate is None else loop.terminate(state, features)
+            return jnp.asarray(over, bool)
+
+        time, now, over = start.time, start.state, jnp.array(False)
+        for _ in range(loop.steps_per_control):
+            after, later = now, time
+            for _ in range(loop.substeps):
+                after, later = advance(slope, later, after, dt), later + dt
+            # Each sample of a trace may be its last.
+            time, now = _where(over, (time, now), (time + loop.dt, after))
+            over = over | ended(now)
+        reward = jnp.asarray(self.reward(start.time, start.state, control, now), jnp.float32)
+        return Moment(time, now, start.features), reward.reshape(()), over
+
+    def observe(self, state: Moment) -> Float[Array, " k"]:
+        """What the policy sees."""
+        return jnp.ravel(jnp.asarray(self.observe_state(state.state), jnp.float32))
+
+
+@suggests_options
+def ode_task(
+    loop: Ode,
+    action: Action,
+    *,
+    reward: Callable[..., Any],
+    control: Callable[..., Any] | None = None,
+    observe: Callable[..., Any] | None = None,
+    features: Mapping[str, Any] | Callable[..., Any] | None = None,
+    time_limit: int | None = None,
+) -> OdeTask:
+    """A `Task` of an `ode`: its start, dynamics, step, control period and end; not its controller.
+
+    **Arguments:**
+
+    - `action`: the kind of action.
+    - `reward(time, state, control, after) -> number`: of one control period that begins in `state`
+      at `time` and leads to `after`.
+    - `control(action) -> control`: what the dynamics are given. When left out: a continuous action
+      itself, one number as a scalar. Discrete actions need it.
+    - `observe(state) -> [k]`: what a policy sees; all numbers of the state when left out.
+    - `features`: what dynamics and start are given, or a function `key -> features` that draws
+      them for each episode (domain randomisation). None at all when left out.
+    - `time_limit`: in control periods; the loop's duration when left out.
+
+    **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`, and
+    functions that do not fit together.
+    """
+    if not isinstance(loop, Ode):
+        raise ValueError(f"loop must be made by ode(...); got {outline(loop)}")
+    if not isinstance(action, Discrete | Continuous):
+        raise ValueError(f"action must be a Discrete or a Continuous; got {action!r}")
+    if not isinstance(loop.substeps, int):
+        raise ValueError("loop has a traced number of substeps; a task needs a fixed one")
+    if control is None:
+        if isinstance(action, Discrete):
+            raise ValueError(
+                f"{action} needs control=..., a function from the index to what the dynamics take"
+            )
+        control = _itself
+    limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit
+    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
+        raise ValueError(f"time_limit must be an integer of at least 1; got {limit!r}")
+    given = features if callable(features) else _constant(dict(features or {}))
+    task = OdeTask(loop, action, limit, reward, control, observe or _numbers, given)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    start = jax.eval_shape(task.reset, key)
+    discrete = isinstance(action, Discrete)
+    shape = jax.ShapeDtypeStruct(
+        () if discrete else (action.size,), jnp.int32 if discrete else jnp.float32
+    )
+    after, _, _ = jax.eval_shape(task.step, key, start, shape)
+    if jax.tree.structure(after) != jax.tree.structure(start):
+        raise ValueError(f"dynamics must return the slope of {outline(start)}")
+    jax.eval_shape(task.observe, start)
+    return task
+
+
+def _itself(action: Array) -> Array:
+    return action[0] if action.shape == (1,) else action
+
+
+def _numbers(state: Any) -> Array:
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(state)])
+
+
+def _constant(features: dict[str, Any]) -> Callable[..., Any]:
+    return lambda key: features
+
+
+def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,0 +1,288 @@
+"""What a search proposes to simulate, with the constraint of the space honoured.
+
+    proposals = Proposals(search, space.cube, batch=1024, key=key, accepts=space.constraint)
+    points = proposals.next(1024)                       # [m, d], m <= 1024
+    proposals.tell(rho, counted, gradient)              # of these points
+    proposals.slopes, proposals.temperature             # what the search wants to know of them
+
+A constraint (`where=`) refuses points; only accepted ones are simulated. A search that does not
+learn is asked until there are enough, so that the accepted points are a subsequence of its own,
+whatever the batch. One that learns is asked again for the refused rows only, which leaves each
+row with the distribution it would have, given acceptance; rows that stay refused are told as not
+counted.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from verifai_jax.core.cube import Cube
+from verifai_jax.search import Diverse, Evaluated, Plan, Search
+from verifai_jax.search.base import CLAUSES
+
+TRIES = 32
+"""Asks in one round at most until every row of a search that learns is accepted."""
+MOST_REFUSED = 2000
+"""Asks in a row without a single accepted point, after which a run ends."""
+
+
+class ConstraintError(ValueError):
+    """The search does not get past the constraint of the space."""
+
+
+class Proposals:
+    """The stream of points to simulate; see the module's docstring.
+
+    `asked` and `accepted` count the points that the search proposed and that the constraint let
+    through.
+    """
+
+    def __init__(
+        self,
+        search: Search,
+        cube: Cube,
+        batch: int,
+        key: Key[Array, ""],
+        accepts: Callable[[Any], Bool[Any, " n"]] | None = None,
+    ) -> None:
+        self.search, self.batch, self.cube = search, batch, cube
+        self.total = search.total(self.cube)
+        self.asked = self.accepted = 0
+        self._program = _program(search, self.cube, batch)
+        self._accepts = accepts
+        if self._accepts is not None:
+            # Compiled now, in the shape that it will be asked in.
+            self._accepts(np.zeros((batch, self.cube.dim), np.float32))
+        self._state = self._program.init(key)
+        self._queue = np.zeros((0, self.cube.dim), np.float32)
+        self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
+        self._rows = np.zeros(0, int)  # and which of them are simulated.
+        self._plan: Plan | None = None
+        self._barren = 0  # Rounds without any, so far.
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether a finite search has no further point."""
+        return self.total is not None and self.asked >= self.total and not len(self._queue)
+
+    @property
+    def distinct(self) -> int:
+        """Failures far from each other that a search for diverse ones has found."""
+        return int(Diverse.count(self._state))
+
+    @property
+    def slopes(self) -> bool:
+        """Whether the points that `next` gave last are to be simulated with slopes."""
+        return self._plan is not None and bool(self._plan.slopes)
+
+    @property
+    def temperature(self) -> Any:
+        """Of the smooth robustness to differentiate; only for searches with gradients.
+
+        One for the next points, or, for a search that wants clauses, one for each of the last.
+        """
+        if self._plan is None:
+            return self._program.temperature(self._state)
+        return np.asarray(self._plan.temperature)[self._rows]
+
+    def next(self, most: int) -> Float[Any, "m d"]:
+        """The next points, at most `most`; none if all rows of a round are refused.
+
+        **Raises:** `ConstraintError` when the constraint has refused everything for long.
+        """
+        points = self._learned(most) if self.search.learns else self._sequence(most)
+        self.accepted += len(points)
+        return points
+
+    def tell(
+        self,
+        rho: Float[np.ndarray, " m"],
+        counted: Bool[np.ndarray, " m"],
+        gradient: Float[np.ndarray, "m d"] | None,
+        clauses: Float[np.ndarray, "m clauses"] | None = None,
+        slopes: Float[np.ndarray, "m clauses d"] | None = None,
+    ) -> None:
+        """Tell the search what came of the points that `next` gave last."""
+        if not self.search.learns:
+            return
+        told = Evaluated(
+            u=self._points,
+            rho=self._spread(rho, np.nan),
+            counted=self._spread(counted, False),
+            gradient=None if gradient is None else self._spread(gradient, 0.0),
+        )
+        if self.search.wants_clauses:
+            none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
+            told = told._replace(
+                clauses=self._spread(none[:, :, 0] if clauses is None else clauses, 0.0),
+                slopes=self._spread(none if slopes is None else slopes, 0.0),
+            )
+        self._state = self._program.tell(self._state, told)
+
+    def tell_refused(self) -> None:
+        """Tell the search that no row of the last round could be simulated."""
+        gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
+        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient)
+
+    def warm(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
+        """Let the search learn from the points of an earlier table, before the first round."""
+        if not self.search.learns or not len(u):
+            return
+        warm = jax.jit(lambda state, told: self.search.warm(state, self.cube, told))
+        for start in range(0, len(u), self.batch):
+            part, values = u[start : start + self.batch], rho[start : start + self.batch]
+            missing = self.batch - len(part)
+            told = Evaluated(
+                u=np.pad(part.astype(np.float32), ((0, missing), (0, 0)), constant_values=0.5),  # pyright: ignore[reportArgumentType]
+                rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
+                counted=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
+            )
+            self._state = warm(self._state, told)
+
+    def snapshot(self) -> dict[str, Any]:
+        """All that decides what comes next; its values are arrays and never change."""
+        leaves = jax.tree.leaves(self._state)
+        return {
+            **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
+            "queue": self._queue,
+            "counts": np.array([self.asked, self.accepted], np.int64),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on where `snapshot` was taken.
+
+        **Raises:** `ValueError` for a snapshot of another search, space or batch size.
+        """
+        leaves, form = jax.tree.flatten(self._state)
+        restored = []
+        for i, leaf in enumerate(leaves):
+            saved = snapshot.get(f"search.{i}")
+            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) and isinstance(saved, np.ndarray):
+                saved = jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(leaf))
+            if saved is None or saved.shape != leaf.shape or saved.dtype != leaf.dtype:
+                raise ValueError(
+                    f"the saved state is not one of search {self.search!r} on this space with "
+                    f"batches of {self.batch}"
+                )
+            restored.append(jnp.asarray(saved))
+        self._state = jax.tree.unflatten(form, restored)
+        self._queue = np.asarray(snapshot["queue"])
+        self.asked, self.accepted = (int(count) for count in snapshot["counts"])
+
+    def _ask(self) -> Any:
+        points, self._state = self._program.ask(self._state)
+        if self.total is not None:
+            points = points[: max(0, self.total - self.asked)]
+        return points
+
+    def _accepted_rows(self, points: Any) -> Bool[np.ndarray, " n"]:
+        if self._accepts is None:
+            return np.ones(len(points), bool)
+        missing = self.batch - len(points)
+        padded = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
+        return np.asarray(self._accepts(padded))[: len(points)]
+
+    def _sequence(self, most: int) -> Float[np.ndarray, "m d"]:
+        parts, ready, barren = [self._queue], len(self._queue), 0
+        while ready < most and not (self.total is not None and self.asked >= self.total):
+            points = self._ask()
+            self.asked += len(points)
+            if self._accepts is not None:
+                points = np.asarray(points)[self._accepted_rows(points)]
+            barren = 0 if len(points) else barren + 1
+            if barren >= MOST_REFUSED:
+                self._give_up()
+            parts.append(points)
+            ready += len(points)
+        whole = parts[-1] if ready == len(parts[-1]) else np.concatenate(parts)
+        if ready <= most:
+            # As the search gave it: a full round needs no copy.
+            self._queue = np.zeros((0, self.cube.dim), np.float32)
+            return whole
+        whole = np.asarray(whole)
+        self._queue = whole[most:]
+        return whole[:most]
+
+    def _learned(self, most: int) -> Float[Any, "m d"]:
+        points = self._ask()
+        self._plan = None
+        planned = len(points)
+        if self.search.wants_clauses:
+            plan: Plan = self._program.plan(self._state)
+            self._plan, planned = plan, int(plan.rows)
+        self.asked += planned
+        wanted = np.arange(len(points)) < planned
+        accepted = self._accepted_rows(points) & wanted
+        for _ in range(TRIES - 1):
+            if accepted.sum() == planned or self.total is not None:
+                break
+            others = self._ask()
+            fresh = wanted & ~accepted
+            if np.array_equal(np.asarray(others)[fresh], np.asarray(points)[fresh]):
+                break  # This search proposes the same until it is told something.
+            self.asked += int(fresh.sum())
+            points = jnp.where(fresh[:, None], others, points)
+            accepted = accepted | (self._accepted_rows(points) & wanted)
+        self._barren = 0 if accepted.any() else self._barren + 1
+        if self._barren >= MOST_REFUSED:
+            self._give_up()
+        missing = self.batch - len(points)
+        self._points = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
+        self._rows = np.flatnonzero(accepted)[:most]
+        return points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
+
+    def _spread(self, values: np.ndarray, filler: Any) -> Any:
+        """Values of the simulated rows in an array of all rows of the batch."""
+        if len(values) == self.batch:
+            return values
+        whole = np.full((self.batch, *values.shape[1:]), filler, values.dtype)
+        whole[self._rows] = values
+        return whole
+
+    def _give_up(self) -> None:
+        raise ConstraintError(
+            f"where refused all that search {self.search!r} has proposed for {MOST_REFUSED} "
+            f"rounds; it accepted {self.accepted} of {self.asked} points in all. Make the space "
+            "narrower, so that more of it is allowed, or use another search"
+        )
+
+
+class _Program(NamedTuple):
+    init: Any
+    ask: Any
+    tell: Any
+    temperature: Any
+    plan: Any
+
+
+@lru_cache(maxsize=64)
+def _program(search: Search, cube: Cube, batch: int) -> _Program:
+    """The compiled `init / ask / tell` of one search on one cube."""
+    key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
+    init = jax.jit(lambda key: search.init(key, cube, batch)).lower(key).compile()
+    state = jax.eval_shape(lambda key: search.init(key, cube, batch), key)
+    ask = jax.jit(lambda state: search.ask(state, cube, batch)).lower(state).compile()
+    points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
+    rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
+    counted: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
+    evaluated = Evaluated(points, rho, counted, points if search.wants_gradient else None)
+    plan: Any = None
+    if search.wants_clauses:
+        evaluated = evaluated._replace(
+            clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
+            slopes=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
+        )
+        plan = jax.jit(lambda state: search.plan(state, cube, batch)).lower(state).compile()
+    tell = None
+    if search.learns:
+        tell = jax.jit(lambda state, told: search.tell(state, cube, told))
+        tell = tell.lower(state, evaluated).compile()
+    temperature: Any = lambda state: 1.0  # noqa: E731
+    if search.wants_gradient:
+        temperature = jax.jit(search.temperature).lower(state).compile()
+    return _Program(init, ask, tell, temperature, plan)

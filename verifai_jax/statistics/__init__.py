@@ -1,0 +1,1 @@
+"""Pure numbers: intervals of rates, stopping rules, Pareto fronts, least-distance steps."""

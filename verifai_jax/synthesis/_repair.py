@@ -1,0 +1,433 @@
+"""Parameters of a controller that fails, changed as little as removes its failures.
+
+    repair(problem, ["k_theta", "k_theta_dot"])          # from the problem's nominal features
+    repair(run, ["k_theta"])                              # with the counterexamples of a run
+    repair(problem, weights, system_of=closed_loop)       # a pytree of arrays, by gradients
+
+Falsification and repair take turns: attack the environment with the present parameters; add the
+counterexamples to a set; go to the parameters nearest to the nominal ones that keep the formula in
+all of the set. Along gradients this is a sequence of least-distance problems (sequential quadratic
+programming: Nocedal and Wright, Numerical optimization, 2006, chapter 18), without them a
+cross-entropy search. It ends when an attack finds nothing, which proves nothing: the failure rates
+before and after are those of fresh samples, which the repair has never seen.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.budget import Limits, timed
+from verifai_jax.core.errors import check_names, suggests_options
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.validation import check_options, usual_batch
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.statistics.least_distance import least_change, uphill
+from verifai_jax.synthesis._synthesize import ATTACK, attacker, check_numbers, feature_loop
+from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.held_out import held_out
+from verifai_jax.synthesis.optimize import (
+    LEAST_BATCH,
+    Archive,
+    Choice,
+    by_value,
+    climb,
+    climbs,
+    explore,
+    judged,
+    narrow,
+)
+from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
+from verifai_jax.synthesis.results import Repair, Round
+
+ADDED = 8
+"""Counterexamples that a round adds to the set at most."""
+CANDIDATES = 32
+SLACK = 0.05
+"""How far above the margin a repair aims, in ordinary robustnesses: the next worst case is near."""
+
+
+@suggests_options
+def repair(
+    problem: Problem | Run,
+    parameters: Any,
+    budget: int = 20_000,
+    *,
+    nominal: Mapping[str, Any] | None = None,
+    system_of: Callable[[Any], Any] | None = None,
+    search: str | Search = "cross_entropy",
+    margin: float = 0.0,
+    rounds: int = 30,
+    held_out: int = 2000,
+    gradient: bool | None = None,
+    batch: int = 256,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+) -> Repair:
+    """Change parameters as little as makes the formula hold in all environments that are found.
+
+    **Arguments:**
+
+    - `problem`: what fails, or a run of it, whose counterexamples come first.
+    - `parameters`: names of features; or, with `system_of`, a pytree of arrays.
+    - `budget`: simulations at most, the check not counted.
+    - `nominal`: values of the parameters to start from; the problem's own when left out.
+    - `system_of(parameters) -> system`: pure, and traced by JAX. All features are the environment.
+    - `search`: attacks the parameters, over the environment.
+    - `margin`: robustness that is wanted.
+    - `rounds`: turns of attack and repair at most.
+    - `held_out`: fresh environments for the failure rates before and after; 0 for no check.
+    - `gradient`: whether to follow gradients; by default where the system has them without
+      changing the backend.
+    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - the others as in `falsify`.
+
+    Ctrl-C ends it and returns what is finished, without the check.
+
+    **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
+    nominal value, no environment, options out of range, or arrays of a system without gradients.
+    """
+    started = time.perf_counter()
+    run = problem if isinstance(problem, Run) else None
+    whole: Any = problem.problem if isinstance(problem, Run) else problem
+    if whole is None:
+        assert run is not None
+        raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
+    check_options(budget, batch, seed, max_seconds, None)
+    check_numbers(margin, rounds=rounds, held_out=held_out)
+    loop: Parametric
+    if system_of is not None:
+        loop = _arrays(whole, parameters, system_of, nominal, gradient, batch, precision, seed)
+        start = loop.start
+    else:
+        loop, start = _features(
+            whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
+        )
+    search = attacker(whole, search, loop)
+    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
+    work = _Repair(loop, start, search, limits, margin, seed)
+    try:
+        if run is not None:
+            work.add_run(run)
+        work.go(rounds)
+        stopped = work.stopped
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    before = after = None
+    searched = loop.simulations
+    if stopped != "interrupted" and held_out:
+        before, after = _checked(loop, start, work.now.theta, held_out, margin, seed, checking)
+    robustness = work.robustness
+    if after is not None and after.least is not None:
+        robustness = min(robustness, after.least)
+    theta = work.now.theta
+    return Repair(
+        name=whole.name,
+        before=loop.values(start),
+        parameters=loop.values(theta),
+        rounds=tuple(work.turns),
+        held_out_before=before,
+        held_out_after=after,
+        robustness=robustness,
+        environments=len(work.environments),
+        margin=margin,
+        change=float(np.linalg.norm(theta - start)),
+        found=stopped == "repaired",
+        simulations=searched,
+        without_verdict=loop.without_verdict,
+        seconds=time.perf_counter() - started,
+        stopped=stopped,
+        seed=seed,
+        arrays=system_of is not None,
+        notes=tuple(work.notes),
+        make=lambda: loop.with_parameters(theta),
+    )
+
+
+def _checked(
+    loop: Any, start: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
+) -> Any:
+    try:
+        # What was repaired first: it matters more where time is short.
+        after = held_out(loop, theta, count, margin, (seed, 1), limits)
+        return held_out(loop, start, count, margin, (seed, 1), limits), after
+    except KeyboardInterrupt:
+        return None, None
+
+
+def _arrays(
+    problem: Any,
+    parameters: Any,
+    system_of: Any,
+    nominal: Any,
+    gradient: Any,
+    batch: int,
+    precision: str,
+    seed: int,
+) -> ArrayParameters:
+    if not isinstance(problem, Problem):
+        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
+    if nominal is not None:
+        raise ValueError("with system_of the parameters are their own nominal values")
+    if gradient is False:
+        raise ValueError(
+            "arrays of parameters are repaired by gradients; leave gradient out, or make the "
+            "parameters features of the space"
+        )
+    problem.space.check_where()
+    return ArrayParameters(
+        problem, parameters, system_of, batch=batch, precision=precision, seed=seed
+    )
+
+
+def _features(
+    problem: Any,
+    names: Any,
+    nominal: Any,
+    gradient: Any,
+    batch: int,
+    budget: int,
+    precision: str,
+    backend: Any,
+    seed: int,
+) -> tuple[Any, Float[np.ndarray, " p"]]:
+    named = isinstance(names, str) or (
+        isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
+    )
+    if not named or not len(names):
+        raise ValueError(
+            "parameters must be names of features, at least one; arrays need "
+            f"system_of=function that makes the system of them; got {names!r}"
+        )
+    loop = feature_loop(problem, names, gradient, batch, budget, precision, backend, seed)
+    if loop.environment is None:
+        raise ValueError(
+            "all features are parameters, so that nothing can vary to find counterexamples in; "
+            "use synthesize"
+        )
+    check_names("parameter of nominal", nominal or {}, loop.names)
+    given = {**(problem.nominal or {}), **(nominal or {})}
+    missing = [name for name in loop.names if name not in given]
+    if missing:
+        raise ValueError(
+            f"a repair starts from nominal values; {', '.join(missing)} "
+            f"{'has' if len(missing) == 1 else 'have'} none: give nominal={{...}}"
+        )
+    values = {name: given[name] for name in loop.names}
+    for name, value in values.items():
+        loop.space[name].check(value, name)
+    return loop, loop.begin(values)
+
+
+class _Repair:
+    """The work of a repair, of which all that is finished can be had at any time."""
+
+    def __init__(
+        self,
+        loop: Parametric,
+        start: Float[np.ndarray, " p"],
+        search: Search,
+        limits: Limits,
+        margin: float,
+        seed: int,
+    ) -> None:
+        assert loop.environment is not None
+        self.loop, self.start, self.search, self.limits = loop, start, search, limits
+        self.margin, self.seed = margin, seed
+        self.rng = np.random.default_rng((seed, 2))
+        # An attack that finds nothing costs a tenth of the budget; one that does costs less.
+        self.share = min(ATTACK, max(64, limits.most // 10))
+        self.batch = min(128, usual_batch(search, self.share))
+        self.environments = np.zeros((0, loop.environment.dim), np.float32)
+        self.now = Choice(start, np.inf, 0)
+        self.robustness = np.inf
+        self.deficit: float | None = None
+        self.slack = 0.0
+        self.archive = Archive()
+        self.turns: list[Round] = []
+        self.notes: list[str] = []
+        self.stopped = "rounds"
+
+    def add_run(self, run: Run) -> None:
+        """Begin with the environments of a run in which the nominal parameters fail."""
+        rows = run.table.counterexamples
+        space = self.loop.environment
+        assert space is not None
+        if len(rows):
+            order = np.argsort(rows["rho"].to_numpy(), kind="stable")[: 4 * ADDED]
+            points = space.points(rows.iloc[order])
+            pairs = self.loop.judge(self.start[None], points)
+            failing = pairs.violates(self.margin)[0]
+            self.environments = points[failing][: 2 * ADDED].astype(np.float32)
+            if failing.any():
+                self.seen(pairs.rho[0])
+        self.notes.append(
+            f"{len(self.environments)} counterexamples came from the run of {run.name!r}"
+        )
+
+    def seen(self, rho: Any) -> None:
+        """How badly the nominal parameters fail, and where they do not, how well they do."""
+        if self.deficit is not None:
+            return
+        rho = rho[np.isfinite(rho)] - self.margin
+        kept = rho[rho > 0]
+        self.deficit = max(-float(np.min(rho, initial=0.0)), 1e-6)
+        # A pole that has fallen has a deficit far beyond any margin that can be had.
+        self.slack = SLACK * min(self.deficit, float(np.median(kept)) if len(kept) else np.inf)
+
+    @property
+    def aim(self) -> float:
+        """The robustness that a repair goes for."""
+        return self.margin + self.slack
+
+    @property
+    def enough(self) -> float:
+        """The robustness at which it is content."""
+        return self.margin + 0.5 * self.slack
+
+    def go(self, rounds: int) -> None:
+        """Attack and mend in turn."""
+        if len(self.environments) and not self.mend():
+            return
+        for number in range(1, rounds + 1):
+            if self.limits.over:
+                break
+            found = attack(
+                self.loop, self.now.theta, self.margin, self.limits.slice(self.share),
+                search=self.search, batch=self.batch, seed=self.seed + 7919 * number,
+                scale=self.deficit or 1.0,
+            )  # fmt: skip
+            count = int(found.violating.sum())
+            change = float(np.linalg.norm(self.now.theta - self.start))
+            self.turns.append(Round(len(found.rho), count, found.worst, change))
+            self.robustness = min(found.worst, self.now.value)
+            if not count:
+                # What a handful of simulations does not find says nothing.
+                thorough = not self.limits.over or len(found.rho) >= self.share // 2
+                self.stopped = "repaired" if thorough else self.limits.ended
+                if not np.isfinite(found.rho).any():
+                    self.stopped = "no verdict"
+                return
+            self.seen(found.rho)
+            self.environments = np.concatenate([self.environments, found.chosen(ADDED)])
+            self.environments = self.environments.astype(np.float32)
+            if not self.mend():
+                return
+        self.stopped = self.limits.ended if self.limits.over else "rounds"
+
+    def mend(self) -> bool:
+        """Go to the nearest parameters that keep the whole set; whether there are any."""
+        # What was near and what was robust in the old set may still be in this one.
+        old = self.archive.best(4, self.merit) + self.archive.best(8, by_value, apart=0.05)
+        self.archive = archive = Archive()
+        if self.limits.left < LEAST_BATCH * len(self.environments):
+            self.archive, self.stopped = archive, self.limits.ended
+            return False
+        starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
+        affordable = max(2, self.limits.left // 4 // len(self.environments))
+        judged(self.loop, starts[:affordable], self.environments, archive)
+        scale = self.deficit or 1.0
+        if climbs(self.loop):
+            # From where it is now, and from the start anew: the nearest may lie elsewhere.
+            starts = [self.now.theta] if np.all(self.now.theta == self.start) else [
+                self.now.theta, self.start
+            ]  # fmt: skip
+            climb(
+                self.loop, starts, self.environments, archive,
+                self.limits.slice(self.limits.left // 3), propose=self.propose, merit=self.merit,
+                scale=scale, radius=0.1 if self.loop.bounded else 0.1 * self.size,
+            )  # fmt: skip
+        best = archive.best(1, self.merit)[0]
+        followed = climbs(self.loop) and self.loop.free.all()
+        if self.loop.bounded and (best.value < self.enough or not followed):
+            best = self.without_gradients(archive)
+        if self.margin <= best.value < self.enough:
+            # More than the margin is not to be had; the nearest that keeps it will do.
+            self.slack = 0.0
+            best = archive.best(1, self.merit)[0]
+        self.now = best
+        self.robustness = best.value
+        if best.value >= self.enough:
+            return True
+        if self.limits.left < LEAST_BATCH * len(self.environments):
+            self.stopped = self.limits.ended
+            return False
+        self.stopped = "no parameters"
+        if not self.loop.bounded:
+            self.notes.append("gradients led no further; nothing else is tried on arrays")
+        return False
+
+    @property
+    def size(self) -> float:
+        """Of an ordinary number in the arrays."""
+        return float(np.sqrt(np.mean(self.start**2))) or 1.0
+
+    def merit(self, theta: Any, value: float) -> tuple[float, ...]:
+        """First enough robustness, then the nearer the better."""
+        far = float(np.linalg.norm(theta - self.start))
+        return (1.0, -far) if value >= self.enough else (0.0, value)
+
+    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
+        loop = self.loop
+        step = least_change(
+            theta, self.start, rho, slopes, self.aim, free=loop.free, bounded=loop.bounded
+        )
+        steps = [] if step is None else [step * share for share in (1.0, 0.5, 0.2, 0.05)]
+        if np.min(rho, initial=np.inf) < self.enough:
+            if loop.dim <= 64:
+                steps.append(
+                    uphill(theta, rho, slopes, radius, free=loop.free, bounded=loop.bounded)
+                )
+            else:
+                worst = slopes[int(np.argmin(rho))]
+                size = np.linalg.norm(worst)
+                if size > 0:
+                    steps.append(radius * np.sqrt(loop.dim) * worst / size)
+        moved = [theta + step for step in steps]
+        return [np.clip(m, 0.0, 1.0) for m in moved] if loop.bounded else moved
+
+    def without_gradients(self, archive: Archive) -> Choice:
+        """Cross-entropy over the whole space where nothing is known, then nearer and nearer."""
+        limits = self.limits.slice(max(self.limits.most // 8, self.limits.left // 8))
+        if archive.best(1, self.merit)[0].value < self.enough:
+            explore(
+                self.loop, self.environments, archive, limits.slice(limits.left // 2),
+                merit=self.merit, batch=CANDIDATES, rng=self.rng,
+            )  # fmt: skip
+        best = archive.best(6, self.merit)
+        narrow(
+            self.loop, [c.theta for c in best], self.environments, archive,
+            limits.slice(limits.left // 2),
+            merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=40,
+        )  # fmt: skip
+        best = archive.best(1, self.merit)[0]
+        if best.value >= self.enough:
+            self.back(best.theta, archive, limits)
+        return archive.best(1, self.merit)[0]
+
+    def back(self, theta: Any, archive: Archive, limits: Limits) -> None:
+        """Towards the nominal parameters: each coordinate alone first, then all together."""
+        blocks = [np.arange(self.loop.dim) == i for i in range(self.loop.dim)]
+        for block in [*blocks, np.ones(self.loop.dim, bool)]:
+            block = block & self.loop.free if block.sum() > 1 else block
+            low, high = 0.0, 1.0  # Shares of the way that are kept: `high` is known to be enough.
+            for _ in range(3):
+                shares = low + (high - low) * np.arange(8) / 8
+                ways = [np.where(block, self.start + s * (theta - self.start), theta)
+                        for s in shares]  # fmt: skip
+                if limits.left < len(ways) * len(self.environments) or high - low < 1e-3:
+                    return
+                values = judged(self.loop, ways, self.environments, archive)
+                good = values >= self.enough
+                # Nearest above which all are good, so that it is not an island.
+                upper = len(good) - int(np.argmin(np.append(good[::-1], False)))
+                if upper == 0:
+                    high = 0.0
+                    break
+                low, high = shares[upper - 1], shares[upper] if upper < len(shares) else high
+            theta = np.where(block, self.start + high * (theta - self.start), theta)

@@ -1,0 +1,415 @@
+"""Features for which the formula holds, and holds robustly: model-parameter synthesis.
+
+    synthesize(problem, ["gain", "damping"])             # for all values of the other features
+    synthesize(problem)                                   # all features are parameters
+
+Without an environment the robustness is maximised: by a search over the whole space, then along
+gradients. With one it is the least robustness over a set of environments that grows
+(counterexample-guided inductive synthesis: Solar-Lezama, Program synthesis by sketching, 2008,
+chapter 5; for robust optimisation Blankenship and Falk, Infinitely constrained optimization
+problems, 1976, algorithm 2.1): choose parameters for the set, attack them, add the environments in
+which they do worse than in any of the set, choose again. The result is checked in fresh samples.
+"""
+
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax import search as searches
+from verifai_jax.core.budget import Limits, timed
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.precision import in_precision
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.falsification.validation import check_options, check_search, usual_batch
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.statistics.least_distance import uphill
+from verifai_jax.synthesis.adversary import attack
+from verifai_jax.synthesis.held_out import drawn, held_out
+from verifai_jax.synthesis.optimize import (
+    Archive,
+    Choice,
+    by_value,
+    climb,
+    climbs,
+    explore,
+    judged,
+    least,
+    narrow,
+    scale_of,
+)
+from verifai_jax.synthesis.parametric import FeatureParameters, rows_of
+from verifai_jax.synthesis.results import Synthesis
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+CANDIDATES = 32
+"""Choices of parameters at a time, and at most in the table at the end."""
+STARTS = 4
+"""Choices from which gradients are followed."""
+ADDED = 6
+"""Environments that a round adds to the set at most."""
+ATTACK = 20_000
+"""Simulations of an attack at most, however large the budget."""
+EXPLORED = 20_000
+"""Simulations of the first look at the parameters at most, where there is no environment."""
+
+
+@suggests_options
+def synthesize(
+    problem: Problem,
+    parameters: Sequence[str] | str | None = None,
+    budget: int = 10_000,
+    *,
+    search: str | Search = "cross_entropy",
+    margin: float = 0.0,
+    environments: int = 16,
+    held_out: int = 2000,
+    gradient: bool | None = None,
+    batch: int = 256,
+    seed: int = 0,
+    max_seconds: float | None = None,
+    precision: str = "float32",
+    backend: str | None = None,
+) -> Synthesis:
+    """Find features for which the formula holds robustly, whatever the other features are.
+
+    **Arguments:**
+
+    - `parameters`: names of the features to choose; all when left out. The others are the
+      environment, which varies.
+    - `budget`: simulations at most, the check not counted.
+    - `search`: attacks the parameters, over the environment.
+    - `margin`: robustness that is wanted.
+    - `environments`: in the set at first.
+    - `held_out`: fresh environments in which the result is checked; 0 for no check.
+    - `gradient`: whether to follow gradients; by default where the system has them without
+      changing the backend.
+    - `batch`: simulations at once.
+    - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - the others as in `falsify`.
+
+    Ctrl-C ends it and returns what is finished, without the check.
+
+    **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
+    """
+    started = time.perf_counter()
+    check_options(budget, batch, seed, max_seconds, None)
+    check_numbers(margin, environments=environments, held_out=held_out)
+    loop = feature_loop(problem, parameters, gradient, batch, budget, precision, backend, seed)
+    search = attacker(problem, search, loop)
+    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
+    work = _Search(loop, search, limits, margin, environments, seed)
+    try:
+        work.go()
+        stopped = work.stopped
+    except KeyboardInterrupt:
+        stopped = "interrupted"
+    if stopped != "interrupted":
+        try:
+            work.conclude()
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+    best, robustness = work.best, work.robustness
+    searched = loop.simulations
+    checked = None
+    if stopped != "interrupted" and held_out and (loop.environment is not None or problem.draws()):
+        checked = _held_out_or_none(loop, best.theta, held_out, margin, seed, checking)
+    if checked is not None and checked.least is not None:
+        robustness = min(robustness, checked.least)
+    return Synthesis(
+        problem=problem,
+        parameters=loop.values(best.theta),
+        robustness=robustness,
+        margin=margin,
+        candidates=work.table(),
+        environments=work.environment_table(),
+        held_out=checked,
+        attacks=work.attacks.get(best.theta.tobytes(), 0) + len(work.environments),
+        converged=work.stopped == "converged",
+        simulations=searched,
+        without_verdict=loop.without_verdict,
+        seconds=time.perf_counter() - started,
+        stopped=stopped,
+        seed=seed,
+    )
+
+
+def _held_out_or_none(
+    loop: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
+) -> Any:
+    try:
+        return held_out(loop, theta, count, margin, (seed, 1), limits)
+    except KeyboardInterrupt:
+        return None
+
+
+class _Search:
+    """The work of a synthesis, of which all that is finished can be had at any time."""
+
+    def __init__(
+        self,
+        loop: FeatureParameters,
+        search: Search,
+        limits: Limits,
+        margin: float,
+        environments: int,
+        seed: int,
+    ) -> None:
+        self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
+        self.margin = margin
+        # One shape for all attacks: a twentieth of what one may cost.
+        self.batch = min(128, usual_batch(search, max(256, limits.most // 4)))
+        self.archive = Archive()
+        self.rng = np.random.default_rng((seed, 2))
+        self.scale = 1.0
+        self.stopped = "budget"
+        self.attacked: list[Choice] = []
+        self.attacks: dict[bytes, int] = {}
+        self.final: list[Choice] = []
+        self.rho: Any = None  # Of the best, in each environment of the set.
+        self.environments: Any = np.zeros((1, 0), np.float32)
+        if loop.environment is not None:
+            environments = max(1, min(environments, limits.left // 4))
+            self.environments = drawn(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
+            if not len(self.environments):
+                # The constraint wants other parameters: it is asked with each of them.
+                rng = np.random.default_rng((seed, 3))
+                self.environments = rng.random((environments, loop.environment.dim), np.float32)
+
+    def go(self) -> None:
+        whole = self.limits
+        if self.loop.environment is not None:
+            # A tenth is kept for comparing the candidates over the whole set at last.
+            self.limits = whole.slice(int(0.9 * whole.left))
+        try:
+            self.rounds()
+        finally:
+            self.limits = whole
+
+    def rounds(self) -> None:
+        """All but the conclusion."""
+        total = self.limits.left
+        alone = self.loop.environment is None
+        most = EXPLORED if alone else 1000 * len(self.environments)
+        first = self.limits.slice(min(most, int((0.5 if alone else 0.15) * total)))
+        explore(
+            self.loop, self.environments, self.archive, first,
+            merit=by_value, batch=CANDIDATES, rng=self.rng,
+        )  # fmt: skip
+        if not self.archive.choices:
+            # Not even one choice fits into the share: at least one is judged.
+            judged(self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive)
+        self.scale = scale_of([choice.value for choice in self.archive.choices])
+        if self.loop.environment is None:
+            self.improve(self.limits, 2 * STARTS)
+            self.stopped = self.limits.ended if self.limits.over else "converged"
+            return
+        number = 0
+        while not self.limits.over:
+            number += 1
+            # A quarter of what is left: later sets deserve as much as the first.
+            self.improve(self.limits.slice(self.limits.left // 4), STARTS if number == 1 else 1)
+            choice = self.archive_best()
+            if not np.isfinite(choice.value):
+                break
+            level = choice.value - 1e-3 * self.scale
+            share = max(self.limits.left // 4, min(self.limits.left, 256))
+            share = min(share, ATTACK)
+            found = attack(
+                self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
+                batch=self.batch, seed=self.seed + 7919 * number,
+                scale=self.scale,
+            )  # fmt: skip
+            worst = min(choice.value, found.worst)
+            name = choice.theta.tobytes()
+            self.attacks[name] = self.attacks.get(name, 0) + len(found.rho)
+            self.attacked.append(choice._replace(value=worst))
+            if not found.violating.any():
+                # What a handful of simulations does not find says nothing.
+                thorough = len(found.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
+                self.stopped = "converged" if thorough else self.limits.ended
+                return
+            self.extend(found.chosen(ADDED))
+        self.stopped = self.limits.ended if self.limits.over else "no verdict"
+
+    def improve(self, limits: Limits, starts: int) -> None:
+        best = self.archive.best(starts, by_value, apart=1e-3)
+        if climbs(self.loop):
+            part = limits if self.loop.differentiable else limits.slice(limits.left // 2)
+            climb(
+                self.loop, [c.theta for c in best], self.environments, self.archive, part,
+                propose=self.propose, merit=by_value, scale=self.scale, radius=0.1,
+            )  # fmt: skip
+        if not self.loop.free.all() or not self.loop.differentiable:
+            best = self.archive.best(2, by_value) + self.archive.best(6, by_value, apart=0.05)
+            narrow(
+                self.loop, [c.theta for c in best], self.environments, self.archive, limits,
+                merit=by_value, batch=CANDIDATES, rng=self.rng, rounds=1000
+                if self.loop.environment is None else 12,
+            )  # fmt: skip
+
+    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
+        def step(radius: float) -> Any:
+            moved = theta + uphill(theta, rho, slopes, radius, free=self.loop.free, bounded=True)
+            return np.clip(moved, 0.0, 1.0)
+
+        return [step(radius), step(radius / 3), step(radius / 10)]
+
+    def extend(self, points: Any) -> None:
+        """Add environments to the set; what was judged over the old one starts anew."""
+        self.environments = np.concatenate([self.environments, points]).astype(np.float32)
+        best = self.archive.best(4, by_value, apart=1e-3)
+        best += self.archive.best(12, by_value, apart=0.1)
+        affordable = min(len(best), self.limits.left // len(self.environments))
+        kept, self.archive = best[:affordable], Archive()
+        if kept:
+            judged(self.loop, [c.theta for c in kept], self.environments, self.archive)
+            return
+        # Old values bound the new ones from above; the attacked ones are known best.
+        self.archive.choices = best
+
+    def archive_best(self) -> Choice:
+        return self.archive.best(1, by_value)[0]
+
+    @property
+    def best(self) -> Choice:
+        """The choice that has stood up best to all that was tried against it."""
+        if self.attacked:
+            known: dict[bytes, Choice] = {}
+            for choice in self.attacked:
+                name = choice.theta.tobytes()
+                if name not in known or choice.value < known[name].value:
+                    known[name] = choice
+            return max(known.values(), key=lambda choice: choice.value)
+        if self.archive.choices:
+            return self.archive_best()
+        return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0)
+
+    @property
+    def robustness(self) -> float:
+        """Of the best, the least that was seen."""
+        return self.best.value
+
+    def conclude(self) -> None:
+        """With what is left: judge the attacked and the best other choices over the whole set."""
+        if self.loop.environment is None:
+            return
+        pool = Archive()
+        pool.choices = [*self.attacked, *self.archive.best(CANDIDATES, by_value, apart=1e-3)]
+        thetas: dict[bytes, Any] = {}
+        for choice in pool.best(len(pool.choices), by_value):
+            thetas.setdefault(choice.theta.tobytes(), choice)
+        affordable = max(0, self.limits.most - self.loop.simulations) // len(self.environments)
+        chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
+        if not chosen:
+            return
+        pairs = self.loop.judge(np.stack([c.theta for c in chosen]), self.environments)
+        values = least(pairs)
+        self.final = [
+            Choice(c.theta, float(v), len(self.environments))
+            for c, v in zip(chosen, values, strict=True)
+        ]
+        seen = {c.theta.tobytes(): c.value for c in self.final}
+        self.attacked = [
+            c._replace(value=min(c.value, seen.get(c.theta.tobytes(), c.value)))
+            for c in self.attacked
+        ]
+        names = [c.theta.tobytes() for c in self.final]
+        if (name := self.best.theta.tobytes()) in names:
+            self.rho = pairs.rho[names.index(name)]
+
+    def table(self) -> "pd.DataFrame":
+        """The candidates, best first."""
+        if self.loop.environment is None:
+            pool = self.archive.best(len(self.archive.choices), by_value)
+            chosen = [c for i, c in enumerate(pool) if c.value >= self.margin or i < CANDIDATES]
+        else:
+            chosen = sorted(self.final or [self.best], key=lambda c: c.value, reverse=True)
+        thetas = np.array([c.theta for c in chosen]).reshape(len(chosen), self.loop.dim)
+        frame = rows_of(self.loop.space, thetas)
+        return frame.assign(
+            rho=[c.value for c in chosen], environments=[c.environments for c in chosen]
+        )
+
+    def environment_table(self) -> "pd.DataFrame":
+        """The set, with the robustness of the best parameters where it is known."""
+        rho = self.rho if self.rho is not None else np.full(len(self.environments), np.nan)
+        return rows_of(self.loop.environment, self.environments).assign(rho=rho)
+
+
+def check_numbers(margin: Any, **counts: Any) -> None:
+    """Refuse numbers out of range.
+
+    **Raises:** `ValueError`.
+    """
+    if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
+        raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
+    for name, count in counts.items():
+        least = 0 if name == "held_out" else 1
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        if not whole or count < least:
+            raise ValueError(f"{name} must be an integer of at least {least}; got {count!r}")
+
+
+def feature_loop(
+    problem: Any,
+    parameters: Any,
+    gradient: bool | None,
+    batch: int,
+    budget: int,
+    precision: str,
+    backend: str | None,
+    seed: int,
+) -> FeatureParameters:
+    """The problem, checked and on its backend, with these features as parameters.
+
+    **Raises:** `ValueError` for what does not fit, before anything compiles.
+    """
+    if not isinstance(problem, Problem):
+        raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
+    in_precision(precision)
+    if gradient and problem.black_box:
+        raise ValueError(
+            f"the system of problem {problem.name!r} is a black box, which has no gradient; leave "
+            "gradient out, and parameters are chosen by cross-entropy"
+        )
+    several = bool(getattr(problem.system, "backends", ()))
+    # With every name known, before a backend is measured.
+    FeatureParameters(problem, parameters, batch=batch, gradient=False)
+    problem.space.check_where()
+    choice = resolved(
+        problem, gradient=bool(gradient), batch=batch, budget=budget, precision=precision,
+        wanted=backend,
+    )  # fmt: skip
+    choice.problem.check()
+    wanted = not several if gradient is None else gradient
+    return FeatureParameters(
+        choice.problem, parameters, batch=batch, gradient=wanted, precision=precision, seed=seed
+    )
+
+
+def attacker(problem: Problem, search: Any, loop: Any) -> Search:
+    """The search over the environment, if it can work there.
+
+    **Raises:** `ValueError` for one that needs gradients where there are none, or of clauses.
+    """
+    if isinstance(search, str):
+        search = searches.named(search)
+    if loop.environment is None:
+        return search
+
+    checked = check_search(problem, search) if loop.problem.black_box else search
+    if not isinstance(checked, Search):
+        raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
+    checked.check(loop.environment.cube)
+    clauses = bool(getattr(checked, "wants_clauses", False))
+    if clauses or (checked.wants_gradient and not loop.differentiable):
+        raise ValueError(
+            f"search {checked!r} needs gradients that an attack does not have; use one that does "
+            "not, such as 'cross_entropy': its worst environments are followed downhill anyway"
+        )
+    return checked

@@ -1,0 +1,120 @@
+"""Chosen parameters in environments that nobody has looked at: a failure rate that means something.
+
+What an active search does not find proves nothing. Environments drawn from the prior after the
+parameters are fixed are independent of how they were chosen, so that an exact binomial interval
+holds.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.budget import Limits
+from verifai_jax.statistics.binomial import Rate, clopper_pearson
+from verifai_jax.synthesis.parametric import Parametric
+
+MOST_DRAWS = 1000
+ROUND = 256
+"""Simulations between two looks at the clock."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How parameters did in `simulations` fresh environments.
+
+    - `failures`: that broke a formula; `short`: that kept it, but by less than the wanted margin.
+    - `without_verdict`: simulations that did not end properly; they are in no rate.
+    - `least`: robustness, None without a verdict.
+    - `rate`: of failures among the simulations with a verdict, with its 95 % interval.
+    """
+
+    simulations: int
+    failures: int
+    short: int
+    without_verdict: int
+    least: float | None
+    rate: Rate | None
+
+    @property
+    def passed(self) -> bool:
+        """Whether all were simulated and none fails or falls short of the margin."""
+        return self.simulations > 0 and not (self.failures or self.short or self.without_verdict)
+
+    @property
+    def bound(self) -> float | None:
+        """A number that the failure probability is below, with 95 % confidence."""
+        if self.rate is None:
+            return None
+        return clopper_pearson(self.rate.failures, self.rate.simulations, 0.9).high
+
+    def told(self, what: str = "environments") -> str:
+        """For people, such as `0 of 2000 held-out environments fail: ...`."""
+        if not self.simulations:
+            return f"no time was left for held-out {what}"
+        if self.rate is None:
+            return f"none of {self.simulations} held-out {what} gave a verdict"
+        judged = self.rate.simulations
+        text = f"{self.failures} of {judged} held-out {what} fail"
+        if self.failures:
+            text += f": failure probability {self.rate}"
+        else:
+            text += f": failure probability < {self.bound:.2g} at 95 %"
+        if self.short:
+            text += f"; {self.short} more keep less than the margin"
+        if self.without_verdict:
+            text += f"; {self.without_verdict} more gave no verdict and are in no rate"
+        return text
+
+
+def held_out(
+    loop: Parametric,
+    theta: Float[np.ndarray, " p"],
+    count: int,
+    margin: float,
+    seed: Any,
+    limits: Limits | None = None,
+) -> HeldOut:
+    """Simulate `count` environments drawn from the prior, which the seed alone decides.
+
+    Fewer where the constraint of the space refuses nearly all, or where `limits` end it first.
+    """
+    points = drawn(loop, theta, count, seed)
+    parts = []
+    for start in range(0, len(points), ROUND):
+        if limits is not None and limits.late:
+            break
+        pairs = loop.judge(theta[None], points[start : start + ROUND])
+        short = pairs.violates(margin) & ~pairs.failing
+        parts.append((pairs.rho[0], pairs.proper[0], pairs.failing[0], short[0]))
+    none = (np.zeros(0), *[np.zeros(0, bool)] * 3)
+    rho, proper, failing, short = (
+        np.concatenate(column) for column in zip(none, *parts, strict=True)
+    )
+    judged, failures = int(proper.sum()), int(failing.sum())
+    return HeldOut(
+        simulations=len(rho),
+        failures=failures,
+        short=int(short.sum()),
+        without_verdict=len(rho) - judged,
+        least=float(np.min(rho[proper])) if judged else None,
+        rate=clopper_pearson(failures, judged) if judged else None,
+    )
+
+
+def drawn(
+    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, seed: Any
+) -> Float[np.ndarray, "n d"]:
+    """Environments from the prior, given that the constraint accepts them with these parameters."""
+    d = loop.environment.dim if loop.environment is not None else 0
+    rng = np.random.default_rng(seed)
+    parts, have = [np.zeros((0, d), np.float32)], 0
+    for _ in range(MOST_DRAWS):
+        if have >= count:
+            break
+        points = rng.random((max(count, 64), d), np.float32)
+        points = points[loop.happens(theta, points)]
+        parts.append(points)
+        have += len(points)
+    return np.concatenate(parts)[:count]

@@ -1,0 +1,307 @@
+"""Parameters for a fixed set of environments: explored, climbed along gradients, or narrowed.
+
+The value of parameters is their least robustness over the set. All that is judged goes to the
+`Archive`. A `merit` says which of two choices is better: the value alone for a synthesis, first the
+value and then the distance from the nominal parameters for a repair.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.budget import Limits
+from verifai_jax.synthesis.parametric import Pairs, Parametric, accepted
+
+ACTIVE = 16
+"""Environments, the least robust ones, that decide a step; all of them judge its result."""
+FIRST = 6
+"""Of the hardest environments, in which candidates are judged before the others."""
+EXPLORED = 0.2
+"""Share of the candidates of cross-entropy that are drawn from anywhere."""
+LEAST_BATCH = 8
+"""Candidates below which a round of cross-entropy is not worth having."""
+LEAST_RADIUS = 1e-5
+MOST_DIFFERENCES = 12
+"""Parameters up to which slopes are taken from differences where there are no gradients."""
+MOST_REFUSED = 1000
+"""Draws in a row without one that the constraint accepts, after which no more are made."""
+
+Merit = Callable[[np.ndarray, float], tuple[float, ...]]
+Propose = Callable[[np.ndarray, np.ndarray, np.ndarray, float], list[np.ndarray]]
+
+
+class Choice(NamedTuple):
+    """Parameters, and their least robustness over so many environments."""
+
+    theta: Float[np.ndarray, " p"]
+    value: float
+    environments: int
+
+
+class Archive:
+    """All parameters that were judged, newest last."""
+
+    def __init__(self) -> None:
+        self.choices: list[Choice] = []
+
+    def add(self, thetas: Any, values: Any, environments: int) -> None:
+        """Keep these."""
+        for theta, value in zip(np.asarray(thetas), values, strict=True):
+            self.choices.append(Choice(theta, float(value), environments))
+
+    def best(self, count: int, merit: Merit, apart: float = 0.0) -> list[Choice]:
+        """The best, no two the same, or nearer than `apart` in each coordinate."""
+        taken: list[Choice] = []
+        seen: set[bytes] = set()
+        for choice in sorted(self.choices, key=lambda c: merit(c.theta, c.value), reverse=True):
+            if (name := choice.theta.tobytes()) in seen:
+                continue
+            seen.add(name)
+            if not apart or all(np.abs(choice.theta - t.theta).max() > apart for t in taken):
+                taken.append(choice)
+            if len(taken) == count:
+                break
+        return taken
+
+
+def by_value(theta: np.ndarray, value: float) -> tuple[float, ...]:
+    """The merit of a synthesis."""
+    return (value,)
+
+
+def least(pairs: Pairs) -> Float[np.ndarray, " k"]:
+    """The value of each choice of parameters: negative where one fails somewhere.
+
+    Minus infinity where a simulation has no verdict in an environment in which others have one, or
+    where none of the environments can happen.
+    """
+    known = np.any(pairs.proper, axis=0)
+    rho = np.where(pairs.proper, pairs.rho, -np.inf)[:, known]
+    # At exactly zero the Boolean semantics have decided.
+    rho = np.where(pairs.failing[:, known] & (rho >= 0), -np.finfo(np.float32).tiny, rho)
+    value = np.min(rho, axis=1, initial=np.inf)
+    return np.where(np.isposinf(value), -np.inf, value)
+
+
+def scale_of(rho: Any) -> float:
+    """The size of ordinary robustnesses, positive."""
+    sizes = np.abs(np.asarray(rho, float))
+    sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+    return float(np.median(sizes)) if len(sizes) else 1.0
+
+
+def judged(
+    loop: Parametric, thetas: Any, environments: Any, archive: Archive | None = None
+) -> Float[np.ndarray, " k"]:
+    """The values of these parameters over the set."""
+    values = least(loop.judge(thetas, environments))
+    if archive is not None:
+        archive.add(thetas, values, len(environments))
+    return values
+
+
+def explore(
+    loop: Parametric,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    merit: Merit,
+    batch: int,
+    rng: np.random.Generator,
+) -> None:
+    """Look over the whole space of the parameters, which are features, then around the best."""
+    size, half = max(1, len(environments)), limits.slice(limits.left // 2)
+    refused = 0
+    while half.left >= size and refused < MOST_REFUSED:
+        # One in each of as many slices of every coordinate: a Latin hypercube.
+        cells = np.argsort(rng.random((batch, loop.dim)), axis=0)
+        thetas = (cells + rng.random(cells.shape)) / batch
+        if loop.environment is None:
+            thetas = thetas[accepted(loop.problem.space, thetas.astype(np.float32))]
+        refused = 0 if len(thetas) else refused + 1
+        thetas = thetas[: half.left // size]
+        if len(thetas):
+            known = archive.best(max(4, batch // 5), merit)
+            level = merit(known[-1].theta, known[-1].value) if len(known) > 3 else (-np.inf,)
+            _promising(loop, thetas, np.asarray(environments), archive, merit, level)
+    best = archive.best(max(4, batch // 5), merit)
+    if best:
+        narrow(
+            loop, [c.theta for c in best], environments, archive, limits,
+            merit=merit, batch=batch, rng=rng, rounds=1000,
+        )  # fmt: skip
+
+
+def climb(
+    loop: Parametric,
+    thetas: Any,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    propose: Propose,
+    merit: Merit,
+    scale: float,
+    radius: float,
+    steps: int = 40,
+) -> list[Choice]:
+    """Follow the gradients of the least robust environments from each start, all in step.
+
+    - `propose(theta, rho, slopes, radius)`: candidates for a step, the boldest first.
+
+    A step is taken where simulations show that it is better; the radius follows its success.
+    """
+    thetas = np.array(thetas, np.float64)[: limits.left // max(1, len(environments))]
+    if not len(thetas):
+        return []
+    rho = loop.judge(thetas, environments)
+    now = [Choice(t, v, len(environments)) for t, v in zip(thetas, least(rho), strict=True)]
+    rhos = [np.where(ok, r, np.inf) for r, ok in zip(rho.rho, rho.proper, strict=True)]
+    archive.add(thetas, [choice.value for choice in now], len(environments))
+    radii = np.full(len(now), radius)
+    for _ in range(steps):
+        alive = [
+            i for i, r in enumerate(radii) if r >= LEAST_RADIUS * radius and now[i].value > -np.inf
+        ]
+        if not alive:
+            break
+        for i in alive:
+            few = np.asarray(environments)[np.argsort(rhos[i], kind="stable")[:ACTIVE]]
+            tries = 8 if loop.differentiable else 9 + int(loop.free.sum())
+            if limits.left < tries * len(few) + len(environments):
+                return now
+            # Cooler as steps get shorter: the kinks of the robustness matter then.
+            warmth = scale * max(0.001, 0.02 * min(1.0, radii[i] / radius))
+            values, slopes = _slopes(loop, now[i].theta, few, warmth, 0.1 * radii[i])
+            candidates = propose(now[i].theta, values, slopes, radii[i])
+            candidates = [c for c in candidates if np.any(c != now[i].theta)]
+            if not candidates:
+                radii[i] = 0.0
+                continue
+            tried = judged(loop, candidates, few)
+            order = sorted(
+                range(len(candidates)), key=lambda j: merit(candidates[j], tried[j]), reverse=True
+            )
+            winner = candidates[order[0]]
+            whole = loop.judge(winner[None], environments)
+            value = float(least(whole)[0])
+            archive.add([winner], [value], len(environments))
+            before, after = merit(now[i].theta, now[i].value), merit(winner, value)
+            if after > before:
+                now[i] = Choice(winner, value, len(environments))
+                rhos[i] = np.where(whole.proper[0], whole.rho[0], np.inf)
+                gain = max(abs(a - b) for a, b in zip(after, before, strict=True))
+                radii[i] *= 2.0 if order[0] == 0 else 0.7
+                if gain < 1e-5 * scale:
+                    radii[i] /= 20
+            else:
+                radii[i] /= 10
+            radii[i] = min(radii[i], 4 * radius)
+    return now
+
+
+def climbs(loop: Parametric) -> bool:
+    """Whether slopes are to be had: from gradients, or from differences of a few parameters."""
+    return loop.differentiable or (loop.bounded and 0 < loop.free.sum() <= MOST_DIFFERENCES)
+
+
+def _slopes(
+    loop: Parametric, theta: np.ndarray, environments: Any, warmth: float, gap: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Robustness `[n]`, infinite where there is no verdict, and its slopes `[n, p]`, zero there."""
+    if loop.differentiable:
+        seen = loop.judge(theta[None], environments, warmth)
+        assert seen.by_parameters is not None
+        return np.where(seen.proper[0], seen.rho[0], np.inf), seen.by_parameters[0]
+    places = np.flatnonzero(loop.free)
+    # Away from the nearer end of the cube; wide enough that float32 has digits left.
+    gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
+    beside = np.repeat(theta[None], len(places), axis=0)
+    beside[np.arange(len(places)), places] += gaps
+    seen = loop.judge(np.concatenate([theta[None], beside]), environments)
+    rho = np.where(seen.proper & np.isfinite(seen.rho), seen.rho, np.nan)
+    slopes = np.zeros((len(environments), loop.dim))
+    slopes[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
+    return np.where(np.isnan(rho[0]), np.inf, rho[0]), slopes
+
+
+def narrow(
+    loop: Parametric,
+    thetas: Any,
+    environments: Any,
+    archive: Archive,
+    limits: Limits,
+    *,
+    merit: Merit,
+    batch: int,
+    rng: np.random.Generator,
+    rounds: int = 8,
+) -> None:
+    """Cross-entropy around good parameters, without gradients: sample, keep an elite, narrow.
+
+    De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
+    3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.
+    """
+    environments, size = np.asarray(environments), max(1, len(environments))
+    affordable = limits.left // size
+    if affordable < LEAST_BATCH:
+        return
+    points = np.array(thetas, np.float64)[: max(1, affordable // 3)]
+    pairs = loop.judge(points, environments)
+    values = least(pairs)
+    archive.add(points, values, len(environments))
+    # What is hard for the best is hard for most: with these first, few are simulated in all.
+    best = max(range(len(points)), key=lambda j: merit(points[j], values[j]))
+    rho = np.where(pairs.proper[best], pairs.rho[best], np.inf)
+    environments = environments[np.argsort(rho, kind="stable")]
+    most, std = max(4, batch // 5), np.full(loop.dim, 0.1)
+    for _ in range(rounds):
+        affordable = limits.left // size
+        if affordable < LEAST_BATCH:
+            return
+        order = sorted(range(len(points)), key=lambda j: merit(points[j], values[j]), reverse=True)
+        points, values = points[order[:most]], values[order[:most]]
+        if len(points) == most:
+            std = np.clip(1.5 * points.std(axis=0), 1e-4, 0.2)
+            if np.all(std[loop.free] == 1e-4) and loop.free.all():
+                return
+        count = min(batch, max(LEAST_BATCH, affordable // 3))
+        level = merit(points[-1], values[-1]) if len(points) == most else (-np.inf,)
+        parents = points[rng.integers(0, len(points), 4 * count)]
+        drawn = parents + std * rng.normal(size=parents.shape)
+        # A few anywhere: what was best in the old set need not be near what is in this one.
+        anywhere = rng.random((len(parents), 1)) < EXPLORED
+        parents = np.where(anywhere, rng.random(parents.shape), parents)
+        anew = rng.random(parents.shape) < 0.1
+        other = np.where(anew, rng.random(parents.shape), parents)
+        drawn = np.clip(np.where(loop.free, drawn, other), 0.0, 1.0)
+        # Some are too far from the nominal parameters, whatever their value.
+        drawn = drawn[[merit(theta, np.inf) > level for theta in drawn]][:count]
+        if not len(drawn):
+            return
+        drawn, found = _promising(loop, drawn, environments, archive, merit, level)
+        points, values = np.concatenate([points, drawn]), np.concatenate([values, found])
+
+
+def _promising(
+    loop: Parametric,
+    thetas: np.ndarray,
+    environments: np.ndarray,
+    archive: Archive,
+    merit: Merit,
+    level: tuple[float, ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those whose merit may exceed `level`, and their values: the first environments rule out."""
+    if len(environments) < 2 * FIRST:
+        return thetas, judged(loop, thetas, environments, archive)
+    bounds = judged(loop, thetas, environments[:FIRST])
+    left = [j for j, pair in enumerate(zip(thetas, bounds, strict=True)) if merit(*pair) > level]
+    thetas, bounds = thetas[left], bounds[left]
+    if not left:
+        return thetas, bounds
+    values = np.minimum(bounds, judged(loop, thetas, environments[FIRST:]))
+    archive.add(thetas, values, len(environments))
+    return thetas, values

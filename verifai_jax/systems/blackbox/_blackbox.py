@@ -1,0 +1,397 @@
+"""Any Python function as a system: a simulator that JAX cannot see into.
+
+    blackbox(simulate)                               # simulate(features) -> Trace, in this process
+    blackbox(simulate, seeded=True)                  # simulate(features, seed) -> Trace
+    blackbox(simulate, workers=4, timeout=10.0)      # in four processes, 10 s each at most
+    blackbox(simulate, vectorised=True)              # many at a time: every array is [n, ...]
+
+A simulation that raises, hangs or kills its process is a row of the table with a message; it does
+not end the run.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.blackbox.workers import Pool
+from verifai_jax.systems.outcome import Outcome
+
+Names = Sequence[str] | Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What every trace of a simulator must have; what is None may be anything.
+
+    **Arguments:**
+
+    - `signals`: names of scalars, or names with their number of components (1 for a scalar).
+    - `dt`: sampling period in seconds.
+    - `length`: number of samples.
+
+    **Raises:** `ValueError` for a declaration that no trace can meet.
+    """
+
+    signals: Names | None = None
+    dt: float | None = None
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        signals, dt, length = self.signals, self.dt, self.length
+        if signals is not None:
+            named = not isinstance(signals, str) and all(isinstance(n, str) for n in signals)
+            if not named or not len(signals):
+                raise ValueError(f"signals must be names, such as ('x', 'theta'); got {signals!r}")
+            for name, width in self.widths.items():
+                if not isinstance(width, int) or width < 1:
+                    raise ValueError(
+                        f"signals must say how many components {name!r} has, at least 1; "
+                        f"got {width!r}"
+                    )
+        if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
+            raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
+        if length is not None and (not isinstance(length, int) or length < 1):
+            raise ValueError(f"length must be an integer of at least 1; got {length!r}")
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Number of components of each declared signal."""
+        signals = () if self.signals is None else self.signals
+        return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """A function of the features that gives a trace's form; None unless all is declared."""
+        if self.signals is None or self.dt is None or self.length is None:
+            return None
+        shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
+        signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
+        return lambda features: Trace(signals, dt=self.dt)
+
+    def accept(self, trace: Any) -> Trace:
+        """What a simulator returned, its signals as NumPy arrays, if it is as declared.
+
+        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
+        not as declared; both say what was expected and what came.
+        """
+        if not isinstance(trace, Trace):
+            raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
+        signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
+        for name, signal in signals.items():
+            if signal.dtype.kind not in "biuf":
+                raise TypeError(f"signal {name!r} must hold real numbers; got {signal.dtype}")
+        if self.signals is not None:
+            self._check_signals(signals)
+        if self.dt is not None:
+            wanted = f"the trace must have the sampling period dt={self.dt}"
+            if trace.dt is None:
+                raise ValueError(f"{wanted}; it has sample times")
+            if not math.isclose(trace.dt, self.dt, rel_tol=1e-6):
+                raise ValueError(f"{wanted}; got dt={trace.dt}")
+        if self.length is not None and trace.length != self.length:
+            raise ValueError(f"the trace must have {self.length} samples; got {trace.length}")
+        return replace(trace, signals=signals)
+
+    def _check_signals(self, signals: Mapping[str, np.ndarray]) -> None:
+        widths = self.widths
+        if signals.keys() != widths.keys():
+            missing = ", ".join(name for name in widths if name not in signals)
+            extra = ", ".join(name for name in signals if name not in widths)
+            how = [f"{missing} missing"] * bool(missing) + [f"{extra} not expected"] * bool(extra)
+            raise ValueError(
+                f"the trace must have the signals {', '.join(widths)}; got "
+                f"{', '.join(signals)} ({'; '.join(how)})"
+            )
+        for name, width in widths.items():
+            shape = signals[name].shape
+            if shape[1:] != (() if width == 1 else (width,)):
+                wanted = "[time]" if width == 1 else f"[time, {width}]"
+                hint = ""
+                if not isinstance(self.signals, Mapping):
+                    hint = f"; declare vectors by signals={{{name!r}: {shape[1]}, ...}}"
+                raise ValueError(f"signal {name!r} must be {wanted}; got {list(shape)}{hint}")
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """One simulation by a user's function, checked; what a worker process is given to run."""
+
+    function: Callable[..., Trace]
+    seeded: bool
+    declared: Declared
+
+    def __call__(self, features: Any, seed: int) -> Trace:
+        return self.declared.accept(
+            self.function(features, seed) if self.seeded else self.function(features)
+        )
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # After `simulate = blackbox(simulate, workers=2)` a worker finds the system by this name.
+        function = state["function"]
+        inner = function.simulation.function if isinstance(function, PooledBlackBox) else function
+        for name, value in {**state, "function": inner}.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False)
+class BlackBox:
+    """A host-side system; made by `blackbox`. Simulated row by row, never traced by JAX."""
+
+    black_box: ClassVar[bool] = True
+    simulation: Simulation
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate once, with features as plain Python and NumPy values.
+
+        `key`: a JAX random key, or an integer seed.
+        """
+        return self.simulation(plain_leaves(features), seed_of(key))
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract
+
+    @property
+    def check(self) -> Callable[[Any], None] | None:
+        """A function that refuses features which do not fit, if the simulator has one."""
+        return getattr(self.simulation.function, "check", None)
+
+    @property
+    def refined(self) -> Callable[[int], "BlackBox"] | None:
+        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
+        finer = getattr(self.simulation.function, "refined", None)
+        if not callable(finer):
+            return None
+        return lambda factor: BlackBox(replace(self.simulation, function=finer(factor)))  # pyright: ignore[reportArgumentType]
+
+
+@dataclass(frozen=True, eq=False)
+class PooledBlackBox:
+    """A host-side system that runs in processes of its own; made by `blackbox(..., workers=n)`."""
+
+    black_box: ClassVar[bool] = True
+    simulation: Simulation
+    pool: Pool
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate once, in a worker.
+
+        **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
+        """
+        return only(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
+
+    def simulate_each(
+        self, features: Sequence[Any], seeds: Sequence[int]
+    ) -> Iterator[tuple[int, Outcome]]:
+        """Each index exactly once, as its simulation ends; see `simulations.Each`."""
+        return self.pool.outcomes(features, seeds)
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract
+
+    @property
+    def check(self) -> Callable[[Any], None] | None:
+        """A function that refuses features which do not fit, if the simulator has one."""
+        return getattr(self.simulation.function, "check", None)
+
+    def close(self) -> None:
+        """End the workers. The next simulation starts new ones."""
+        self.pool.close()
+
+
+@dataclass(frozen=True, eq=False)
+class VectorisedBlackBox:
+    """A host-side system of many simulations at a time; made by `blackbox(vectorised=True)`."""
+
+    black_box: ClassVar[bool] = True
+    function: Callable[..., Trace]
+    seeded: bool
+    declared: Declared
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate one, as a batch of one."""
+        batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
+        trace = self._simulate(batch, np.array([seed_of(key)], np.uint32), 1)
+        return jax.tree.map(lambda leaf: leaf[0], trace)
+
+    @property
+    def refined(self) -> Callable[[int], "VectorisedBlackBox"] | None:
+        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
+        finer = getattr(self.function, "refined", None)
+        if not callable(finer):
+            return None
+        return lambda factor: replace(self, function=finer(factor))  # pyright: ignore[reportArgumentType]
+
+    def simulate_batch(self, features: Any, keys: Key[Array, " n"]) -> Trace:
+        """A trace whose leaves are `[n, ...]`; see `simulations.Batched`."""
+        seeds = np.zeros(len(keys), np.uint32)
+        if self.seeded:
+            seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
+        return self._simulate(features, seeds, len(keys))
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of one trace, if it is declared; see `Problem.check`."""
+        return self.declared.abstract
+
+    def _simulate(self, features: Any, seeds: np.ndarray, n: int) -> Trace:
+        trace = self.function(features, seeds) if self.seeded else self.function(features)
+        if not isinstance(trace, Trace):
+            raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
+        return self._checked(trace, n)
+
+    def _checked(self, trace: Trace, n: int) -> Trace:
+        for name, signal in trace.signals.items():
+            shape = np.shape(signal)
+            if len(shape) not in (2, 3) or shape[0] != n:
+                raise ValueError(
+                    f"signal {name!r} of a vectorised black box must have shape [{n}, time] or "
+                    f"[{n}, time, k], a row for each simulation; got {list(shape)}"
+                )
+        lengths = {np.shape(signal)[1] for signal in trace.signals.values()}
+        if len(lengths) > 1:
+            raise ValueError(f"signals must have one length; got {sorted(lengths)}")
+        rows = {"valid": (n,), "status": (n,), "times": (n, *lengths)}
+        whole = {}
+        for name, shape in rows.items():
+            value = getattr(trace, name)
+            if value is None:
+                continue
+            if np.shape(value) not in (shape, shape[1:]):
+                raise ValueError(
+                    f"{name} of a vectorised black box must have shape {list(shape)}; "
+                    f"got {list(np.shape(value))}"
+                )
+            whole[name] = np.broadcast_to(np.asarray(value), shape)
+        signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
+        trace = stacked(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
+        self.declared.accept(jax.tree.map(lambda leaf: leaf[0], trace))
+        return trace
+
+
+@suggests_options
+def blackbox(
+    function: Callable[..., Trace],
+    *,
+    seeded: bool = False,
+    workers: int | None = None,
+    timeout: float | None = None,
+    retries: int = 1,
+    vectorised: bool = False,
+    signals: Names | None = None,
+    dt: float | None = None,
+    length: int | None = None,
+) -> BlackBox | PooledBlackBox | VectorisedBlackBox:
+    """Mark a Python function as a system that runs on the host.
+
+    **Arguments:**
+
+    - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy. It may
+      have a `refined(factor)`, the same function with a smaller step, to confirm failures with (not
+      in workers).
+    - `seeded`: call `function(features, seed)` with an integer seed in `[0, 2^32)` of the
+      simulation, the same on every replay.
+    - `workers`: simulate in that many processes, which start with the first simulation and stay;
+      `function` must then be at the top level of a module. One after the other in this process
+      when left out. A worker has one core for JAX, no GPU, and no standard output.
+    - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
+      `timeout`; needs `workers`. What a worker's first simulation compiles or loads counts.
+    - `retries`: how often a simulation whose process dies is started again, in a new one.
+    - `vectorised`: `function` simulates many at a time: arrays of features are `[n, ...]`, `seeds`
+      is `[n]`, and so is every array of the trace; see `stacked`.
+    - `signals`, `dt`, `length`: what every trace must have; see `Declared`. One that differs is a
+      row with status `error`.
+
+    **Raises:** `ValueError` for something that is not callable, or not importable by workers;
+    options that do not go together.
+    """
+    if not callable(function):
+        raise ValueError(f"blackbox needs a function (features) -> Trace; got {function!r}")
+    declared = Declared(signals, dt, length)
+    if vectorised and workers is not None:
+        raise ValueError(
+            f"blackbox runs either vectorised or in workers; got (vectorised=True, {workers=})"
+        )
+    if timeout is not None and workers is None:
+        raise ValueError(
+            "blackbox can end a simulation only in a process of its own: give workers=1, or more, "
+            f"with timeout={timeout}"
+        )
+    if vectorised:
+        return VectorisedBlackBox(function, seeded, declared)
+    simulation = Simulation(function, seeded, declared)
+    if workers is None:
+        return BlackBox(simulation)
+    return PooledBlackBox(simulation, Pool(simulation, function, workers, timeout, retries))
+
+
+def stacked(
+    signals: Mapping[str, Any],
+    dt: float | None = None,
+    times: Any = None,
+    valid: Any = None,
+    status: Any = None,
+    held: bool = False,
+    finite: tuple[str, ...] = (),
+) -> Trace:
+    """Many traces as one, as `jax.vmap` over a system would give them.
+
+    **Arguments:** those of `Trace`, each array with a leading axis: `signals` are `[n, time]` or
+    `[n, time, k]`, `times` `[n, time]`, `valid` and `status` `[n]`.
+
+    **Raises:** `ValueError` for what the first of them would be refused for.
+    """
+    first = None if times is None else np.asarray(times)[0]
+    Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
+    # A Trace is checked as one; unflattening is how JAX makes a batch of them.
+    whole = Trace({name: np.zeros(1) for name in signals}, 1.0, held=held, finite=finite)
+    trace = jax.tree.unflatten(jax.tree.structure(whole), list(signals.values()))
+    for name, value in (("dt", dt), ("times", times), ("valid", valid), ("status", status)):
+        object.__setattr__(trace, name, value)
+    return trace
+
+
+def only(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
+    """The trace of the one simulation that was asked for.
+
+    **Raises:** `TimeoutError` or `RuntimeError` with its message where there is none.
+    """
+    ((_, outcome),) = outcomes
+    if outcome.trace is None:
+        kind = TimeoutError if outcome.status == Status.TIMEOUT else RuntimeError
+        raise kind(outcome.message)
+    return outcome.trace
+
+
+def seed_of(key: Any) -> int:
+    """The integer seed of a simulation: a function of its JAX key, or the number itself."""
+    if isinstance(key, int | np.integer):
+        return int(key)
+    if key is None:
+        return 0
+    return int(jax.random.bits(key))
+
+
+def plain_leaves(features: Any) -> Any:
+    """The same features with plain Python numbers and NumPy arrays."""
+    return jax.tree.map(_plain, features)
+
+
+def _plain(leaf: Any) -> Any:
+    if not isinstance(leaf, jax.Array | np.ndarray | np.generic):
+        return leaf
+    return np.asarray(leaf).item() if np.ndim(leaf) == 0 else np.asarray(leaf)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,0 +1,431 @@
+"""A pool of processes that simulate: one that hangs or dies takes nothing with it but itself.
+
+Each worker is a fresh Python, so that nothing of this process (threads, JAX, locks) is half copied
+into it, and in a session of its own: Ctrl-C reaches this process only, and a worker that is ended
+takes along what it has started.
+"""
+
+import importlib
+import importlib.util
+import logging
+import math
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing import Pipe, spawn
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.outcome import Outcome
+
+log = logging.getLogger("verifai_jax.workers")
+
+# One core and no GPU each: the workers are what is parallel. What the user has set is kept.
+QUIET = {
+    "JAX_PLATFORMS": "cpu",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+GLANCE = 0.5  # Seconds between two looks at whether a silent worker still lives.
+PATIENCE = 30.0  # Seconds until it is said that a worker is still importing.
+
+_preparing = False  # Whether this process is a worker that still imports what it is to run.
+
+
+class StartError(RuntimeError):
+    """A worker could not start; no simulation of the pool can run."""
+
+
+class Pool:
+    """`workers` processes that run one simulation at a time each; started when first needed.
+
+    **Arguments:**
+
+    - `simulation(features, seed) -> Trace`: picklable, as `function` is.
+    - `function`: the user's part of it, which errors speak of.
+    - `workers`, `timeout` (s), `retries`: see `blackbox`.
+
+    **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
+    import.
+    """
+
+    def __init__(
+        self,
+        simulation: Callable[[Any, int], Trace],
+        function: Any,
+        workers: int,
+        timeout: float | None,
+        retries: int,
+    ) -> None:
+        if not isinstance(workers, int) or isinstance(workers, bool) or workers < 1:
+            raise ValueError(f"workers must be an integer of at least 1; got {workers!r}")
+        if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
+            raise ValueError(f"timeout must be a positive number of seconds; got {timeout!r}")
+        if not isinstance(retries, int) or isinstance(retries, bool) or retries < 0:
+            raise ValueError(f"retries must be an integer of at least 0; got {retries!r}")
+        if os.name != "posix":
+            raise ValueError(
+                "workers need Linux or macOS; leave them out, or use a remote simulator"
+            )
+        self.workers, self.timeout, self.retries = workers, timeout, retries
+        self._setup = _setup(simulation, function)
+        self._slots = threading.Semaphore(workers)
+        self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
+        # When nobody can use it any more, and at the interpreter's exit.
+        weakref.finalize(self, _end, self._idle)
+
+    def outcomes(
+        self, features: Sequence[Any], seeds: Sequence[int]
+    ) -> Iterator[tuple[int, Outcome]]:
+        """Simulate all, and give each index with its outcome as soon as it has one.
+
+        Workers go on while the caller looks at an outcome. When the caller stops, or is
+        interrupted, the simulations that run are ended.
+
+        **Raises:** `StartError` if no worker can start.
+        """
+        if _preparing:
+            raise StartError(_guard())
+        batch, finished = _Batch(features, seeds), not len(features)
+        threads = [
+            threading.Thread(target=self._work, args=(batch,), daemon=True)
+            for _ in range(min(self.workers, len(batch.tasks)))
+        ]
+        try:
+            for thread in threads:
+                thread.start()
+            for left in reversed(range(len(features))):
+                result = batch.results.get()
+                if isinstance(result, BaseException):
+                    raise result
+                finished = left == 0
+                yield result
+        finally:
+            if not finished:
+                batch.stop()
+            for thread in threads:
+                thread.join()
+
+    def close(self) -> None:
+        """Let the idle workers end; those that work are ended by their batch."""
+        _end(self._idle)
+
+    def _work(self, batch: "_Batch") -> None:
+        """Simulate what is left of the batch in one worker after the other; runs in a thread."""
+        while not self._slots.acquire(timeout=GLANCE):
+            if batch.stopped:
+                return
+        worker = None
+        try:
+            while not batch.stopped:
+                try:
+                    index, task = batch.tasks.popleft()
+                except IndexError:
+                    break
+                deaths = 0
+                while True:
+                    worker = worker or self._worker(batch)
+                    outcome = worker.simulate(task, self.timeout)
+                    if outcome is not None and outcome.status != Status.TIMEOUT:
+                        break
+                    batch.leave(worker)
+                    end, worker = worker.end(), None
+                    if outcome is not None or batch.stopped:
+                        break
+                    deaths += 1
+                    log.warning("%s while it simulated number %d of the batch", end, index)
+                    if deaths > self.retries:
+                        message = f"{end} (attempt {deaths} of {self.retries + 1})"
+                        outcome = Outcome(None, Status.ERROR, message)
+                        break
+                if outcome is not None:
+                    batch.results.put((index, outcome))
+        except BaseException as error:  # A thread must not die silently: its batch would wait.
+            batch.results.put(error)
+        finally:
+            if worker is not None:
+                batch.leave(worker)
+                if batch.stopped:
+                    worker.end()
+                else:
+                    self._idle.append(worker)
+            self._slots.release()
+
+    def _worker(self, batch: "_Batch") -> "_Worker":
+        """An idle worker that lives, or a new one that is ready."""
+        while True:
+            try:
+                worker = self._idle.pop()
+            except IndexError:
+                break
+            if worker.process.poll() is None:
+                batch.enter(worker)
+                return worker
+            worker.end()
+        end = ""
+        for _ in range(self.retries + 1):
+            worker = _Worker(self._setup)
+            batch.enter(worker)
+            try:
+                if worker.ready():
+                    return worker
+            except StartError:
+                batch.leave(worker)
+                worker.end()
+                raise
+            batch.leave(worker)
+            end = worker.end()
+            if batch.stopped:
+                break
+        raise StartError(f"{end} before it was ready to simulate")
+
+
+def _end(idle: "list[_Worker]") -> None:
+    """Let these workers end, all at a time."""
+    ending = []
+    while idle:
+        ending.append(idle.pop())
+        ending[-1].pipe.close()
+    for worker in ending:
+        worker.end()
+
+
+class _Batch:
+    """What is left to simulate, what came of the rest, and who works on it."""
+
+    def __init__(self, features: Sequence[Any], seeds: Sequence[int]) -> None:
+        self.tasks = deque(enumerate(zip(features, seeds, strict=True)))
+        self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.stopped = False
+        self._busy: set[_Worker] = set()
+        self._lock = threading.Lock()
+
+    def enter(self, worker: "_Worker") -> None:
+        with self._lock:
+            self._busy.add(worker)
+            if self.stopped:
+                worker.kill()
+
+    def leave(self, worker: "_Worker") -> None:
+        with self._lock:
+            self._busy.discard(worker)
+
+    def stop(self) -> None:
+        """End what runs, and begin nothing more."""
+        with self._lock:
+            self.stopped = True
+            for worker in self._busy:
+                worker.kill()
+
+
+class _Worker:
+    """One process and the pipe to it."""
+
+    def __init__(self, setup: bytes) -> None:
+        self.pipe, theirs = Pipe()
+        try:
+            self.process = subprocess.Popen(
+                [sys.executable, "-c", _START.format(path=sys.path, fd=theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+                env={**QUIET, **os.environ, "VERIFAI_JAX_CORES": "1"},
+            )
+        except OSError as error:
+            raise StartError(f"no worker process could start: {error}") from error
+        finally:
+            theirs.close()
+        self._setup = setup
+
+    def ready(self) -> bool:
+        """Whether it has imported what it is to run; False if it died.
+
+        **Raises:** `StartError` with what the import raised.
+        """
+        said = time.monotonic()
+        try:
+            self.pipe.send_bytes(self._setup)
+            while not self.pipe.poll(GLANCE):
+                if self.process.poll() is not None:
+                    return False
+                if time.monotonic() - said > PATIENCE:
+                    said = time.monotonic()
+                    log.warning("worker process %d is still importing", self.process.pid)
+            problem = self.pipe.recv()
+        except (EOFError, OSError):
+            return False
+        if problem:
+            raise StartError(problem)
+        return True
+
+    def simulate(self, task: Any, timeout: float | None) -> Outcome | None:
+        """What came of one simulation; None if the process died."""
+        begun = time.monotonic()
+        try:
+            self.pipe.send(task)
+            while True:
+                left = math.inf if timeout is None else begun + timeout - time.monotonic()
+                # A process that it has started may hold the pipe open after its death.
+                if self.pipe.poll(min(max(left, 0.0), GLANCE)):
+                    return self.pipe.recv()
+                if self.process.poll() is not None:
+                    return None
+                if left <= 0:
+                    message = f"the simulation took longer than {timeout:g} s"
+                    return Outcome(None, Status.TIMEOUT, message)
+        except (EOFError, OSError):
+            return None
+
+    def kill(self) -> None:
+        """End the process, and those that it has started, now."""
+        if self.process.poll() is None:
+            try:
+                os.killpg(self.process.pid, signal.SIGKILL)
+            except (ProcessLookupError, PermissionError):
+                self.process.kill()
+
+    def end(self) -> str:
+        """End it, and say how it ended."""
+        # One whose pipe is closed, here or there, is about to end by itself.
+        ending = self.pipe.closed or self.pipe.poll(0)
+        try:
+            code = self.process.wait(2.0 if ending else 0.0)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            code = self.process.wait()
+        self.pipe.close()
+        return f"the worker process {_manner(code)}"
+
+
+def _manner(code: int) -> str:
+    if code >= 0:
+        return f"ended with exit code {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    return f"was killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
+
+
+# What a worker runs. Its path is that of this process, whatever was added since it started.
+_START = (
+    "import sys; sys.path[:] = {path!r}; "
+    "from verifai_jax.systems.blackbox import workers; workers.work({fd})"
+)
+
+
+def _setup(simulation: Any, function: Any) -> bytes:
+    """Everything that a worker needs to know, pickled.
+
+    **Raises:** `ValueError` for a function that cannot be imported elsewhere.
+    """
+    name = getattr(function, "__qualname__", None) or repr(function)
+    where = "at the top level of a module or a script"
+    try:
+        pickled = pickle.dumps(simulation)
+    except Exception as error:
+        if _preparing:  # Its module is half imported; and nothing will be simulated here.
+            return b""
+        raise ValueError(
+            f"blackbox(..., workers=...) starts new processes, which must be able to import what "
+            f"they run: {name} cannot be ({error}). Define it by `def` {where}, "
+            "or leave out workers"
+        ) from error
+    main = None
+    if b"__main__" in pickled:
+        main = {k: v for k, v in spawn.get_preparation_data("").items() if k.startswith("init")}
+        file = getattr(sys.modules["__main__"], "__file__", None)
+        if not main or ("init_main_from_path" in main and not (file and Path(file).exists())):
+            raise ValueError(
+                f"blackbox(..., workers=...) starts new processes, which cannot import {name} "
+                "from a notebook or an interactive session: put it into a file beside it "
+                f"(`%%writefile simulator.py`), {where}, and import it from there, or leave out "
+                "workers"
+            )
+    module = getattr(function, "__module__", None) or type(function).__module__
+    # Those that are loaded by their file are not found by their name: a target of the command line.
+    files = {n: m.__file__ for n, m in sys.modules.items() if n.startswith("_target_")}
+    files = {name: file for name, file in files.items() if name.encode() in pickled}
+    files.setdefault(module, getattr(sys.modules.get(module), "__file__", None))
+    return pickle.dumps((pickled, main, files))
+
+
+def _guard() -> str:
+    return (
+        "a worker process imports the script that started it, and the script starts simulations "
+        "when it is imported. Put what it runs under `if __name__ == '__main__':`, or the "
+        "simulator into a module of its own"
+    )
+
+
+def work(fd: int) -> None:
+    """Simulate what comes through the pipe until it closes; the life of a worker process."""
+    global _preparing
+    os.set_inheritable(fd, False)
+    pipe = Connection(fd)
+    threading.Thread(target=_outlive_no_parent, args=(os.getppid(),), daemon=True).start()
+    simulation, problem = None, ""
+    _preparing = True
+    try:
+        pickled, main, files = pickle.loads(pipe.recv_bytes())
+        if main is not None:
+            spawn.prepare(main)
+        for module, file in files.items():
+            if module not in sys.modules:
+                _import(module, file)
+        simulation = pickle.loads(pickled)
+    except BaseException as error:
+        problem = f"a worker process could not import the simulator: {_text(error)}"
+        if _guard() in str(error):
+            problem = _guard()
+    _preparing = False
+    pipe.send(problem)
+    if simulation is None:
+        return
+    while True:
+        try:
+            features, seed = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            reply = pickle.dumps(Outcome(simulation(features, seed)))
+        except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
+            reply = pickle.dumps(Outcome(None, Status.ERROR, _text(error)))
+        pipe.send_bytes(reply)
+
+
+def _text(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _import(module: str, file: str | None) -> None:
+    """Import a module, by its file where its name is one that only the parent knows."""
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module or file is None:
+            raise
+        spec = importlib.util.spec_from_file_location(module, file)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[module] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[module])
+
+
+def _outlive_no_parent(parent: int) -> None:
+    """End this process if its parent is gone, even in the middle of a simulation."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)

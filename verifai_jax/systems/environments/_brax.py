@@ -1,0 +1,359 @@
+"""A Brax environment with a policy in the loop as a system.
+
+    brax("inverted_pendulum", policy, steps=100, features={"pole": "link.inertia.mass[pole]"})
+    brax("hopper", policy, backend="positional", duration=2.0, initial={"height": "q[1]"})
+    brax(MyEnvironment(), policy, steps=50, signals=["x", "v"], dt=0.1)
+
+The result is a pure function `(features, key) -> Trace` of one episode, which is never reset.
+"""
+
+import copy
+import importlib.metadata
+import re
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from jaxtyping import Array, Int
+
+from verifai_jax.core.errors import (
+    MissingExtra,
+    require,
+    suggests_options,
+    unknown_name,
+)
+from verifai_jax.core.trace import Trace
+from verifai_jax.core.waveform import bound
+from verifai_jax.systems.environments.brax_parts import (
+    Place,
+    check_read,
+    explained,
+    finer,
+    joint_place,
+    starting_at,
+    system_place,
+    with_system,
+    with_value,
+)
+from verifai_jax.systems.environments.episode import (
+    Episode,
+    Moment,
+    at_time,
+    check_features,
+    check_signals_option,
+    deciding,
+    folded,
+    period,
+    read,
+    rollout,
+    step_count,
+    varies,
+    vector_action,
+)
+from verifai_jax.systems.ode.integrators import check_factor
+from verifai_jax.systems.structure import outline
+
+OLDEST = (0, 14)
+BACKENDS = ("generalized", "spring", "positional", "mjx")
+
+
+@dataclass(frozen=True, eq=False)
+class Brax:
+    """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are."""
+
+    env: Any
+    name: str
+    policy: Any
+    policy_memory: Any
+    steps: int
+    dt: float
+    features: Mapping[str, Place]
+    configure: Callable[..., Any] | None
+    initial: Mapping[str, Place] | Callable[..., Any] | None
+    signals: Any
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.steps * self.dt
+
+    @property
+    def reverse_hint(self) -> str:
+        """Why derivatives in reverse may not exist."""
+        return (
+            f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges, "
+            "unless the model asks for one iteration; the other backends have fixed loops"
+        )
+
+    def refined(self, factor: int) -> "Brax":
+        """The same episode, decided and sampled as before, with a `factor` times smaller step.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for an
+        environment that is another model at another step (backends spring and positional).
+        """
+        check_factor(factor)
+        return replace(self, env=finer(self.env, factor, self.name))
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate one episode, not reset at its end."""
+        return rollout(self._episode(features), key)
+
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the last step.
+        Returns the carry and the status.
+        """
+        return folded(self._episode(features), key, carry, update)
+
+    def _episode(self, features: Any) -> Episode:
+        """The environment under these features, with the policy in the loop."""
+        features = bound(features, self.duration)
+        self.check(features)
+        fixed = None if varies(features) else self._configured(features, 0.0)
+
+        def env_at(time: Any) -> Any:
+            return self._configured(features, time) if fixed is None else fixed
+
+        def start(key: Any) -> Moment:
+            env, now = env_at(0.0), at_time(features, 0.0)
+            if callable(self.initial):
+                return _moment(self.initial(env, now, key), self.name)
+            if self.initial:
+                env = starting_at(env, {place: now[name] for name, place in self.initial.items()})
+            with explained(self.env, self.name, "reset"):
+                return _moment(env.reset(key), self.name)
+
+        def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
+            env = env_at(time)
+            with explained(self.env, self.name, "step"):
+                return _moment(env.step(state, action), self.name)
+
+        def see(time: Any, moment: Moment, action: Any) -> Any:
+            now = at_time(features, time)
+            return read(self.signals, moment, action, now, _named(moment.state), self.name)
+
+        decide, size = deciding(self.policy, self.policy_memory), self.env.action_size
+
+        def fitting(observation: Any, memory: Any, key: Any) -> Any:
+            action, memory = decide(observation, memory, key)
+            return vector_action(action, size, self.name), memory
+
+        return Episode(
+            self.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
+        )
+
+    def _configured(self, features: Any, time: Any) -> Any:
+        """The environment under the features of an instant."""
+        now, env = at_time(features, time), self.env
+        if self.features:
+            sys = env.unwrapped.sys
+            for name, place in self.features.items():
+                sys = with_value(sys, place, now[name], name)
+            env = with_system(env, sys)
+        if self.configure is None:
+            return env
+        if not hasattr(env.unwrapped, "sys"):
+            configured = self.configure(copy.copy(env), now)
+            if not hasattr(configured, "step"):
+                raise ValueError(
+                    f"configure must return the environment {self.name}, which has no sys of its "
+                    f"own; got {outline(configured)}"
+                )
+            return configured
+        sys = self.configure(env.unwrapped.sys, now)
+        if not isinstance(sys, type(env.unwrapped.sys)):
+            raise ValueError(
+                f"configure must return the sys of {self.name}, a "
+                f"{type(env.unwrapped.sys).__name__}; got {outline(sys)}"
+            )
+        return with_system(env, sys)
+
+    def check(self, features: Any) -> None:
+        """Refuse features that do not exist, or that nothing would read.
+
+        **Raises:** `UnknownNameError`, `ValueError`.
+        """
+        starts = self.initial if isinstance(self.initial, Mapping) else {}
+        check_features(
+            features,
+            [*self.features, *starts],
+            (self.configure, self.signals, self.initial),
+            self.name,
+            "features={feature: part of the system} or initial={feature: 'q[0]'}",
+        )
+
+
+@suggests_options
+def brax(
+    env: Any,
+    policy: Any,
+    *,
+    steps: int | None = None,
+    duration: float | None = None,
+    backend: str | None = None,
+    features: Mapping[str, str] | Iterable[str] = (),
+    configure: Callable[..., Any] | None = None,
+    initial: Mapping[str, str] | Callable[..., Any] | None = None,
+    signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
+    dt: float | None = None,
+    policy_memory: Any = None,
+    options: Mapping[str, Any] | None = None,
+) -> Brax:
+    """A system `(features, key) -> Trace` from an environment of Brax and a policy.
+
+    **Arguments:**
+
+    - `env`: the name of an environment, or an `Env` of your own without training wrappers.
+    - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
+      function, or an object with a method `act`, such as an `rl.Policy`.
+    - `steps`: of the episode at most, or `duration` in seconds. The trace has a sample after the
+      reset and after each step, and its last valid sample is the one at which the environment is
+      done.
+    - `backend`: `"generalized"`, `"spring"`, `"positional"` or `"mjx"`, for an environment by name;
+      its own default when left out.
+    - `features`: which feature sets which part of the environment's `sys`, by attributes joined by
+      dots: `{"gravity": "opt.gravity[2]", "mass": "link.inertia.mass[pole]"}`. An entry is named by
+      its number; of a link (`link...`) or of MuJoCo's arrays (`body_...`, `geom_...`) also by the
+      name that the model gives it. Nothing that was once derived from it is computed again.
+    - `configure(sys, features) -> sys`: for anything else; for an environment without `sys`,
+      `(env, features) -> env`, with a copy of it.
+    - `initial`: which feature sets which entry of the initial position or velocity, by number or by
+      the joint's name: `{"angle": "q[hinge]", "speed": "qd[0]"}`; the rest is as the environment's
+      reset draws it. Or a function `(env, features, key) -> brax State`.
+    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
+      and `reward` come along. Or a function `(state, observation, action, reward, features) ->
+      dict`, whose state is Brax's. When left out: `q`, `qd`, the metrics, `observation`, `action`
+      and `reward`, as far as they are scalars and vectors. An action of one number is a scalar.
+    - `dt`: seconds of a step; `env.dt` when left out.
+    - `policy_memory`: what a policy with memory remembers at first. It is then called
+      `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
+    - `options`: keyword arguments of an environment by name.
+
+    A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
+
+    **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
+    unknown environment, backend or part; `ValueError` for a part that the backend does not read,
+    and numbers that do not fit; once the system is traced, for a policy, a state or signals that
+    do not, and for an environment that does not work with the installed versions.
+    """
+    _import("brax.envs")
+    _check_version()
+    if isinstance(env, str):
+        name = env
+        env = _made(name, backend, dict(options or {}))
+    else:
+        name = type(getattr(env, "unwrapped", env)).__name__
+        if backend is not None or options:
+            raise ValueError(
+                f"backend and options are for an environment by its name; got {name} itself"
+            )
+    _check_env(env, name)
+    if dt is None:
+        try:
+            dt = env.dt
+        except AttributeError as error:
+            raise ValueError(f"{name} has no dt: give dt=..., seconds of a step") from error
+    seconds = period(dt)
+    check_signals_option(signals)
+    deciding(policy, policy_memory)
+    bindings = features if isinstance(features, Mapping) else {path: path for path in features}
+    places = {feature: system_place(env, path, name) for feature, path in bindings.items()}
+    starts = initial
+    if isinstance(initial, Mapping):
+        if not hasattr(env, "pipeline_init"):
+            raise ValueError(
+                f"{name} has no pipeline_init: initial must be a function (env, features, key) -> "
+                "State"
+            )
+        starts = {feature: joint_place(env, path, name) for feature, path in initial.items()}
+    check_read(env, name, places)
+    return Brax(
+        env=env,
+        name=name,
+        policy=policy,
+        policy_memory=policy_memory,
+        steps=step_count(steps, duration, seconds),
+        dt=seconds,
+        features=places,
+        configure=configure,
+        initial=starts,  # pyright: ignore[reportArgumentType]
+        signals=signals,
+    )
+
+
+def _import(module: str) -> Any:
+    """A module of Brax, without what it and its packages say of themselves at each import."""
+    require("brax", extra="brax")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return require(module, extra="brax")
+
+
+def _check_version() -> None:
+    version = importlib.metadata.version("brax")
+    numbers = tuple(int(n) for n in re.findall(r"\d+", version)[:3])
+    if numbers < OLDEST:
+        raise MissingExtra(
+            f"brax {version} is installed, verifai_jax needs {'.'.join(map(str, OLDEST))} or "
+            "later: pip install 'verifai_jax[brax]'"
+        )
+
+
+def _made(name: str, backend: str | None, options: dict[str, Any]) -> Any:
+    """An environment of Brax's own, by its name."""
+    envs = _import("brax.envs")
+    known = getattr(envs, "_envs", {})
+    if known and name not in known:
+        raise unknown_name("environment of brax", name, known)
+    if backend is not None:
+        if backend not in BACKENDS:
+            raise unknown_name("backend", backend, BACKENDS)
+        options["backend"] = backend
+    with explained(None, name, "construction", backend):
+        return envs.get_environment(name, **options)
+
+
+def _check_env(env: Any, name: str) -> None:
+    """Refuse what is no environment, or one that resets itself."""
+    for part in ("reset", "step", "action_size"):
+        if not hasattr(type(env), part) and not hasattr(env, part):
+            raise ValueError(
+                f"env must be the name of an environment or a brax Env; got {env!r}, "
+                f"which has no {part}"
+            )
+    wrappers = _import("brax.envs.wrappers.training")
+    training = tuple(
+        getattr(wrappers, wrapper)
+        for wrapper in ("AutoResetWrapper", "EpisodeWrapper", "VmapWrapper")
+        if hasattr(wrappers, wrapper)
+    )
+    inner = env
+    while inner is not None:
+        if isinstance(inner, training):
+            raise ValueError(
+                f"{type(inner).__name__} is for training: one episode that is not reset needs "
+                f"{name} without it, brax.envs.get_environment or env.unwrapped"
+            )
+        inner = vars(inner).get("env") if hasattr(inner, "__dict__") else None
+
+
+def _moment(state: Any, name: str) -> Moment:
+    missing = [part for part in ("obs", "reward", "done") if not hasattr(state, part)]
+    if missing:
+        raise ValueError(
+            f"{name}: reset, step and initial must return a brax State; got {outline(state)}"
+        )
+    return Moment(state, state.obs, state.reward, state.done)
+
+
+def _named(state: Any) -> dict[str, Any]:
+    """The parts of a brax State that have names of their own."""
+    physics = getattr(state, "pipeline_state", None)
+    parts = {part: getattr(physics, part, None) for part in ("q", "qd")}
+    return {
+        name: value for name, value in (parts | dict(state.metrics)).items() if value is not None
+    }

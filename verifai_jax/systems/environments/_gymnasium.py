@@ -1,0 +1,260 @@
+"""A Gymnasium environment with a policy in the loop as a black box.
+
+    gymnasium("CartPole-v1", policy, steps=200, signals=("x", "x_dot", "theta", "theta_dot"),
+              features=("masspole", "length"), reset=start)
+    gymnasium("Pendulum-v1", policy, steps=200, workers=4, timeout=10.0)
+    gymnasium(make_my_environment, policy, steps=500, configure=place_obstacles)
+
+One trace is one episode: it is never reset within.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import jax
+import numpy as np
+
+from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.waveform import bound, is_waveform
+from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
+from verifai_jax.systems.environments.episode import Moment, check_signals_option, period, read
+
+# What environments compute once from their attributes, and would not follow a feature.
+DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "CartPoleEnv": {
+        "total_mass": lambda env: env.masspole + env.masscart,
+        "polemass_length": lambda env: env.masspole * env.length,
+    }
+}
+
+
+@dataclass(eq=False)
+class EpisodeOf:
+    """One episode of an environment as a function `(features, seed) -> Trace`.
+
+    The environment is made once in each process, and does not travel to workers.
+    """
+
+    make: str | Callable[[], Any]
+    policy: Any
+    steps: int
+    signals: Any
+    features: Mapping[str, str]
+    configure: Callable[..., None] | None
+    reset: Callable[..., Any] | None
+    dt: float | None
+
+    def __post_init__(self) -> None:
+        self._env: Any = None
+        self._decide: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_env": None, "_decide": None}
+
+    def __repr__(self) -> str:
+        return self.name
+
+    @property
+    def name(self) -> str:
+        """What errors call the environment."""
+        return self.make if isinstance(self.make, str) else getattr(self.make, "__name__", "env")
+
+    def __call__(self, features: Any, seed: int) -> Trace:
+        env, dt = self.environment, self.period
+        features = bound(features, self.steps * dt)
+        self._set(features, 0.0)
+        if self.configure is not None:
+            self.configure(env, features)
+        observation = self._start(env, features, seed)
+        if callable(getattr(self.policy, "reset", None)):
+            self.policy.reset()
+        changes = any(is_waveform(features[name]) for name in self.features)
+        reward, over, rows = 0.0, False, []
+        for k in range(self.steps + 1):
+            action = self._act(env, observation)
+            rows.append(self._sample(env, observation, action, reward, features))
+            if over or k == self.steps:
+                break
+            if changes:
+                self._set(features, k * dt)
+            observation, reward, terminated, truncated, _ = env.step(action)
+            over = bool(terminated or truncated)
+        signals = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        finite = all(bool(np.all(np.isfinite(signal))) for signal in signals.values())
+        index = np.minimum(np.arange(self.steps + 1), len(rows) - 1)
+        return Trace(
+            {name: signal[index] for name, signal in signals.items()},
+            dt=dt,
+            valid=len(rows),
+            status=int(Status.OK if finite else Status.NONFINITE),
+            held=True,
+        )
+
+    def check(self, features: Mapping[str, Any]) -> None:
+        """Refuse features that the environment does not have.
+
+        **Raises:** `UnknownNameError`.
+        """
+        check_names(f"feature that sets {self.name}", self.features, features)
+        known = [name for name in vars(self.environment.unwrapped) if not name.startswith("_")]
+        check_names(f"attribute of {self.name}", self.features.values(), known)
+
+    @property
+    def environment(self) -> Any:
+        """The environment of this process."""
+        if self._env is None:
+            if isinstance(self.make, str):
+                package = require("gymnasium", extra="gymnasium")
+                self._env = package.make(self.make)
+            else:
+                self._env = self.make()
+            missing = [n for n in ("reset", "step", "unwrapped") if not hasattr(self._env, n)]
+            if missing:
+                raise TypeError(
+                    f"{self.name} must make a Gymnasium environment; it made {self._env!r}, which "
+                    f"has no {missing[0]}"
+                )
+        return self._env
+
+    @property
+    def period(self) -> float:
+        """Seconds between two samples."""
+        if self.dt is not None:
+            return self.dt
+        for name in ("dt", "tau"):
+            value = getattr(self.environment.unwrapped, name, None)
+            if isinstance(value, int | float | np.number) and 0 < value < math.inf:
+                return period(value)
+        return 1.0
+
+    def _set(self, features: Mapping[str, Any], time: float) -> None:
+        env = self.environment
+        for name, attribute in self.features.items():
+            if not hasattr(env.unwrapped, attribute):
+                raise unknown_name(f"attribute of {self.name}", attribute, vars(env.unwrapped))
+            value = features[name]
+            value = np.asarray(value(time)) if is_waveform(value) else value
+            value = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+            setattr(env.unwrapped, attribute, value)
+        for attribute, derived in DERIVED.get(type(env.unwrapped).__name__, {}).items():
+            setattr(env.unwrapped, attribute, derived(env.unwrapped))
+
+    def _start(self, env: Any, features: Any, seed: int) -> Any:
+        started = env.reset(seed=seed) if self.reset is None else self.reset(env, features, seed)
+        if isinstance(started, tuple) and len(started) == 2 and isinstance(started[1], dict):
+            started = started[0]
+        shape = getattr(env.observation_space, "shape", None)
+        if started is None or (shape is not None and np.shape(started) != shape):
+            raise TypeError(
+                f"reset must return the first observation of {self.name}, "
+                f"{env.observation_space}; got {started!r}"
+            )
+        return started
+
+    def _act(self, env: Any, observation: Any) -> Any:
+        if self._decide is None:
+            self._decide = _deciding(self.policy)
+        action, space = self._decide(observation), env.action_space
+        array = np.asarray(action)
+        if hasattr(space, "n"):
+            if array.shape != () or array != np.floor(array):
+                raise ValueError(
+                    f"policy must return one of the {space.n} actions of {self.name}; "
+                    f"got {action!r}"
+                )
+            return int(array)
+        if array.shape != space.shape and not (array.shape == () and space.shape == (1,)):
+            raise ValueError(
+                f"policy must return an action of {self.name}, shape {list(space.shape)}; "
+                f"got {list(array.shape)}"
+            )
+        return array.reshape(space.shape).astype(space.dtype)
+
+    def _sample(
+        self, env: Any, observation: Any, action: Any, reward: Any, features: Any
+    ) -> dict[str, np.ndarray]:
+        now: Any = (env, _arrays(observation), np.asarray(reward, float), np.array(False))
+        seen = Moment(*now)
+        samples = read(self.signals, seen, np.asarray(action), features, {}, self.name)
+        # Copied: an environment may write its next observation into the same array.
+        return {name: np.array(value) for name, value in samples.items()}
+
+
+@suggests_options
+def gymnasium(
+    env: str | Callable[[], Any],
+    policy: Any,
+    *,
+    steps: int,
+    signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
+    features: Mapping[str, str] | Iterable[str] = (),
+    configure: Callable[..., None] | None = None,
+    reset: Callable[..., Any] | None = None,
+    dt: float | None = None,
+    workers: int | None = None,
+    timeout: float | None = None,
+    retries: int = 1,
+) -> BlackBox | PooledBlackBox:
+    """A black box of an environment of Gymnasium and a policy.
+
+    **Arguments:**
+
+    - `env`: the id of a registered environment, or a function that makes one; it is called once in
+      each process.
+    - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
+      `rl.Policy`. One that remembers something has a method `reset()`, called before each episode.
+    - `steps`: of the episode at most. The trace has a sample after the reset and after each step;
+      the last valid one is that at which the environment terminates or is truncated (by its own
+      time limit, too). Each sample has the action that is taken there, and the reward of the step
+      that led there.
+    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
+      and `reward` come along. Or a function `(env, observation, action, reward, features) -> dict`.
+      When left out: `observation`, `action` and `reward`.
+    - `features`: which feature sets which attribute of the unwrapped environment, `{"mass":
+      "masspole"}`, or names that are the same in both. What the cart-pole derives from its masses
+      and length follows; in other environments that is for `configure` to do. A `Signal` is set
+      anew before each step.
+    - `configure(env, features)`: for anything else, before the reset.
+    - `reset(env, features, seed) -> observation`: starts the episode, with the initial state that
+      the features say; `env.reset(seed=seed)` when left out.
+    - `dt`: seconds of a step; the environment's attribute `dt` or `tau` when left out, or 1.
+    - `workers`, `timeout`, `retries`: see `blackbox`.
+
+    **Raises:** `MissingExtra` without Gymnasium; `ValueError` for options that do not fit; when the
+    problem is checked, `UnknownNameError` for an attribute that the environment lacks.
+    """
+    if isinstance(env, str):
+        package = require("gymnasium", extra="gymnasium")
+        if env not in package.registry and ":" not in env and "/" not in env:
+            raise unknown_name("environment of Gymnasium", env, package.registry)
+    elif not callable(env):
+        raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
+    _deciding(policy, compiled=False)
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
+    check_signals_option(signals)
+    bindings = features if isinstance(features, Mapping) else {name: name for name in features}
+    seconds = None if dt is None else period(dt)
+    episode = EpisodeOf(env, policy, steps, signals, dict(bindings), configure, reset, seconds)
+    options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
+    return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
+
+
+def _arrays(observation: Any) -> Any:
+    if isinstance(observation, Mapping):
+        return {name: np.asarray(value) for name, value in observation.items()}
+    return np.asarray(observation)
+
+
+def _deciding(policy: Any, compiled: bool = True) -> Callable[[Any], Any]:
+    function = policy.act if callable(getattr(policy, "act", None)) else policy
+    if not callable(function):
+        raise ValueError(
+            f"policy must be a function of the observation, or have a method act; got {policy!r}"
+        )
+    # A network in JAX costs a hundred times less a step when it is compiled as a whole.
+    network = function is not policy and jax.tree.leaves(policy) != [policy]
+    return jax.jit(function) if network and compiled else function

@@ -1,0 +1,374 @@
+"""A gymnax environment with a policy in the loop as a system.
+
+    gymnax("CartPole-v1", policy, features={"masspole": "masspole"}, initial={"theta0": "theta"})
+    gymnax("Pendulum-v1", lambda observation: -observation[2:], steps=100)
+    gymnax(MyEnvironment(), policy, signals=["x", "x_dot"], dt=0.1, steps=50)
+
+The result is a pure function `(features, key) -> Trace` of one episode, which is never reset.
+"""
+
+import importlib.metadata
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from verifai_jax.core.errors import (
+    MissingExtra,
+    check_names,
+    require,
+    suggests_options,
+    unknown_name,
+)
+from verifai_jax.core.trace import Trace
+from verifai_jax.core.waveform import bound
+from verifai_jax.systems.environments.episode import (
+    Episode,
+    Moment,
+    at_time,
+    check_features,
+    check_signals_option,
+    deciding,
+    folded,
+    inputs_used,
+    period,
+    read,
+    rollout,
+    step_count,
+    varies,
+    vector_action,
+)
+from verifai_jax.systems.structure import check_like, outline
+
+OLDEST = (1, 0, 1)
+
+# Parameters that gymnax stores but that follow from others; it does not recompute them.
+DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "CartPole-v1": {
+        "total_mass": lambda p: p.masscart + p.masspole,
+        "polemass_length": lambda p: p.masspole * p.length,
+    }
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Gymnax:
+    """A closed loop `(features, key) -> Trace`; made by `gymnax`, which says what its parts are."""
+
+    env: Any
+    params: Any
+    policy: Any
+    policy_memory: Any
+    steps: int
+    dt: float
+    features: Mapping[str, str]
+    configure: Callable[..., Any] | None
+    initial: Mapping[str, str] | Callable[..., Any] | None
+    signals: Any
+    truncate: bool
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.steps * self.dt
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate one episode, not reset at its end."""
+        return rollout(self._episode(features), key)
+
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the last step.
+        Returns the carry and the status.
+        """
+        return folded(self._episode(features), key, carry, update)
+
+    def _episode(self, features: Any) -> Episode:
+        """The environment under these features, with the policy in the loop."""
+        features = bound(features, self.duration)
+        self.check(features)
+        fixed = None if varies(features) else self._configured(features, 0.0)
+
+        def params_at(time: Any) -> Any:
+            return self._configured(features, time) if fixed is None else fixed
+
+        def start(key: Any) -> Moment:
+            params = params_at(0.0)
+            observation, state = self.env.reset_env(key, params)
+            if self.initial is not None:
+                state = self._placed(state, at_time(features, 0.0), key)
+                observation = self.env.observe(key, state, None, params)
+            return Moment(state, observation, 0.0, False)
+
+        def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
+            params = params_at(time)
+            state, params = _differentiable(self.env, state, action, key, params)
+            observation, state, reward, over, _ = self.env.step_env(key, state, action, params)
+            if self.truncate:
+                over = over | self.env.is_truncated(state, params)
+            return Moment(state, observation, reward, over)
+
+        def see(time: Any, moment: Moment, action: Any) -> Any:
+            named = {n: v for n, v in _fields(moment.state).items() if n != "time"}
+            now = at_time(features, time)
+            return read(self.signals, moment, action, now, named, self.env.name)
+
+        decide = deciding(self.policy, self.policy_memory)
+
+        def fitting(observation: Any, memory: Any, key: Any) -> Any:
+            action, memory = decide(observation, memory, key)
+            return _fitted(action, self.env.action_space(self.params), self.env.name), memory
+
+        return Episode(
+            self.env.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
+        )
+
+    def _configured(self, features: Any, time: Any) -> Any:
+        """The environment's parameters under the features of an instant."""
+        now, params = at_time(features, time), self.params
+        if self.features:
+            fields = {field: now[name] for name, field in self.features.items()}
+            params = params.replace(**fields)
+            derived = DERIVED.get(self.env.name, {})
+            params = params.replace(
+                **{name: rule(params) for name, rule in derived.items() if name not in fields}
+            )
+        if self.configure is not None:
+            params = self.configure(params, now)
+            if not isinstance(params, type(self.params)):
+                raise ValueError(
+                    f"configure must return the parameters of {self.env.name}, a "
+                    f"{type(self.params).__name__}; got {outline(params)}"
+                )
+        return params
+
+    def _placed(self, state: Any, features: Any, key: Any) -> Any:
+        """The state to start from."""
+        if not isinstance(self.initial, Mapping):
+            assert self.initial is not None
+            placed = self.initial(state, features, key)
+            role = f"a state of {self.env.name}"
+            if jax.tree.structure(placed) != jax.tree.structure(state):
+                check_like(placed, state, "initial", role)
+            return jax.tree.map(jnp.asarray, placed)
+        known = _fields(state)
+        check_names(f"part of {self.env.name}'s state", self.initial.values(), known)
+        return state.replace(**{part: features[name] for name, part in self.initial.items()})
+
+    def check(self, features: Any) -> None:
+        """Refuse features that do not exist, or that nothing would read.
+
+        **Raises:** `UnknownNameError`, `ValueError`.
+        """
+        starts = self.initial if isinstance(self.initial, Mapping) else {}
+        check_features(
+            features,
+            [*self.features, *starts],
+            (self.configure, self.signals, self.initial),
+            self.env.name,
+            "features={feature: parameter} or initial={feature: part of the state}",
+        )
+
+
+@suggests_options
+def gymnax(
+    env: Any,
+    policy: Any,
+    *,
+    steps: int | None = None,
+    duration: float | None = None,
+    features: Mapping[str, str] | Iterable[str] = (),
+    configure: Callable[..., Any] | None = None,
+    initial: Mapping[str, str] | Callable[..., Any] | None = None,
+    signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
+    dt: float | None = None,
+    params: Any = None,
+    policy_memory: Any = None,
+    truncate: bool = False,
+) -> Gymnax:
+    """A system `(features, key) -> Trace` from an environment of gymnax and a policy.
+
+    **Arguments:**
+
+    - `env`: the id of a registered environment, or an `Environment` of your own.
+    - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
+      function, or an object with a method `act`, such as an `rl.Policy`.
+    - `steps`: of the episode at most, or `duration` in seconds; the environment's own
+      `max_steps_in_episode` when left out. The trace has a sample after the reset and after each
+      step, and its last valid sample is the one at which the environment is over.
+    - `features`: which feature sets which parameter of the environment, `{"mass": "masspole"}`, or
+      names that are the same in both. What `CartPole-v1` derives from its parameters follows.
+    - `configure(params, features) -> params`: for anything else.
+    - `initial`: which feature sets which part of the initial state, `{"theta0": "theta"}`, or a
+      function `(state, features, key) -> state`. The rest is as the environment's reset draws it.
+    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
+      and `reward` come along. Or a function `(state, observation, action, reward, features) ->
+      dict`. When left out: the parts of the state (but `time`), `observation`, `action` and
+      `reward`, as far as they are scalars and vectors. An action of one number is a scalar signal.
+    - `dt`: seconds of a step; the parameter `dt` or `tau` of the environment when left out, or 1.
+    - `params`: the parameters that features change; the environment's own when left out.
+    - `policy_memory`: what a policy with memory remembers at first. It is then called
+      `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
+    - `truncate`: end also where the environment's time limit would cut the episode off.
+
+    A `Signal` feature reaches parameters and functions as its value at the beginning of the step.
+    Environments that support gradients are asked for them; differentiating any other raises.
+
+    **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
+    an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the
+    system is traced, for a policy, a state or signals that do not.
+    """
+    package = require("gymnax", extra="gymnax")
+    _check_version()
+    if isinstance(env, str):
+        if env not in package.registered_envs:
+            raise unknown_name("environment of gymnax", env, package.registered_envs)
+        env, own = package.make(env)
+        params = own if params is None else params
+    parts = ("reset_env", "step_env", "default_params")
+    if missing := [part for part in parts if not hasattr(env, part)]:
+        raise ValueError(
+            f"env must be the id of an environment or a gymnax Environment; got {env!r}, "
+            f"which has no {missing[0]}"
+        )
+    if not hasattr(type(env), "step_env"):
+        # What it passes on is the inner environment's step, without what the wrapper adds.
+        raise ValueError(
+            f"{type(env).__name__} is a wrapper, whose step resets the environment at its end: "
+            "give the environment itself, and do in the policy what the wrapper does"
+        )
+    if env.supports_transition_gradients and not env.transition_gradients_enabled:
+        env = env.with_transition_gradients()
+    params = env.default_params if params is None else params
+    fields = _fields(params)
+    bindings = features if isinstance(features, Mapping) else {name: name for name in features}
+    check_names(f"parameter of {env.name}", bindings.values(), fields)
+    clocks = [name for name in ("dt", "tau") if name in fields]
+    for name, field in bindings.items():
+        if field in clocks and dt is None:
+            raise ValueError(
+                f"feature {name!r} cannot set {field!r}: all samples of a trace are one fixed "
+                "period apart; give dt=... if it is not the environment's time step"
+            )
+    if dt is None:
+        dt = fields[clocks[0]] if clocks else 1.0
+    seconds = period(dt)
+    check_signals_option(signals)
+    deciding(policy, policy_memory)
+    _check_choices(policy, env.action_space(params), env.name)
+    if isinstance(initial, Mapping):
+        state = jax.eval_shape(env.reset_env, jax.eval_shape(lambda: jax.random.key(0)), params)[1]
+        check_names(f"part of {env.name}'s state", initial.values(), _fields(state))
+    return Gymnax(
+        env=env,
+        params=params,
+        policy=policy,
+        policy_memory=policy_memory,
+        steps=step_count(steps, duration, seconds, fields.get("max_steps_in_episode")),
+        dt=seconds,
+        features=bindings,
+        configure=configure,
+        initial=initial,
+        signals=signals,
+        truncate=truncate,
+    )
+
+
+def _check_version() -> None:
+    version = importlib.metadata.version("gymnax")
+    numbers = tuple(int(n) for n in re.findall(r"\d+", version)[:3])
+    if numbers < OLDEST:
+        raise MissingExtra(
+            f"gymnax {version} is installed, verifai_jax needs {'.'.join(map(str, OLDEST))} or "
+            "later: pip install 'verifai_jax[gymnax]'"
+        )
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {name: getattr(value, name) for name in getattr(value, "__dataclass_fields__", ())}
+
+
+def _check_choices(policy: Any, space: Any, name: str) -> None:
+    """Refuse a policy that says itself that it chooses among another number of actions."""
+    chosen, offered = getattr(getattr(policy, "action", None), "n", None), getattr(space, "n", None)
+    if chosen is not None and chosen != offered:
+        raise ValueError(f"policy chooses one of {chosen} actions; {name} takes {space!r}")
+
+
+def _fitted(action: Any, space: Any, name: str) -> Array:
+    """A policy's output as an action of the space.
+
+    **Raises:** `ValueError` for another shape, or numbers of another kind.
+    """
+    if not hasattr(space, "n"):
+        if hasattr(space, "low") and len(space.shape) == 1:
+            return vector_action(action, space.shape[0], name)
+        return jnp.asarray(action)
+    shape, dtype = getattr(action, "shape", ()), getattr(action, "dtype", jnp.result_type(action))
+    whole = jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_
+    if shape not in ((), (1,)) or not whole:
+        raise ValueError(
+            f"policy must return one of the {space.n} actions of {name}, an integer; "
+            f"got {outline(action)}"
+        )
+    return jnp.reshape(jnp.asarray(action, space.dtype), ())
+
+
+_STOPS = (
+    "the environment stops gradients between its steps, so derivatives of a trace would be zero, "
+    "not true; use a search without gradients, or an environment that gymnax can differentiate "
+    "(Pendulum-v1, MountainCarContinuous-v0, Reacher-misc, Swimmer-misc, PointRobot-misc)"
+)
+
+
+def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) -> tuple[Any, Any]:
+    """State and parameters as they are, but not differentiable if the step stops gradients.
+
+    A gradient that is silently zero would mislead a search worse than none.
+    """
+    if env.transition_gradients_enabled:
+        return state, params
+    tree = (state, params)
+    leaves, structure = jax.tree.flatten(tree)
+    leaves = [jnp.asarray(leaf) for leaf in leaves]
+    moving = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    shapes = jax.eval_shape(lambda: (leaves, action, key))
+
+    def stepped(values: Any, others: Any, action: Any, key: Any) -> Any:
+        whole = list(others)
+        for i, value in zip(moving, values, strict=True):
+            whole[i] = value
+        state, params = jax.tree.unflatten(structure, whole)
+        after = jax.tree.leaves(env.step_env(key, state, action, params)[1])
+        return [leaf for leaf in after if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+
+    def tangents(values: Any, directions: Any, others: Any, action: Any, key: Any) -> Any:
+        return jax.jvp(lambda v: stepped(v, others, action, key), (values,), (directions,))[1]
+
+    def stops() -> bool:
+        abstract, action, key = shapes
+        values = [abstract[i] for i in moving]
+        used = inputs_used(tangents, values, values, abstract, action, key)
+        return bool(values) and not any(used[len(values) : 2 * len(values)])
+
+    @jax.custom_jvp
+    def same(*values: Any) -> Any:
+        return values
+
+    @same.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        if stops():
+            raise ValueError(f"{env.name}: {_STOPS}")
+        return primals, tangents
+
+    if moving:
+        for i, value in zip(moving, same(*(leaves[i] for i in moving)), strict=True):
+            leaves[i] = value
+    return jax.tree.unflatten(structure, leaves)

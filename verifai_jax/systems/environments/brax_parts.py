@@ -1,0 +1,266 @@
+"""Parts of a Brax environment that features set, and where it starts.
+
+place = system_place(env, "link.inertia.mass[pole]", "hopper")
+env = with_system(env, with_value(env.unwrapped.sys, place, 2.0, "mass"))
+"""
+
+import contextlib
+import copy
+import difflib
+import importlib.metadata
+import re
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.core.errors import UnknownNameError, require, unknown_name
+from verifai_jax.systems.environments.episode import inputs_used
+
+# Arrays of MuJoCo by the beginnings of their names, and what their rows are called after.
+_ROWS = {
+    "body_": "mjOBJ_BODY",
+    "geom_": "mjOBJ_GEOM",
+    "site_": "mjOBJ_SITE",
+    "jnt_": "mjOBJ_JOINT",
+    "actuator_": "mjOBJ_ACTUATOR",
+}
+
+
+class Place(NamedTuple):
+    """An array somewhere in a system, or one entry of it."""
+
+    parts: tuple[str, ...]
+    index: int | None
+
+    def __str__(self) -> str:
+        return ".".join(self.parts) + ("" if self.index is None else f"[{self.index}]")
+
+
+@contextlib.contextmanager
+def explained(env: Any, name: str, what: str, backend: str | None = None) -> Iterator[None]:
+    """Say which environment, backend and versions an error within Brax belongs to."""
+    try:
+        with warnings.catch_warnings():
+            # Brax still uses names that MuJoCo has moved, and nobody can do anything about it.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            # Each model that is loaded says that Brax's environments are no longer maintained.
+            warnings.filterwarnings("ignore", message="Brax System")
+            yield
+    except (TypeError, ValueError, AttributeError, IndexError, KeyError, NotImplementedError) as e:
+        with contextlib.suppress(Exception):
+            backend = backend or env.backend
+        versions = ", ".join(f"{p} {importlib.metadata.version(p)}" for p in ("mujoco", "jax"))
+        on = f" on the backend {backend!r}" if backend else ""
+        raise ValueError(
+            f"{name}{on} does not work with brax {importlib.metadata.version('brax')}, {versions}: "
+            f"its {what} raised {type(e).__name__}: {str(e).splitlines()[0] if str(e) else ''}"
+        ) from e
+
+
+def system_place(env: Any, path: str, name: str) -> Place:
+    """Where a path such as `link.inertia.mass[pole]` leads.
+
+    **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
+    environment without `sys`, or a part that holds no numbers.
+    """
+    sys = getattr(env.unwrapped, "sys", None)
+    if sys is None:
+        raise ValueError(
+            f"{name} has no sys whose parts features could set: use "
+            "configure=(env, features) -> env"
+        )
+    match = re.fullmatch(r"([\w.]+)(?:\[([^\]]+)\])?", path.strip())
+    parts = tuple(match.group(1).split(".")) if match else (path,)
+    leaf: Any = sys
+    for part in parts:
+        if not hasattr(leaf, part) or part.startswith("__"):
+            known = _paths(sys)
+            near = difflib.get_close_matches(".".join(parts), known, n=2, cutoff=0.5)
+            hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "it has no such."
+            raise UnknownNameError(f"unknown part of the system of {name} {path!r}; {hint}")
+        leaf = getattr(leaf, part)
+    numeric = isinstance(leaf, jax.Array | np.ndarray | float | np.number)
+    if not numeric or not jnp.issubdtype(jnp.result_type(leaf), jnp.inexact):
+        raise ValueError(
+            f"{'.'.join(parts)} of {name} holds no real numbers that a feature could set; "
+            f"got {type(leaf).__name__}"
+        )
+    text = match.group(2) if match else None
+    if text is None:
+        return Place(parts, None)
+    if np.ndim(leaf) == 0:
+        raise ValueError(f"{'.'.join(parts)} of {name} is one number and has no entry {text!r}")
+    return Place(parts, _row(text, parts, np.shape(leaf)[0], _row_names(sys, parts), name))
+
+
+def _paths(sys: Any) -> list[str]:
+    return [
+        ".".join(getattr(key, "name", str(key)) for key in path)
+        for path, _ in jax.tree.leaves_with_path(sys)
+    ]
+
+
+def _row_names(sys: Any, parts: tuple[str, ...]) -> dict[str, int]:
+    """What the rows of an array are called, where they are called anything."""
+    if parts[0] == "link":
+        return {link: i for i, link in enumerate(sys.link_names)}
+    kind = next((kind for start, kind in _ROWS.items() if parts[-1].startswith(start)), None)
+    model = getattr(sys, "mj_model", None)
+    if kind is None or model is None:
+        return {}
+    mujoco = require("mujoco", extra="brax")
+    named = {}
+    for i in range(len(getattr(sys, parts[0]))):
+        if label := mujoco.mj_id2name(model, getattr(mujoco.mjtObj, kind), i):
+            named[label] = i
+    return named
+
+
+def _row(text: str, parts: tuple[str, ...], length: int, named: dict[str, int], name: str) -> int:
+    if text in named:
+        return named[text]
+    if not re.fullmatch(r"-?\d+", text):
+        raise unknown_name(
+            f"entry of {'.'.join(parts)} of {name}", text, named or map(str, range(length))
+        )
+    if not -length <= int(text) < length:
+        raise ValueError(f"{'.'.join(parts)} of {name} has {length} entries; got the number {text}")
+    return int(text) % length
+
+
+def joint_place(env: Any, path: str, name: str) -> Place:
+    """Which entry of `q` or `qd` a path such as `q[hinge]` means."""
+    match = re.fullmatch(r"(\w+)\[([^\]]+)\]", path.strip())
+    part = match.group(1) if match else path
+    if part not in ("q", "qd") or match is None:
+        raise unknown_name(f"part of {name}'s initial state", path, ["q[0]", "qd[0]"])
+    sys = env.unwrapped.sys
+    length = sys.q_size() if part == "q" else sys.qd_size()
+    named = {}
+    model = getattr(sys, "mj_model", None)
+    if model is not None:
+        mujoco = require("mujoco", extra="brax")
+        first = model.jnt_qposadr if part == "q" else model.jnt_dofadr
+        # A joint of several numbers has no entry of its own.
+        single = {int(kind) for kind in (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)}
+        for i in range(model.njnt):
+            if int(model.jnt_type[i]) in single:
+                named[mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i)] = int(first[i])
+    return Place((part,), _row(match.group(2), (part,), length, named, name))
+
+
+def with_value(sys: Any, place: Place, value: Any, feature: str) -> Any:
+    """The system with one array, or one entry of it, set."""
+    old: Any = sys
+    for part in place.parts:
+        old = getattr(old, part)
+    old = jnp.asarray(old)
+    target = old if place.index is None else old[place.index]
+    if jnp.shape(value) != target.shape:
+        raise ValueError(
+            f"feature {feature!r} has shape {list(jnp.shape(value))} and {place} has "
+            f"{list(target.shape)}; name one entry, as in '{'.'.join(place.parts)}[0]', or use "
+            "configure=(sys, features) -> sys"
+        )
+    new = jnp.asarray(value, jnp.result_type(old, value))
+    if place.index is not None:
+        new = old.astype(new.dtype).at[place.index].set(new)
+    return _replaced(sys, place.parts, new)
+
+
+def _replaced(node: Any, parts: tuple[str, ...], value: Any) -> Any:
+    if not parts:
+        return value
+    child = _replaced(getattr(node, parts[0]), parts[1:], value)
+    return node.replace(**{parts[0]: child})
+
+
+def with_system(env: Any, sys: Any) -> Any:
+    """A copy of the environment, within its wrappers, with another `sys`."""
+    other = copy.copy(env)
+    if "env" in vars(other) and "sys" not in vars(other):
+        other.env = with_system(other.env, sys)
+    else:
+        other.sys = sys
+    return other
+
+
+def finer(env: Any, factor: int, name: str) -> Any:
+    """A copy of the environment with a `factor` times smaller step of its physics.
+
+    **Raises:** `ValueError` for one whose physics is another at another step.
+    """
+    other = copy.copy(env)
+    if "env" in vars(other) and "sys" not in vars(other):
+        other.env = finer(other.env, factor, name)
+        return other
+    frames, backend = getattr(other, "_n_frames", None), getattr(other, "_backend", None)
+    if frames is None or not hasattr(getattr(other, "sys", None), "opt"):
+        raise ValueError(f"{name} is no PipelineEnv of Brax, whose step is known")
+    if backend not in ("generalized", "mjx"):
+        raise ValueError(
+            f"{name} on Brax's backend {backend!r}: its constraints are as stiff as its step makes "
+            "them, so that another step is another model"
+        )
+    sys = other.sys
+    other.sys = sys.tree_replace({"opt.timestep": sys.opt.timestep / factor})
+    other._n_frames = frames * factor
+    return other
+
+
+def starting_at(env: Any, values: Mapping[Place, Any]) -> Any:
+    """A copy whose reset starts from these entries of `q` and `qd`, and observes what they give."""
+    other = copy.copy(env)
+    if "env" in vars(other) and "sys" not in vars(other):
+        other.env = starting_at(other.env, values)
+        return other
+    begin = other.pipeline_init
+
+    def pipeline_init(q: Any, qd: Any, *rest: Any, **options: Any) -> Any:
+        for place, value in values.items():
+            if place.parts == ("q",):
+                q = jnp.asarray(q).at[place.index].set(value)
+            else:
+                qd = jnp.asarray(qd).at[place.index].set(value)
+        return begin(q, qd, *rest, **options)
+
+    other.pipeline_init = pipeline_init
+    return other
+
+
+def check_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
+    """Refuse a part of the system that neither reset nor step looks at: it would change nothing.
+
+    Each backend reads its own copies of masses, gains and the like.
+    """
+    if not places:
+        return
+    sys = env.unwrapped.sys
+
+    def leaf(place: Place) -> Any:
+        value: Any = sys
+        for part in place.parts:
+            value = getattr(value, part)
+        return jnp.asarray(value)
+
+    def play(values: Any, key: Any, action: Any) -> Any:
+        changed = sys
+        for place, value in zip(places.values(), values, strict=True):
+            changed = _replaced(changed, place.parts, value)
+        played = with_system(env, changed)
+        with explained(env, name, "reset and step"):
+            return jax.tree.leaves(played.step(played.reset(key), action))
+
+    values = [leaf(place) for place in places.values()]
+    used = inputs_used(play, values, jax.random.key(0), jnp.zeros(env.action_size))
+    for (feature, place), read_at_all in zip(places.items(), used, strict=False):
+        if not read_at_all:
+            raise ValueError(
+                f"feature {feature!r} sets {place}, which {name} on the backend {env.backend!r} "
+                "does not read. The mjx backend reads MuJoCo's arrays (body_mass, dof_damping, "
+                "...), the others mostly Brax's (link.inertia.mass, actuator.gear, ...)"
+            )

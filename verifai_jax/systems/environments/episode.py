@@ -1,0 +1,391 @@
+"""What all stepping environments share: a policy in the loop, one trace of one episode.
+
+    rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key)
+
+An episode that is over stays frozen where it ended: it is never reset within a trace.
+"""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.waveform import is_waveform
+from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.systems.structure import check_like, check_signals, outline
+
+Time = Float[Array, ""]
+Decide = Callable[[Any, Any, Any], tuple[Any, Any]]
+
+
+class Moment(NamedTuple):
+    """What an environment shows after its reset or a step: one reward, and whether it is over."""
+
+    state: Any
+    observation: Any
+    reward: Any
+    over: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """How an environment is started, stepped and seen, with its features in place.
+
+    - `start(key) -> Moment`
+    - `step(time, state, action, key) -> Moment`: from the sample at `time` seconds to the next.
+    - `decide(observation, memory, key) -> (action, memory)`: see `deciding`.
+    - `see(time, moment, action) -> dict`: the samples of the signals.
+    - `steps`, `dt`: how many at most, and seconds between two samples.
+    """
+
+    name: str
+    start: Callable[..., Moment]
+    step: Callable[..., Moment]
+    decide: Decide
+    memory: Any
+    see: Callable[..., Mapping[str, Any]]
+    steps: int
+    dt: float
+
+    def after(self, time: Any, state: Any, action: Any, key: Any) -> Moment:
+        """The moment that a step leads to, `over` as a truth value."""
+        moment = self.step(time, state, action, key)
+        return moment._replace(over=jnp.asarray(moment.over, bool))
+
+
+class _Keys(NamedTuple):
+    """Random keys of a simulation: its start, and where those of steps and decisions begin."""
+
+    start: Key[Array, ""]
+    step: Key[Array, ""]
+    decide: Key[Array, ""]
+
+
+def keys_of(key: Any) -> _Keys:
+    """The keys of one simulation; step `k` has `fold_in(keys.step, k)`, decision `k` likewise."""
+    return _Keys(*jax.random.split(jax.random.key(0) if key is None else key, 3))
+
+
+def rollout(episode: Episode, key: Any) -> Trace:
+    """One episode: a sample after the reset and after each step, with the action taken there.
+
+    The reward of a sample is that of the step which led to it. The first sample at which the
+    episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
+    NaN, or in an observation that is not finite.
+
+    **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
+    """
+    last, age, _, samples = _run(episode, key, None, lambda _, seen: (None, seen))
+    return Trace(samples, dt=episode.dt, valid=age + 1, status=_status(last), held=True)
+
+
+def folded(
+    episode: Episode, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+) -> tuple[Any, Int[Array, ""]]:
+    """`carry = update(carry, sample)` over the samples of `rollout`, of which none is kept.
+
+    Behind the end the last valid sample comes again. Returns the carry and the status.
+    """
+    last, _, carry, _ = _run(episode, key, carry, lambda c, seen: (update(c, seen), None))
+    return carry, _status(last)
+
+
+def _run(episode: Episode, key: Any, kept: Any, keep: Any) -> tuple[Moment, Any, Any, Any]:
+    """The last moment, how many steps were lived, and what `keep` made of the samples."""
+    keys = keys_of(key)
+    first, memory = _settled(episode, episode.start(keys.start), keys)
+
+    def sample(carry: Any, k: Any) -> Any:
+        (moment, memory, age), kept = carry
+        frozen = (k >= episode.steps) | moment.over
+        # Time, and with it randomness, stops with the state: what is seen behind the end repeats.
+        time = age.astype(float) * episode.dt
+        decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
+        action, after = episode.decide(moment.observation, memory, decide_key)
+        kept, output = keep(kept, episode.see(time, moment, action))
+        # A state in which an episode has ended may have no finite derivative.
+        state = _where(frozen, first.state, moment.state)
+        following = _cast(episode.after(time, state, action, step_key), moment)
+        return (_where(frozen, carry[0], (following, after, age + 1)), kept), output
+
+    # One iteration more than there are steps samples the end and moves nothing.
+    ((last, _, age), kept), outputs = checkpointed_scan(
+        sample, ((first, memory, jnp.int32(0)), kept), episode.steps + 1
+    )
+    return last, age, kept, outputs
+
+
+def _status(last: Moment) -> Int[Array, ""]:
+    sound = jnp.array(True)
+    for leaf in _floats(last):
+        sound &= ~jnp.any(jnp.isnan(leaf))
+    for leaf in _floats((last.observation, last.reward)):
+        sound &= jnp.all(jnp.isfinite(leaf))
+    return jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+
+
+def _settled(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:
+    """The first moment and memory in the types that they keep; refuses parts that do not fit."""
+    first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
+    memory = jax.tree.map(jnp.asarray, episode.memory)
+    action, after = jax.eval_shape(episode.decide, first.observation, memory, keys.decide)
+    check_like(after, memory, "policy", "(action, memory), its memory in the form of policy_memory")
+    following = jax.eval_shape(episode.after, jnp.zeros(()), first.state, action, keys.step)
+    if jax.tree.structure(first) != jax.tree.structure(following):
+        raise ValueError(
+            f"{episode.name}: a step must return a state in the form that the start has: "
+            f"{outline(first)}; got {outline(following)}"
+        )
+    pairs = zip(jax.tree.leaves_with_path(first), jax.tree.leaves(following), strict=True)
+    leaves = []
+    for (path, have), then in pairs:
+        if have.shape != then.shape:
+            raise ValueError(
+                f"{episode.name}: {jax.tree_util.keystr(path).lstrip('.')} has shape "
+                f"{list(have.shape)} at the start and {list(then.shape)} after a step"
+            )
+        # Environments start with a plain 0 and step to something that is not an integer.
+        mixed = have.dtype != then.dtype
+        leaves.append(have.astype(jnp.promote_types(have.dtype, then.dtype)) if mixed else have)
+    first = jax.tree.unflatten(jax.tree.structure(first), leaves)
+    if first.reward.shape != ():
+        raise ValueError(
+            f"{episode.name}: the reward must be one number; got {outline(first.reward)}"
+        )
+    check_signals(jax.eval_shape(episode.see, jnp.zeros(()), first, action))
+    return first, memory
+
+
+def deciding(policy: Any, memory: Any = None) -> Decide:
+    """A user's policy as `decide(observation, memory, key) -> (action, memory)`.
+
+    **Arguments:**
+
+    - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
+      object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
+      arguments have no default.
+    - `memory`: of a policy with memory at first. It is then called with `(observation, memory)` or
+      `(observation, memory, key)` and returns `(action, memory)`.
+
+    **Raises:** `ValueError` for something that cannot be called so.
+    """
+    function = policy.act if callable(getattr(policy, "act", None)) else policy
+    given = ("observation",) if memory is None else ("observation", "memory")
+    forms = f"({', '.join(given)}) or ({', '.join(given)}, key)"
+    if not callable(function):
+        raise ValueError(f"policy must be a function of {forms}; got {policy!r}")
+    needed = _required(function)
+    if needed is not None and not len(given) <= needed <= len(given) + 1:
+        raise ValueError(f"policy must be a function of {forms}; got one of {needed} arguments")
+    random = needed == len(given) + 1
+
+    def decide(observation: Any, remembered: Any, key: Any) -> tuple[Any, Any]:
+        last = (key,) if random else ()
+        if memory is None:
+            return function(observation, *last), remembered
+        decided = function(observation, remembered, *last)
+        if not (isinstance(decided, tuple) and len(decided) == 2):
+            raise ValueError(f"policy must return (action, memory); got {outline(decided)}")
+        return decided
+
+    return decide
+
+
+def _required(function: Callable[..., Any]) -> int | None:
+    """How many arguments it needs; None for one that does not say, or takes any number."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    if any(p.kind is p.VAR_POSITIONAL for p in parameters):
+        return None
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(p.kind in places and p.default is p.empty for p in parameters)
+
+
+def vector_action(action: Any, size: int, name: str) -> Float[Array, " size"]:
+    """A policy's output as the vector that the environment takes; a number may stand for one.
+
+    **Raises:** `ValueError` for anything else than `size` real numbers.
+    """
+    shape, dtype = getattr(action, "shape", None), getattr(action, "dtype", None)
+    if shape is None and isinstance(action, int | float):
+        action = jnp.asarray(action, float)
+        shape, dtype = action.shape, action.dtype
+    fits = shape == (size,) or (size == 1 and shape == ())
+    if not fits or dtype is None or not jnp.issubdtype(dtype, jnp.floating):
+        raise ValueError(
+            f"policy must return the {size} real number{'s' * (size > 1)} that {name} takes as an "
+            f"action, shape [{size}]; got {outline(action)}"
+        )
+    return jnp.reshape(action, (size,))
+
+
+def read(
+    signals: Any, moment: Moment, action: Any, features: Any, named: Mapping[str, Any], name: str
+) -> Any:
+    """The samples of the signals that were asked for.
+
+    - `signals`: a function `(state, observation, action, reward, features) -> dict`; names of the
+      observation's entries, in their order; or `{name: index or key of the observation}`. The last
+      two also give `action` and `reward`. None: `named`, `observation`, `action` and `reward`.
+
+    **Raises:** `ValueError` for an entry that the observation does not have.
+    """
+    if callable(signals):
+        return signals(moment.state, moment.observation, action, moment.reward, features)
+    loop = {"action": _plain(action), "reward": moment.reward}
+    if signals is None:
+        everything = {**named, "observation": moment.observation, **loop}
+        if isinstance(moment.observation, Mapping):
+            everything |= {str(k): v for k, v in moment.observation.items()}
+        return {k: _plain(v) for k, v in everything.items() if hasattr(v, "ndim") and v.ndim <= 1}
+    if isinstance(signals, Mapping):
+        return loop | {k: _entry(moment.observation, at, k, name) for k, at in signals.items()}
+    shape = getattr(moment.observation, "shape", None)
+    if shape != (len(signals),):
+        raise ValueError(
+            f"signals has {len(signals)} names, {', '.join(signals)}, for the entries of an "
+            f"observation of {name}, which is {outline(moment.observation)}; "
+            "name all of them, or give {name: index}"
+        )
+    return {entry: moment.observation[i] for i, entry in enumerate(signals)} | loop
+
+
+def check_signals_option(signals: Any) -> None:
+    """Refuse a `signals=` option that `read` could not use.
+
+    **Raises:** `ValueError`.
+    """
+    if signals is None or callable(signals):
+        return
+    names = list(signals) if isinstance(signals, Mapping | Sequence) else []
+    if not names or isinstance(signals, str) or not all(isinstance(n, str) for n in names):
+        raise ValueError(
+            "signals must be names of the observation's entries, {name: index or key}, or a "
+            f"function (state, observation, action, reward, features) -> dict; got {signals!r}"
+        )
+    if len(set(names)) < len(names) or {"action", "reward"} & set(names):
+        raise ValueError(
+            f"signals must have names of their own beside action and reward; got {names}"
+        )
+
+
+def _entry(observation: Any, at: Any, signal: str, name: str) -> Any:
+    if isinstance(observation, Mapping):
+        if at not in observation:
+            raise unknown_name(f"entry of {name}'s observation", at, observation)
+        return _plain(observation[at])
+    length = observation.shape[0] if getattr(observation, "ndim", 0) == 1 else 0
+    if not isinstance(at, int | np.integer) or not -length <= at < length:
+        raise ValueError(
+            f"signal {signal!r} is entry {at!r} of an observation of {name}, which is "
+            f"{outline(observation)}"
+        )
+    return observation[at]
+
+
+def _plain(value: Any) -> Any:
+    """A vector of one entry as that entry, so that formulas need no index."""
+    return value[0] if getattr(value, "shape", None) == (1,) else value
+
+
+def check_features(
+    features: Any, bound: Sequence[str], functions: Sequence[Any], name: str, how: str
+) -> None:
+    """Refuse names of features that do not exist, and features that nothing would read.
+
+    - `bound`: features that set something, `functions`: what a user may have given, and would read
+      any of them; `how`: how one is bound, in words.
+
+    **Raises:** `UnknownNameError`, `ValueError`.
+    """
+    if not isinstance(features, Mapping):
+        if bound:
+            raise ValueError(f"features must be a dictionary; got {outline(features)}")
+        return
+    check_names("feature", bound, features)
+    if any(map(callable, functions)):
+        return
+    for feature in features:
+        if feature not in bound:
+            raise ValueError(f"feature {feature!r} changes nothing in {name}: bind it by {how}")
+
+
+def at_time(features: Any, time: Any) -> Any:
+    """The same features, each waveform by its value at a time in seconds."""
+    return jax.tree.map(lambda v: v(time) if is_waveform(v) else v, features, is_leaf=is_waveform)
+
+
+def varies(features: Any) -> bool:
+    """Whether any of the features is a function of time."""
+    return any(map(is_waveform, jax.tree.leaves(features, is_leaf=is_waveform)))
+
+
+def step_count(
+    steps: int | None, duration: float | None, dt: float, otherwise: int | None = None
+) -> int:
+    """How many steps an episode has; refuses what is no positive number of them."""
+    if steps is not None and duration is not None:
+        raise ValueError(f"give either duration or steps; got (duration={duration}, steps={steps})")
+    if duration is not None:
+        steps = round(duration / dt) if math.isfinite(duration) else 0
+        if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt * max(steps, 1):
+            raise ValueError(
+                f"duration must be a positive multiple of dt; got (duration={duration}, dt={dt:g})"
+            )
+    if steps is None:
+        steps = otherwise
+    if steps is None:
+        raise ValueError("give steps or duration; got neither")
+    if not isinstance(steps, int | np.integer) or isinstance(steps, bool) or steps < 1:
+        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
+    return int(steps)
+
+
+def period(seconds: Any) -> float:
+    """A sampling period, checked; one that comes from a float32 is the number that was meant."""
+    number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
+    if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():
+        number = True
+    if not number or not (math.isfinite(seconds) and seconds > 0):
+        raise ValueError(f"dt must be a positive number of seconds; got {seconds!r}")
+    if getattr(seconds, "dtype", None) == np.float32:
+        return float(str(np.float32(seconds)))
+    return float(seconds)
+
+
+def inputs_used(function: Callable[..., Any], *arguments: Any) -> list[bool]:
+    """For each leaf of the arguments, whether any result of the function depends on it.
+
+    Abstract: nothing is computed or compiled.
+    """
+    from jax.interpreters import partial_eval
+
+    closed = jax.make_jaxpr(function)(*arguments)
+    _, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+    return list(used)
+
+
+def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _cast(tree: Any, like: Any) -> Any:
+    def cast(leaf: Any, wanted: Any) -> Any:
+        leaf = jnp.asarray(leaf)
+        return leaf if leaf.dtype == wanted.dtype else leaf.astype(wanted.dtype)
+
+    return jax.tree.map(cast, tree, like)
+
+
+def _floats(tree: Any) -> list[Any]:
+    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]

@@ -1,0 +1,291 @@
+"""Which numbers of a MuJoCo model, its initial state and what acts on it the features set.
+
+    bind={"masspole": "body/pole/mass", "wind": "body/cart/force[0]", "x0": "joint/slider/qpos"}
+    bind={"grip": ["geom/left/friction[0]", "geom/right/friction[0]"]}    # one feature, several
+    bind={"payload": scaled("body/torso/mass")}                           # times the model's value
+
+Everything here is pure JAX on one row of features; the native backend runs it on a batch.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.waveform import is_waveform
+from verifai_jax.systems.mujoco.derived import Solids, bodies_of_geoms, rebuilt
+from verifai_jax.systems.mujoco.model import Model, Place, movable, place
+
+STATE = ("qpos", "qvel", "act")
+APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")
+
+# Parameters from which `mj_setConst` derives others.
+_DERIVED_FROM = {
+    *("body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
+    *("jnt_pos", "jnt_axis", "dof_armature", "tendon_armature", "tendon_stiffness"),
+    *("geom_size", "geom_pos", "geom_quat", "site_pos", "site_quat", "actuator_gear"),
+}
+
+Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
+
+
+@dataclass(frozen=True)
+class Scaled:
+    """A place whose value is multiplied by the feature; made by `scaled`."""
+
+    path: str
+
+
+def scaled(path: str) -> Scaled:
+    """Bind a feature as a factor: 1 leaves the model's value as it is."""
+    return Scaled(path)
+
+
+@dataclass(frozen=True)
+class Binding:
+    """One feature sets one place."""
+
+    feature: str
+    place: Place
+    scaled: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Bindings:
+    """All bindings of a system, sorted by what they set; made by `bindings`."""
+
+    model: Model
+    parameters: tuple[Binding, ...]
+    state: tuple[Binding, ...]
+    applied: tuple[Binding, ...]
+    # The bodies whose mass and inertia come from geoms that features change.
+    solids: tuple[Solids, ...]
+    # What a backend has made of the model, by whatever it depends on.
+    kept: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def all(self) -> tuple[Binding, ...]:
+        """Every binding."""
+        return self.parameters + self.state + self.applied
+
+    @cached_property
+    def arrays(self) -> frozenset[str]:
+        """The model's arrays that differ between rows, those that follow included."""
+        changed = {binding.place.array for binding in self.parameters}
+        if changed & {"geom_size", "geom_pos", "geom_quat"} and self.solids:
+            changed |= {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
+        if "body_mass" in changed:
+            changed.add("body_inertia")
+        return frozenset(changed)
+
+    @cached_property
+    def moves_constants(self) -> bool:
+        """Whether constants that MuJoCo derives from the model differ between rows."""
+        return bool(self.arrays & _DERIVED_FROM)
+
+    def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
+        """The model's arrays for this row of features, in the shapes that the model has them.
+
+        Geometry comes first, then masses, along which inertia scales, then what is bound itself.
+        """
+        ordered = ("geom_size", "geom_pos", "geom_quat")
+        groups = [
+            [b for b in self.parameters if b.place.array in ordered],
+            [b for b in self.parameters if b.place.array == "body_mass"],
+            [b for b in self.parameters if b.place.array not in (*ordered, "body_mass")],
+        ]
+        leaves = {name: jnp.asarray(self._base(name), _float()) for name in sorted(self.arrays)}
+        leaves = _set(leaves, groups[0], features, self._base)
+        leaves = rebuilt(self.model.compiled, self.solids, leaves)
+        before = leaves.get("body_mass")
+        leaves = _set(leaves, groups[1], features, self._base)
+        if before is not None:
+            ratio = leaves["body_mass"] / jnp.where(before > 0, before, 1.0)
+            leaves["body_inertia"] = (
+                leaves["body_inertia"] * jnp.where(before > 0, ratio, 1.0)[:, None]
+            )
+        return _set(leaves, groups[2], features, self._base)
+
+    def start(self, features: Mapping[str, Any]) -> dict[str, Float[Array, " k"]]:
+        """`qpos`, `qvel` and `act` at time 0."""
+        compiled = self.model.compiled
+        values = {
+            "qpos": jnp.asarray(compiled.qpos0, _float()),
+            "qvel": jnp.zeros(compiled.nv, _float()),
+            "act": jnp.zeros(compiled.na, _float()),
+        }
+        return _set(values, self.state, features, self._base)
+
+    def acting(
+        self, features: Mapping[str, Any], time: Float[Array, ""]
+    ) -> dict[str, Float[Array, "..."]]:
+        """Forces and controls that features apply from `time` on, by the array's name."""
+        compiled = self.model.compiled
+        shapes = {"ctrl": (compiled.nu,), "xfrc_applied": (compiled.nbody, 6)}
+        shapes["qfrc_applied"] = (compiled.nv,)
+        bound = {binding.place.array for binding in self.applied}
+        values = {name: jnp.zeros(shapes[name], _float()) for name in APPLIED if name in bound}
+        given = {binding.feature: features[binding.feature] for binding in self.applied}
+        now = {name: value(time) if is_waveform(value) else value for name, value in given.items()}
+        return _set(values, self.applied, now, self._base)
+
+    def check(self, features: Mapping[str, Any]) -> None:
+        """Refuse features that the bindings do not fit.
+
+        **Raises:** `ValueError` for a bound feature that there is not, one of another shape than
+        its place, and a `Signal` where only constants can go.
+        """
+        for binding in self.all:
+            check_names(f"feature bound to {binding.place.path!r}:", [binding.feature], features)
+            value, path = features[binding.feature], binding.place.path
+            if is_waveform(value):
+                if binding not in self.applied:
+                    raise ValueError(
+                        f"feature {binding.feature!r} is a Signal, which can only drive a force, a "
+                        f"torque or a control; it is bound to {path!r}"
+                    )
+                shape = np.shape(value.knots)[1:]
+            elif isinstance(value, Mapping | list | tuple):
+                raise ValueError(
+                    f"feature {binding.feature!r} has parts; bind needs a number or an array"
+                )
+            else:
+                shape = np.shape(value)
+            if shape not in ((), binding.place.shape) or (shape == () != binding.place.shape):
+                raise ValueError(
+                    f"feature {binding.feature!r} has shape {list(shape)}, but {path!r} has "
+                    f"{list(binding.place.shape)}{_one_of(path, shape, binding.place)}"
+                )
+
+    def _base(self, array: str) -> np.ndarray:
+        compiled = self.model.compiled
+        if array == "qpos":
+            return compiled.qpos0
+        owner, name = (compiled.opt, array[4:]) if array.startswith("opt.") else (compiled, array)
+        return np.asarray(getattr(owner, name), np.float64)
+
+
+def bindings(model: Model, bind: Bound | None) -> Bindings:
+    """Resolve the `bind` argument of a system.
+
+    **Raises:** what `mujoco_model.place` raises; `ValueError` for two features on one number, or a
+    factor on what the model has no value of.
+    """
+    sorted_: dict[str, list[Binding]] = {"parameters": [], "state": [], "applied": []}
+    taken: dict[tuple[str, int], str] = {}
+    for feature, targets in (bind or {}).items():
+        for target in [targets] if isinstance(targets, str | Scaled) else targets:
+            path = target.path if isinstance(target, Scaled) else target
+            for where in place(model.compiled, path):
+                group = "state" if where.array in STATE else "parameters"
+                group = "applied" if where.array in APPLIED else group
+                if isinstance(target, Scaled) and group != "parameters":
+                    raise ValueError(
+                        f"scaled({path!r}): the model has no value there to multiply; bind it as "
+                        "it is"
+                    )
+                _claim(taken, where, feature)
+                sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
+    parameters, state, applied = (tuple(group) for group in sorted_.values())
+    solids = bodies_of_geoms(model, _rows(parameters, "geom_size", "geom_pos", "geom_quat"))
+    model = movable(model, _moving(model, parameters, solids))
+    return Bindings(model, parameters, state, applied, solids)
+
+
+def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
+    """Which elements features change in these arrays."""
+    return {
+        int(i) // (4 if binding.place.array.endswith("quat") else 3)
+        for binding in parameters
+        if binding.place.array in arrays
+        for i in binding.place.index
+    }
+
+
+def _moving(model: Model, parameters: Iterable[Binding], solids: Iterable[Solids]) -> set[int]:
+    """The bodies whose centre of mass or axes features move."""
+    joints = _rows(parameters, "jnt_pos", "jnt_axis")
+    placed = _rows(parameters, "geom_pos", "geom_quat")
+    moving = _rows(parameters, "body_ipos", "body_iquat")
+    moving |= {int(model.compiled.jnt_bodyid[joint]) for joint in joints}
+    return moving | {s.body for s in solids if len(s.geoms) > 1 or placed & set(s.geoms)}
+
+
+def _claim(taken: dict[tuple[str, int], str], where: Place, feature: str) -> None:
+    for i in where.index.tolist():
+        other = taken.setdefault((where.array, i), feature)
+        if other != feature:
+            raise ValueError(f"features {other!r} and {feature!r} are both bound to {where.path!r}")
+
+
+def _set(
+    arrays: dict[str, Any], bound: Iterable[Binding], features: Mapping[str, Any], base: Any
+) -> dict[str, Any]:
+    arrays = dict(arrays)
+    for binding in bound:
+        where = binding.place
+        array = arrays[where.array]
+        value = jnp.asarray(features[binding.feature], array.dtype) * where.sign
+        if binding.scaled:
+            # Of the value there is: a size may have changed the mass already.
+            value = value * array.ravel()[where.index].reshape(where.shape) * where.sign
+        flat = array.ravel().at[where.index].set(jnp.broadcast_to(value, where.index.shape))
+        arrays[where.array] = flat.reshape(array.shape)
+    return arrays
+
+
+def _one_of(path: str, shape: tuple[int, ...], where: Place) -> str:
+    if shape == () and where.shape:
+        return f"; bind one of its numbers, like '{path}[0]'"
+    return ""
+
+
+def _float() -> Any:
+    return jnp.result_type(float)
+
+
+class Watched(dict[str, Any]):
+    """Features that note which of them are read."""
+
+    def __init__(self, features: Mapping[str, Any], seen: set[str]) -> None:
+        super().__init__(features)
+        self.seen = seen
+
+    def __getitem__(self, name: str) -> Any:
+        self.seen.add(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """As a dictionary's."""
+        if name in self:
+            self.seen.add(name)
+        return super().get(name, default)
+
+    def __contains__(self, name: object) -> bool:
+        if super().__contains__(name):
+            self.seen.add(str(name))
+        return super().__contains__(name)
+
+    def __iter__(self) -> Any:
+        self.seen.update(super().keys())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        """As a dictionary's; whoever asks for all may read all."""
+        self.seen.update(super().keys())
+        return super().keys()
+
+    def values(self) -> Any:
+        """As a dictionary's."""
+        self.seen.update(super().keys())
+        return super().values()
+
+    def items(self) -> Any:
+        """As a dictionary's."""
+        self.seen.update(super().keys())
+        return super().items()

@@ -1,0 +1,272 @@
+"""What follows from a MuJoCo model's masses and geometry, recomputed where features change them.
+
+- `rebuilt`: mass, centre and inertia of bodies whose geoms change, at constant density (or at the
+  mass that a geom states); for both backends.
+- `constants`: what `mj_setConst` computes and MJX reads: `body_subtreemass`, `body_invweight0`,
+  `dof_invweight0`, `tendon_length0`, `tendon_invweight0`, `actuator_acc0` and `geom_rbound`, in
+  JAX. The native backend calls `mj_setConst` itself.
+"""
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.systems.mujoco.model import Model, mjx_module
+
+_PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
+_SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
+
+Leaves = dict[str, Float[Array, "..."]]
+
+
+@dataclass(frozen=True)
+class Solids:
+    """A body that is made of its geoms.
+
+    - `geoms`: their numbers; `kinds`: their MuJoCo types.
+    - `masses`: in kg where the model states a geom's mass, else None.
+    - `densities`: in kg/m^3.
+    """
+
+    body: int
+    geoms: tuple[int, ...]
+    kinds: tuple[int, ...]
+    masses: tuple[float | None, ...]
+    densities: tuple[float, ...]
+
+
+def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[Solids, ...]:
+    """The bodies whose inertia comes from their geoms, among those with a `changed` geom.
+
+    A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
+
+    **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells).
+    """
+    compiled, spec = model.compiled, model.spec
+    if spec is None or not changed:
+        return ()
+    mode = int(spec.compiler.inertiafromgeom)  # 0 never, 1 always, 2 where none is given
+    stated = {body.id: bool(body.explicitinertial) for body in spec.bodies}
+    low, high = spec.compiler.inertiagrouprange
+    geoms = {geom.id: geom for geom in spec.geoms}
+    solids = []
+    for body in sorted({int(compiled.geom_bodyid[g]) for g in changed}):
+        if body == 0 or mode == 0 or (mode == 2 and stated[body]):
+            continue
+        first, count = int(compiled.body_geomadr[body]), int(compiled.body_geomnum[body])
+        parts = []
+        for g in range(first, first + count):
+            if not low <= int(compiled.geom_group[g]) <= high:
+                continue
+            mass = None if math.isnan(geoms[g].mass) else float(geoms[g].mass)
+            if (mass if mass is not None else geoms[g].density) > 0:
+                parts.append((g, int(compiled.geom_type[g]), mass, float(geoms[g].density)))
+        if not parts:
+            continue
+        solid = Solids(body, *(tuple(column) for column in zip(*parts, strict=True)))  # pyright: ignore[reportArgumentType]
+        _check_solid(compiled, solid)
+        solids.append(solid)
+    return tuple(solids)
+
+
+def _check_solid(compiled: Any, solid: Solids) -> None:
+    """Refuse what does not come out as MuJoCo compiled it."""
+    name = compiled.body(solid.body).name
+    advice = f"give body {name!r} an <inertial>, which then stays as it is"
+    if not set(solid.kinds) <= set(_SHAPES):
+        raise ValueError(
+            f"a geom of body {name!r} is bound, whose mass comes from a shape other than sphere, "
+            f"capsule, ellipsoid, cylinder and box; {advice}"
+        )
+    names = ("geom_size", "geom_pos", "geom_quat", "body_mass", "body_inertia", "body_ipos")
+    with jax.enable_x64():
+        leaves = {n: jnp.asarray(getattr(compiled, n)) for n in (*names, "body_iquat")}
+        again = jax.jit(lambda leaves: rebuilt(compiled, (solid,), leaves))(leaves)
+    same = np.allclose(again["body_mass"], compiled.body_mass, rtol=1e-6) and np.allclose(
+        np.sort(again["body_inertia"][solid.body]),
+        np.sort(compiled.body_inertia[solid.body]),
+        rtol=1e-6,
+    )
+    if not same:
+        raise ValueError(
+            f"a geom of body {name!r} is bound, whose inertia MuJoCo did not compute from solid "
+            f"geoms (a shell, a total mass, a lower bound); {advice}"
+        )
+
+
+def rebuilt(compiled: Any, solids: Collection[Solids], leaves: Leaves) -> Leaves:
+    """The leaves with mass, centre and inertia of the `solids` as their geoms have them."""
+    leaves = dict(leaves)
+    for solid in solids:
+        parts = [
+            _geom(leaves, compiled, geom, kind, mass, density)
+            for geom, kind, mass, density in zip(
+                solid.geoms, solid.kinds, solid.masses, solid.densities, strict=True
+            )
+        ]
+        mass, centre, inertia, quat = parts[0] if len(parts) == 1 else _together(parts)
+        for name, value in (
+            ("body_mass", mass),
+            ("body_ipos", centre),
+            ("body_inertia", inertia),
+            ("body_iquat", quat),
+        ):
+            leaves[name] = leaves[name].at[solid.body].set(value)
+    return leaves
+
+
+def _geom(
+    leaves: Leaves, compiled: Any, geom: int, kind: int, mass: float | None, density: float
+) -> tuple[Array, Array, Array, Array]:
+    """Mass, centre, principal inertia and its orientation of one geom, in its body's frame."""
+
+    def leaf(name: str) -> Array:
+        if name in leaves:
+            return leaves[name][geom]
+        return jnp.asarray(getattr(compiled, name)[geom], leaves["body_mass"].dtype)
+
+    size = leaf("geom_size")
+    total = jnp.asarray(mass if mass is not None else density * _volume(kind, size), size.dtype)
+    return total, leaf("geom_pos"), total * _inertia(kind, size), leaf("geom_quat")
+
+
+def _volume(kind: int, size: Float[Array, "3"]) -> Float[Array, ""]:
+    a, b, c = size
+    if kind == _SPHERE:
+        return 4 / 3 * math.pi * a**3
+    if kind == _CAPSULE:
+        return math.pi * a**2 * (2 * b + 4 / 3 * a)
+    if kind == _CYLINDER:
+        return 2 * math.pi * a**2 * b
+    return (4 / 3 * math.pi if kind == _ELLIPSOID else 8.0) * a * b * c
+
+
+def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Principal moments for unit mass, in the geom's frame."""
+    a, b, _c = size
+    if kind == _SPHERE:
+        return jnp.full(3, 0.4, size.dtype) * a**2
+    if kind == _CYLINDER:
+        side = (3 * a**2 + 4 * b**2) / 12
+        return jnp.stack([side, side, a**2 / 2])
+    if kind == _CAPSULE:
+        # A cylinder of half length b, and two half balls whose centres of mass are 3/8 a further.
+        cylinder = 2 * b / (2 * b + 4 / 3 * a)
+        ball = 1 - cylinder
+        side = cylinder * (3 * a**2 + 4 * b**2) / 12
+        side = side + ball * (0.4 * a**2 + b**2 + 0.75 * a * b)
+        return jnp.stack([side, side, cylinder * a**2 / 2 + ball * 0.4 * a**2])
+    squares = size**2
+    return (jnp.sum(squares) - squares) / (5 if kind == _ELLIPSOID else 3)
+
+
+def _together(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
+    masses, places = (jnp.stack([part[i] for part in parts]) for i in range(2))
+    mass = jnp.sum(masses)
+    centre = masses @ places / mass
+    full = jnp.zeros((3, 3), centre.dtype)
+    for own, place, moments, quat in parts:
+        turn, arm = _rotation(quat), place - centre
+        full = full + (turn * moments) @ turn.T
+        full = full + own * (jnp.dot(arm, arm) * jnp.eye(3, dtype=arm.dtype) - jnp.outer(arm, arm))
+    moments, axes = jnp.linalg.eigh(full)
+    # A rotation, not a reflection.
+    axes = axes.at[:, 2].multiply(jnp.sign(jnp.linalg.det(axes)))
+    return mass, centre, moments, _quaternion(axes)
+
+
+def _rotation(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    w, x, y, z = quat / jnp.linalg.norm(quat)
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
+    """Of a rotation; the largest of four ways to write it, so that none divides by nothing."""
+    m = matrix
+    signs = jnp.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], m.dtype)
+    squares = 1 + signs @ jnp.diag(m)
+    ways = jnp.array(
+        [
+            [squares[0], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], squares[1], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], squares[2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], squares[3]],
+        ]
+    )
+    best = ways[jnp.argmax(squares)]
+    return best / jnp.linalg.norm(best)
+
+
+def constants(model: Any) -> Any:
+    """An MJX model with the constants that `mj_setConst` computes from its other leaves.
+
+    Source: MuJoCo, engine_setconst.c (set0 and setFixed); see "Computation: Model" in its manual.
+    """
+    mjx = mjx_module()
+    masses = model.body_mass
+    subtree = masses
+    for body in range(model.nbody - 1, 0, -1):
+        subtree = subtree.at[model.body_parentid[body]].add(subtree[body])
+    model = model.replace(body_subtreemass=subtree, geom_rbound=_bounds(model))
+    if model.nv == 0:
+        return model
+    data = mjx.make_data(model).replace(qpos=model.qpos0)
+    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    data = mjx.tendon_armature(model, mjx.crb(model, mjx.tendon(model, data)))
+    data = mjx.transmission(model, data)
+    inverse = jnp.linalg.inv(mjx.full_m(model, data))
+    bodies = []
+    for body in range(model.nbody):
+        if model.body_weldid[body] == 0:
+            bodies.append(jnp.zeros(2, masses.dtype))
+            continue
+        if model.body_simple[body] == 2:  # It slides and does not turn.
+            bodies.append(jnp.array([1.0, 0.0], masses.dtype) / masses[body])
+            continue
+        jacobians = mjx.jac(model, data, data.xipos[body], body)
+        bodies.append(jnp.stack([jnp.einsum("ik,ij,jk->", j, inverse, j) / 3 for j in jacobians]))
+    dofs = jnp.diag(inverse)
+    for joint, kind in enumerate(model.jnt_type):
+        first = int(model.jnt_dofadr[joint])
+        for start in {0: (first, first + 3), 1: (first,)}.get(int(kind), ()):
+            part = slice(start, start + 3)
+            dofs = dofs.at[part].set(jnp.mean(dofs[part]))
+    moment, pull = data._impl.actuator_moment, data._impl.ten_J
+    return model.tree_replace(
+        {
+            "body_invweight0": jnp.stack(bodies),
+            "dof_invweight0": dofs,
+            "tendon_length0": data.ten_length,
+            "tendon_invweight0": jnp.einsum("ti,ij,tj->t", pull, inverse, pull),
+            "actuator_acc0": jnp.linalg.norm(moment @ inverse, axis=-1),
+        }
+    )
+
+
+def _bounds(model: Any) -> Float[Array, " ngeom"]:
+    """The radius of the ball around each geom, where features can change it."""
+    bounds = model.geom_rbound
+    for geom, kind in enumerate(model.geom_type):
+        size = model.geom_size[geom]
+        radius = {
+            _SPHERE: lambda s: s[0],
+            _CAPSULE: lambda s: s[0] + s[1],
+            _CYLINDER: lambda s: jnp.sqrt(s[0] ** 2 + s[1] ** 2),
+            _ELLIPSOID: jnp.max,
+            _BOX: lambda s: jnp.sqrt(jnp.sum(s**2)),
+        }.get(int(kind))
+        if radius is not None:
+            bounds = bounds.at[geom].set(radius(size))
+    return bounds

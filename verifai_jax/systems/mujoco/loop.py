@@ -1,0 +1,322 @@
+"""The closed loop around a MuJoCo model, whatever engine steps it: state, control, signals, end.
+
+Both backends call `sample` between control periods, the native one on a whole batch under `vmap`.
+What it computes is therefore the same on both, down to the order of operations.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from verifai_jax.systems.mujoco.bindings import Bindings, Watched
+from verifai_jax.systems.mujoco.model import Place, names, reading
+from verifai_jax.systems.structure import check_like, check_signals, outline
+
+Features = Mapping[str, Any]
+Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
+
+
+# MuJoCo's mjMAXVAL: what is larger it calls unstable, and a control that is it takes for zero.
+HUGE = 1e10
+
+
+class State(NamedTuple):
+    """What controller, signals and terminate see of a simulation, on both backends.
+
+    All of it is current but the sensors of acceleration and force (accelerometer, force, torque,
+    touch, actuatorfrc): they describe the last physics step before the sample, and are zero at
+    time 0.
+    """
+
+    time: Float[Array, ""]
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    act: Float[Array, " na"]
+    sensordata: Float[Array, " nsensordata"]
+    xpos: Float[Array, "nbody 3"]
+    xquat: Float[Array, "nbody 4"]
+    xipos: Float[Array, "nbody 3"]
+    subtree_com: Float[Array, "nbody 3"]
+    geom_xpos: Float[Array, "ngeom 3"]
+    site_xpos: Float[Array, "nsite 3"]
+    ten_length: Float[Array, " ntendon"]
+    actuator_length: Float[Array, " nu"]
+
+
+class Sampled(NamedTuple):
+    """What one sample decides for the control period that begins there.
+
+    - `inputs`: `ctrl`, and the forces that features apply.
+    - `frozen`: the state stays as it is from here on.
+    """
+
+    inputs: dict[str, Float[Array, "..."]]
+    signals: dict[str, Array]
+    frozen: Bool[Array, ""]
+
+
+class Lived(NamedTuple):
+    """What goes from sample to sample beside the physics: memory, periods lived, all finite."""
+
+    memory: Any
+    age: Int[Array, ""]
+    finite: Bool[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Everything of a system but its engine; `mujoco` says what the parts are."""
+
+    bindings: Bindings
+    controller: Callable[..., Any] | None
+    controller_memory: Any
+    initial: Callable[..., Any] | None
+    signals: Signals | None
+    terminate: Callable[..., Any] | None
+    control_period: float
+    periods: int
+    substeps: int
+    # Integration steps in one of the model's; JAX may trace it.
+    finer: Any = 1
+
+    @property
+    def compiled(self) -> Any:
+        """The `mujoco.MjModel`."""
+        return self.bindings.model.compiled
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.periods * self.control_period
+
+    @cached_property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """The shape of each array of the state; the sensors added for contacts included."""
+        m = self.compiled
+        return {
+            "qpos": (m.nq,),
+            "qvel": (m.nv,),
+            "act": (m.na,),
+            "sensordata": (m.nsensordata,),
+            **dict.fromkeys(("xpos", "xipos", "subtree_com"), (m.nbody, 3)),
+            "xquat": (m.nbody, 4),
+            "geom_xpos": (m.ngeom, 3),
+            "site_xpos": (m.nsite, 3),
+            "ten_length": (m.ntendon,),
+            "actuator_length": (m.nu,),
+        }
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """Where signals that are named by a path are."""
+        if callable(self.signals):
+            return {}
+        chosen = self._default_signals() if self.signals is None else self.signals
+        places = {}
+        hidden = list(self.bindings.model.hidden)
+        for name, path in chosen.items():
+            if callable(path):
+                continue
+            if isinstance(path, str) and path.startswith("contact/"):
+                path = f"sensor/{hidden.pop(0)}"
+            places[name] = reading(self.compiled, path)
+        return places
+
+    def _default_signals(self) -> dict[str, str]:
+        found: dict[str, str] = {}
+        for joint in names(self.compiled, "joint"):
+            found |= {joint: f"joint/{joint}/qpos", f"{joint}_vel": f"joint/{joint}/qvel"}
+        found |= {sensor: f"sensor/{sensor}" for sensor in names(self.compiled, "sensor")}
+        if not found:
+            raise ValueError("the model names no joint or sensor: give signals={'x': 'joint/...'}")
+        return found
+
+    @cached_property
+    def late(self) -> np.ndarray:
+        """Which of `sensordata` come from the last physics step."""
+        late = np.zeros(self.compiled.nsensordata, bool)
+        for i in range(self.compiled.nsensor):
+            if self.compiled.sensor_needstage[i] >= 3:
+                start = int(self.compiled.sensor_adr[i])
+                late[start : start + int(self.compiled.sensor_dim[i])] = True
+        return late
+
+    def start(self, features: Features, key: Any) -> dict[str, Array]:
+        """`qpos`, `qvel` and `act` at time 0."""
+        start = self.bindings.start(features)
+        if self.initial is None:
+            return start
+        made = self.initial(features, key, start["qpos"], start["qvel"])
+        role = "(qpos, qvel), each in the shape of the model's"
+        if not (isinstance(made, tuple) and len(made) == 2):
+            raise ValueError(f"initial must return {role}; got {outline(made)}")
+        for name, value in zip(("qpos", "qvel"), made, strict=True):
+            if np.shape(value) != start[name].shape:
+                raise ValueError(
+                    f"initial must return {role}; {name} must have shape "
+                    f"{list(start[name].shape)}, got {list(np.shape(value))}"
+                )
+            start[name] = jnp.asarray(value, start[name].dtype)
+        return start
+
+    def lived(self) -> Lived:
+        """Before the first sample."""
+        return Lived(
+            jax.tree.map(jnp.asarray, self.controller_memory), jnp.int32(0), jnp.array(True)
+        )
+
+    def sample(
+        self, k: Int[Array, ""], arrays: Mapping[str, Array], lived: Lived, features: Features
+    ) -> tuple[Sampled, Lived]:
+        """Look at the state at sample `k`, and decide what happens until the next.
+
+        `arrays`: of the state, those that `reads` names at least.
+        """
+        time = lived.age.astype(jnp.result_type(float)) * self.control_period
+        state, sensors = self.state(time, arrays)
+        ctrl, memory = self.control(state, lived.memory, features)
+        inputs = {"ctrl": ctrl, **self.bindings.acting(features, time)}
+        frozen = k >= self.periods
+        if self.terminate is not None:
+            frozen |= self.terminate(state, features)
+        signals = self.seen(state, sensors, inputs["ctrl"], features)
+        finite = lived.finite
+        for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
+            finite &= jnp.all(jnp.abs(value) <= HUGE)
+        after = Lived(memory, lived.age + 1, finite)
+        kept = Lived(lived.memory, lived.age, finite)
+        after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, kept)
+        return Sampled(inputs, signals, frozen), after
+
+    def state(self, time: Array, arrays: Mapping[str, Array]) -> tuple[State, Array]:
+        """The state as users see it, and all sensors. What is not given is zero."""
+        full = {
+            name: arrays.get(name, jnp.zeros(shape, time.dtype))
+            for name, shape in self.shapes.items()
+        }
+        sensors = full["sensordata"]
+        # Sensors that were added for contacts lie behind the model's own.
+        own = sensors[: self.compiled.nsensordata - len(self.bindings.model.hidden)]
+        return State(time, **{**full, "sensordata": own}), sensors
+
+    def control(self, state: State, memory: Any, features: Features) -> tuple[Any, Any]:
+        """What the controller says, as `[nu]`, and what it then remembers."""
+        nu = self.compiled.nu
+        if self.controller is None:
+            return jnp.zeros(nu, state.time.dtype), memory
+        if self.controller_memory is None:
+            control = self.controller(state.time, state, features)
+        else:
+            control, memory = self.controller(state.time, state, memory, features)
+        control = jnp.asarray(control, state.time.dtype)
+        return control.reshape(nu), memory
+
+    def seen(self, state: State, sensors: Array, ctrl: Array, features: Features) -> dict[str, Any]:
+        """The signals at one sample."""
+        if callable(self.signals):
+            return dict(self.signals(state.time, state, ctrl, features))
+        arrays = {**state._asdict(), "sensordata": sensors, "ctrl": ctrl}
+        seen = {}
+        for name, chosen in (self.signals or self.places).items():
+            if callable(chosen):
+                seen[name] = chosen(state.time, state, ctrl, features)
+            else:
+                where = self.places[name]
+                seen[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
+        return seen
+
+    def vouched(self) -> tuple[str, ...]:
+        """Signals that are parts of the state, whose finiteness is the state's."""
+        parts = ("qpos", "qvel", "act", "ctrl")
+        return tuple(name for name, place in self.places.items() if place.array in parts)
+
+    def reads(self, features: Features) -> frozenset[str]:
+        """The arrays of the state that something looks at."""
+        fields = [name for name in State._fields if name != "time"]
+        zero = jnp.zeros(())
+        state, _ = jax.eval_shape(lambda: self.state(zero, {}))
+
+        def everything(state: State, features: Features, memory: Any) -> Any:
+            control, memory = self.control(state, memory, features)
+            ended = () if self.terminate is None else self.terminate(state, features)
+            if callable(self.signals):
+                chosen: Any = self.signals(state.time, state, control, features)
+            else:
+                chosen = [
+                    one(state.time, state, control, features)
+                    for one in (self.signals or {}).values()
+                    if callable(one)
+                ]
+            return control, memory, ended, chosen
+
+        traced = jax.make_jaxpr(everything)(state, features, self.controller_memory).jaxpr
+        touched = [v for equation in traced.eqns for v in equation.invars] + list(traced.outvars)
+        read = {
+            name
+            for name, variable in zip(State._fields, traced.invars, strict=False)
+            if any(variable is one for one in touched)
+        }
+        read |= {place.array for place in self.places.values()}
+        return frozenset(read & set(fields))
+
+    def check(self, features: Features) -> None:
+        """Refuse features, and functions, that do not fit; abstract evaluation only.
+
+        **Raises:** `ValueError`.
+        """
+        self.bindings.check(features)
+        nu = self.compiled.nu
+        used = {binding.feature for binding in self.bindings.all}
+        key = jax.eval_shape(lambda: jax.random.key(0))
+
+        def everything(features: Features, key: Any) -> Any:
+            watched = Watched(features, used)
+            start = self.start(watched, key)
+            state, sensors = self.state(jnp.zeros((), jnp.result_type(float)), start)
+            memory = jax.tree.map(jnp.asarray, self.controller_memory)
+            if self.controller is not None:
+                self._check_controller(state, memory, watched)
+            control, _ = self.control(state, memory, watched)
+            signals = self.seen(state, sensors, control, watched)
+            check_signals(signals)
+            if self.terminate is not None:
+                ended = jnp.asarray(self.terminate(state, watched))
+                if ended.shape != () or ended.dtype != jnp.bool_:
+                    raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
+            return signals
+
+        jax.eval_shape(everything, features, key)
+        if any(b.place.array == "ctrl" for b in self.bindings.applied) and self.controller:
+            raise ValueError("a feature is bound to a ctrl that the controller already sets")
+        for name in features:
+            if name not in used:
+                raise ValueError(
+                    f"feature {name!r} is used by nothing: bind it to a part of the model, or read "
+                    f"it in controller, initial, signals or terminate (nu={nu})"
+                )
+
+    def _check_controller(self, state: State, memory: Any, features: Features) -> None:
+        nu = self.compiled.nu
+        assert self.controller is not None
+        if self.controller_memory is None:
+            control = self.controller(state.time, state, features)
+        else:
+            decided = self.controller(state.time, state, memory, features)
+            role = "(control, memory), its memory in the form of controller_memory"
+            if not (isinstance(decided, tuple) and len(decided) == 2):
+                raise ValueError(f"controller must return {role}; got {outline(decided)}")
+            control = decided[0]
+            check_like(decided[1], memory, "controller", role)
+        shape = getattr(control, "shape", None) if not np.isscalar(control) else ()
+        if shape != (nu,) and not (shape == () and nu == 1):
+            known = ", ".join(names(self.compiled, "actuator"))
+            raise ValueError(
+                f"the model has {nu} actuators ({known}), so controller must return a control of "
+                f"shape [{nu}]; got {outline(control)}"
+            )

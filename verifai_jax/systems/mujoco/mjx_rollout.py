@@ -1,0 +1,254 @@
+"""MuJoCo in JAX: one simulation as a pure function, to be vmapped, jitted and differentiated.
+
+A physics step is MuJoCo's, cut in two: kinematics, contacts and sensors of the present state, then
+forces and integration. Between the two the controller looks, so nothing that it sees lags behind
+but accelerations and forces.
+"""
+
+import copy
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.mujoco.bindings import Bindings
+from verifai_jax.systems.mujoco.derived import constants
+from verifai_jax.systems.mujoco.loop import Lived, Loop, Sampled
+from verifai_jax.systems.mujoco.model import mjx_module
+
+# What MJX decides once from the model's values, and features may change: it has to see that there
+# is something there.
+_SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
+LEAST = 1e-9  # MJX takes a row of friction without friction for an equality.
+
+
+class Physics(NamedTuple):
+    """What one physics step leaves to the next."""
+
+    qpos: Array
+    qvel: Array
+    act: Array
+    qacc_warmstart: Array
+    sensordata: Array
+
+
+def rollout(loop: Loop, features: Any, key: Any) -> Trace:
+    """Simulate once."""
+    mjx = mjx_module()
+    model, blank = prepared(loop.bindings, features)
+    if not _is_one(loop.finer):
+        model = model.tree_replace({"opt.timestep": model.opt.timestep / loop.finer})
+    substeps = loop.substeps * loop.finer
+    start = loop.start(features, key)
+    physics = Physics(
+        **{name: start[name] for name in ("qpos", "qvel", "act")},
+        qacc_warmstart=jnp.zeros_like(start["qvel"]),
+        sensordata=blank.sensordata,
+    )
+
+    lived = loop.lived()
+    arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
+    form: Sampled = jax.eval_shape(
+        lambda: loop.sample(jnp.int32(0), arrays, lived, features)[0],
+    )
+
+    def step(physics: Physics, time: Array, decide: Any) -> tuple[Physics, Any]:
+        data = blank.replace(time=time, **physics._asdict())
+        data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
+        data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
+        inputs, rest = decide(data)
+        data = data.replace(**{name: v.reshape(getattr(data, name).shape) for name, v in inputs})
+        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        data = solved(model, data) if data._impl.efc_J.size else data.replace(qacc=data.qacc_smooth)
+        data = mjx.sensor_acc(model, data)
+        moved = _integrator(mjx, model)(model, data)
+        after = {name: getattr(moved, name) for name in Physics._fields}
+        # Runge-Kutta evaluates the sensors at its inner stages too.
+        return Physics(**{**after, "sensordata": data.sensordata}), rest
+
+    def sample(carry: tuple[Physics, Lived], k: Int[Array, ""]) -> Any:
+        before, lived = carry
+        time = lived.age.astype(before.qpos.dtype) * loop.control_period
+
+        def substep(carry: Any, j: Int[Array, ""]) -> Any:
+            physics, sampled, after = carry
+
+            def decide(data: Any) -> Any:
+                def look() -> Any:
+                    arrays = {name: getattr(data, name) for name in loop.shapes}
+                    return loop.sample(k, arrays, lived, features)
+
+                if _is_one(substeps):
+                    decided = look()
+                else:
+                    # The counter is common to all lanes of a batch: this stays a branch.
+                    decided = jax.lax.cond(j == 0, look, lambda: (sampled, after))
+                return decided[0].inputs.items(), decided
+
+            physics, (sampled, after) = step(physics, time + j * model.opt.timestep, decide)
+            return (physics, sampled, after), None
+
+        blank_sample = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
+        begun = (before, blank_sample, lived)
+        if isinstance(substeps, int):
+            (after, sampled, lived), _ = jax.lax.scan(substep, begun, jnp.arange(substeps))
+        else:  # Traced: a loop without a derivative in reverse mode.
+            after, sampled, lived = jax.lax.fori_loop(
+                0, substeps, lambda j, carry: substep(carry, j)[0], begun
+            )
+        held = jax.tree.map(lambda new, old: jnp.where(sampled.frozen, old, new), after, before)
+        return (held, lived), sampled.signals
+
+    # Reverse mode keeps the state at each sample, and does a control period again for what is
+    # between: memory does not grow with the substeps.
+    (physics, lived), signals = jax.lax.scan(
+        jax.checkpoint(sample, prevent_cse=False),
+        (physics, lived),
+        jnp.arange(loop.periods + 1),
+    )
+    ends = loop.terminate is not None
+    return Trace(
+        signals,
+        dt=loop.control_period,
+        valid=lived.age + 1 if ends else None,
+        status=jnp.where(lived.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
+        held=ends,
+        finite=loop.vouched(),
+    )
+
+
+def _is_one(count: Any) -> bool:
+    return isinstance(count, int) and count == 1
+
+
+@jax.custom_jvp
+def _attached(value: Array, other: Array) -> Array:
+    """`value`, with the derivative of `other`; which is not even computed without derivatives."""
+    return value
+
+
+_attached.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
+
+
+def solved(model: Any, data: Any) -> Any:
+    """The data after MJX's constraint solver, with derivatives in forward and in reverse mode.
+
+    The accelerations minimise a convex cost, so their derivative is that of one Newton step from
+    the minimum (implicit function theorem). The iterations themselves, a loop of unknown length,
+    are not differentiated; the result has to be converged for the derivative to be exact.
+    """
+    mjx = mjx_module()
+    create, update = _solver()
+    constant_model, constant = jax.lax.stop_gradient((model, data))
+    found = mjx.solve(constant_model, constant)
+    newton = model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
+    constant_newton = constant_model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
+    start = data.replace(qacc=found.qacc)
+    here = create(newton, start, grad=False)
+    residual = here.Ma - data.qfrc_smooth - here.qfrc_constraint
+    zero = jnp.zeros_like(residual)
+    curved = jax.lax.stop_gradient(here).replace(Ma=residual, qfrc_constraint=zero)
+    step = update(constant_newton, constant.replace(qfrc_smooth=zero), curved).Mgrad
+    qacc = _attached(found.qacc, -step)
+    there = create(newton, start.replace(qacc=qacc), grad=False)
+    return data.tree_replace(
+        {
+            "qacc": qacc,
+            "qfrc_constraint": _attached(found.qfrc_constraint, there.qfrc_constraint),
+            "_impl.efc_force": _attached(found._impl.efc_force, there.efc_force),
+        }
+    )
+
+
+def _solver() -> tuple[Any, Any]:
+    from mujoco.mjx._src import solver
+
+    return solver.Context.create, solver._update_gradient
+
+
+def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
+    """The MJX model of one row of features, and blank MJX data.
+
+    **Raises:** `NotImplementedError` for a model that MJX cannot do.
+    """
+    model, blank = _put(bindings)
+    if not bindings.arrays:
+        return model, blank
+    leaves = bindings.leaves(features)
+    changes = {}
+    for name, value in leaves.items():
+        old = _leaf(model, name)
+        if name in _SWITCHES:
+            value = jnp.maximum(value, LEAST)
+        changes[name] = value.reshape(old.shape).astype(old.dtype)
+    model = model.tree_replace(changes)
+    if bindings.moves_constants:
+        model = constants(model)
+    return model, blank
+
+
+def _put(bindings: Bindings) -> tuple[Any, Any]:
+    """The model as it is compiled, on the device, in the present precision; made once."""
+    mjx = mjx_module()
+    precision = bool(jax.config.read("jax_enable_x64"))
+    if precision not in bindings.kept:
+        compiled = copy.copy(bindings.model.compiled)
+        for binding in bindings.parameters:
+            array, where = binding.place.array, binding.place.index
+            if array in _SWITCHES:
+                flat = getattr(compiled, array).reshape(-1)
+                flat[where] = np.maximum(flat[where], LEAST)
+            if array in ("opt.density", "opt.viscosity", "opt.wind"):
+                compiled.opt.density = max(compiled.opt.density, LEAST)
+        # Constants of every program that is traced, so never traced themselves.
+        with jax.ensure_compile_time_eval():
+            model = mjx.put_model(compiled, impl="jax")
+            bindings.kept[precision] = (model, mjx.make_data(model))
+    return bindings.kept[precision]
+
+
+def why_not(bindings: Bindings) -> str | None:
+    """Why MJX cannot simulate a model; None where it can."""
+    try:
+        _put(bindings)
+    except NotImplementedError as error:
+        return f"MJX cannot do this model: {error}"
+    compiled = bindings.model.compiled
+    places = {"body_pos", "body_quat", "site_pos", "site_quat"}
+    if compiled.neq and bindings.arrays & places:
+        return "MJX does not recompute the anchors of equality constraints that features move"
+    if compiled.nplugin:
+        return "MJX has no plugins"
+    return None
+
+
+def _leaf(model: Any, name: str) -> Any:
+    for part in name.split("."):
+        model = getattr(model, part)
+    return model
+
+
+def _integrator(mjx: Any, model: Any) -> Any:
+    kind = mjx.IntegratorType
+    return {kind.EULER: mjx.euler, kind.RK4: mjx.rungekutta4, kind.IMPLICITFAST: mjx.implicit}[
+        model.opt.integrator
+    ]
+
+
+def reverse_hint(compiled: Any) -> str | None:
+    """Why reverse mode does not work on a model, and what makes it work; None where it does."""
+    if compiled.opt.integrator != 1 or not constrained(compiled):  # 1: Runge-Kutta
+        return None
+    return (
+        "MJX solves constraints in a loop of unknown length, which has no reverse-mode derivative "
+        'inside its Runge-Kutta steps: give the model integrator="implicitfast" or "Euler"'
+    )
+
+
+def constrained(compiled: Any) -> bool:
+    """Whether a model can have active constraints: contacts, limits, friction, equalities."""
+    data = mjx_module().make_data(compiled, impl="jax")
+    return bool(data._impl.efc_J.size)

@@ -1,0 +1,401 @@
+"""A MuJoCo model and the names of its parts: `"body/pole/mass"`, `"option/gravity[2]"`.
+
+    model = load("envs/mujoco_cartpole.xml")
+    place(model.compiled, "geom/floor/friction[0]")       # which numbers of the model that is
+    reading(model.compiled, "joint/hinge/qpos")           # which numbers of a state that is
+
+A path is `kind/name/field`, with an index `[i]` or a slice `[i:j]` where a field has several
+numbers. MuJoCo is imported when a model is loaded, not before.
+"""
+
+import contextlib
+import copy
+import io
+import re
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from verifai_jax.core.errors import require, unknown_name
+
+# Where the numbers of one element lie in an array: at its id, its degrees of freedom, its part of
+# qpos, or in some columns of its row.
+_BODY = {name: f"body_{name}" for name in ("mass", "inertia", "pos", "quat", "ipos", "iquat")}
+_GEOM_FIELDS = ("size", "pos", "quat", "friction", "margin", "gap", "solref", "solimp", "solmix")
+_GEOM = {name: f"geom_{name}" for name in _GEOM_FIELDS}
+_JOINT_DOF = {name: f"dof_{name}" for name in ("damping", "armature", "frictionloss")}
+_JOINT = {name: f"jnt_{name}" for name in ("stiffness", "range", "pos", "axis", "solref", "solimp")}
+_SITE = {"pos": "site_pos", "quat": "site_quat"}
+_ACTUATOR = {
+    name: f"actuator_{name}"
+    for name in ("gear", "gainprm", "biasprm", "dynprm", "ctrlrange", "forcerange")
+}
+_TENDON = {
+    name: f"tendon_{name}"
+    for name in ("stiffness", "damping", "armature", "frictionloss", "range", "lengthspring")
+}
+_EQUALITY = {"solref": "eq_solref", "solimp": "eq_solimp", "data": "eq_data"}
+_PAIR = {
+    name: f"pair_{name}"
+    for name in ("friction", "margin", "gap", "solref", "solreffriction", "solimp")
+}
+_OPTION = ("gravity", "wind", "magnetic", "density", "viscosity", "impratio")
+
+KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
+
+# What can be set, beside parameters of the model: the state at time 0, and what acts on it.
+_INPUTS = {
+    "body": ("force", "torque"),
+    "joint": ("qpos", "qvel", "springref", "force"),
+    "actuator": ("kp", "kv", "ctrl", "act"),
+}
+_FIELDS = {
+    "body": _BODY,
+    "geom": _GEOM,
+    "joint": {**_JOINT_DOF, **_JOINT},
+    "site": _SITE,
+    "actuator": _ACTUATOR,
+    "tendon": _TENDON,
+    "equality": _EQUALITY,
+    "pair": _PAIR,
+}
+
+# What can be read of a state, by kind: the name in a path, and that in MjData.
+_READINGS = {
+    "joint": {"qpos": "qpos", "qvel": "qvel"},
+    "body": {"xpos": "xpos", "xquat": "xquat", "xipos": "xipos", "subtree_com": "subtree_com"},
+    "geom": {"xpos": "geom_xpos"},
+    "site": {"xpos": "site_xpos"},
+    "actuator": {"length": "actuator_length", "act": "act", "ctrl": "ctrl"},
+    "tendon": {"length": "ten_length"},
+}
+
+_PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Some numbers of one array.
+
+    - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
+    - `index`: flat indices `[k]` into it.
+    - `shape`: `()` for one number, else `(k,)`.
+    - `sign`: each number is the value times this.
+    """
+
+    array: str
+    index: np.ndarray
+    shape: tuple[int, ...]
+    path: str
+    sign: float = 1.0
+
+    def __post_init__(self) -> None:
+        # JAX keeps what it traced of an index; one of 64 bits would not be the same in float32.
+        object.__setattr__(self, "index", self.index.astype(np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A compiled model, and the spec that it came from where there was one."""
+
+    compiled: Any
+    spec: Any = None
+    hidden: tuple[str, ...] = ()
+
+
+def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
+    """Read and compile a model.
+
+    **Arguments:**
+
+    - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
+    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added behind
+      the model's own.
+    - `options`: fields of the model's options to set, where they are not None.
+
+    **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for text that is
+    no model, and for contacts of an `MjModel`, which takes no more sensors.
+    """
+    mujoco = require("mujoco", extra="mujoco")
+    if isinstance(source, mujoco.MjModel):
+        if contacts:
+            raise ValueError(
+                f"signal {contacts[0]!r} needs a sensor that a compiled MjModel cannot be given: "
+                "give the MJCF file, its text or an MjSpec instead"
+            )
+        spec, compiled = None, copy.copy(source)
+    else:
+        spec = _spec(mujoco, source)
+        plain = spec.compile()
+        for k, path in enumerate(contacts):
+            _add_contact_sensor(mujoco, spec, plain, path, f"__contact{k}")
+        compiled = spec.compile() if contacts else plain
+    for name, value in options.items():
+        if value is not None:
+            setattr(compiled.opt, name, value)
+    # A simulation that becomes NaN must be seen, not silently begin again.
+    compiled.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return Model(compiled, spec, tuple(f"__contact{k}" for k in range(len(contacts))))
+
+
+def movable(model: Model, bodies: Collection[int]) -> Model:
+    """The same model, in which the centre of mass of these bodies can move away from their origin.
+
+    MuJoCo leaves out parts of the mass matrix that are zero as compiled ("simple" bodies).
+
+    **Raises:** `ValueError` where there is no spec to compile again.
+    """
+    mujoco = require("mujoco", extra="mujoco")
+    old = model.compiled
+    simple = [body for body in bodies if old.body_simple[body]]
+    if not simple:
+        return model
+    if model.spec is None or int(model.spec.compiler.inertiafromgeom) == 1:
+        raise ValueError(
+            f"the centre of mass of body {old.body(simple[0]).name!r} lies at its origin, which "
+            "MuJoCo fixes when it compiles: give the MJCF, without inertiafromgeom, not an MjModel"
+        )
+    spec = model.spec.copy()
+    for body in spec.bodies:
+        if body.id in simple:
+            body.explicitinertial = True
+            body.mass, body.inertia = old.body_mass[body.id], old.body_inertia[body.id]
+            body.ipos = old.body_ipos[body.id] + np.array([1e-2, 2e-2, 3e-2])
+            body.iquat = old.body_iquat[body.id]
+    new = spec.compile()
+    for name in ("mass", "inertia", "ipos", "iquat"):
+        getattr(new, f"body_{name}")[:] = getattr(old, f"body_{name}")
+    for name in ("iterations", "ls_iterations", "disableflags"):
+        setattr(new.opt, name, getattr(old.opt, name))
+    mujoco.mj_setConst(new, mujoco.MjData(new))
+    return replace(model, compiled=new)
+
+
+def mjx_module() -> Any:
+    """The module `mujoco.mjx`, imported without what it prints about packages it can do without.
+
+    **Raises:** `MissingExtra`.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        return require("mujoco.mjx", extra="mujoco")
+
+
+def _spec(mujoco: Any, source: Any) -> Any:
+    if isinstance(source, mujoco.MjSpec):
+        return source.copy()
+    if not isinstance(source, str | Path):
+        raise ValueError(
+            "a MuJoCo model is the path of an MJCF file, its text, an MjSpec or an MjModel; "
+            f"got {type(source).__name__}"
+        )
+    try:
+        if "<" in str(source):
+            return mujoco.MjSpec.from_string(str(source))
+        if not Path(source).is_file():
+            raise FileNotFoundError(f"there is no MJCF file {str(source)!r}")
+        return mujoco.MjSpec.from_file(str(source))
+    except ValueError as error:
+        where = "MJCF text" if "<" in str(source) else str(source)
+        raise ValueError(f"{where} is no MuJoCo model: {error}") from error
+
+
+def _add_contact_sensor(mujoco: Any, spec: Any, model: Any, path: str, name: str) -> None:
+    first, second = _contact_geoms(model, path)
+    geom, found = mujoco.mjtObj.mjOBJ_GEOM, 1
+    pair = {} if second is None else {"reftype": geom, "refname": second}
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_CONTACT,
+        objtype=geom,
+        objname=first,
+        intprm=[found, 0, 1],  # How many contacts match; not which.
+        **pair,
+    )
+
+
+def _contact_geoms(model: Any, path: str) -> tuple[str, str | None]:
+    parts, known = path.split("/")[1:], names(model, "geom")
+    if "/".join(parts) in known:
+        return "/".join(parts), None
+    # Names may have slashes in them.
+    for cut in range(1, len(parts)):
+        first, second = "/".join(parts[:cut]), "/".join(parts[cut:])
+        if first in known and second in known:
+            return first, second
+    wrong = next((part for part in parts if part not in known), path)
+    raise unknown_name(f"geom in {path!r}: geom", wrong, known)
+
+
+def names(model: Any, kind: str) -> list[str]:
+    """The names of all elements of a kind that have one."""
+    mujoco = require("mujoco", extra="mujoco")
+    code = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+    count = {
+        "body": "nbody",
+        "joint": "njnt",
+        "geom": "ngeom",
+        "site": "nsite",
+        "actuator": "nu",
+        "tendon": "ntendon",
+        "equality": "neq",
+        "pair": "npair",
+        "sensor": "nsensor",
+    }[kind]
+    found = (mujoco.mj_id2name(model, code, i) for i in range(getattr(model, count)))
+    return [name for name in found if name]
+
+
+def place(model: Any, path: str) -> list[Place]:
+    """Which numbers a bound path sets.
+
+    **Raises:** `UnknownNameError` for an unknown kind, element or field, with the nearest ones;
+    `ValueError` for an index outside the field.
+    """
+    kind, name, field, index = _split(path, (*KINDS, "option"))
+    if kind == "option":
+        if field not in _OPTION:
+            raise unknown_name(f"option in {path!r}: option", field, _OPTION)
+        value = np.asarray(getattr(model.opt, field))
+        return [_pick(path, f"opt.{field}", np.arange(value.size), index)]
+    fields = [*_FIELDS[kind], *_INPUTS.get(kind, ())]
+    element = _element(model, kind, name, path)
+    if field not in fields:
+        raise unknown_name(f"field of a {kind} in {path!r}: field", field, fields)
+    if field in _FIELDS[kind]:
+        array = _FIELDS[kind][field]
+        rows = _dofs(model, element) if array.startswith("dof_") else np.array([element])
+        return [_pick(path, array, _flat(getattr(model, array), rows), index)]
+    return _place_input(model, kind, field, element, path, index)
+
+
+def _place_input(
+    model: Any, kind: str, field: str, element: int, path: str, index: str | None
+) -> list[Place]:
+    if kind == "body":
+        start = 6 * element + (3 if field == "torque" else 0)
+        return [_pick(path, "xfrc_applied", start + np.arange(3), index)]
+    if kind == "joint":
+        if field in ("qpos", "springref"):
+            array = "qpos" if field == "qpos" else "qpos_spring"
+            return [_pick(path, array, _positions(model, element), index)]
+        array = "qvel" if field == "qvel" else "qfrc_applied"
+        return [_pick(path, array, _dofs(model, element), index)]
+    if field == "ctrl":
+        return [_pick(path, "ctrl", np.array([element]), index)]
+    if field == "act":
+        return [_pick(path, "act", _activations(model, element, path), index)]
+    # A position servo is gain kp and bias -kp; a damped one has bias -kv beside.
+    gain, bias = model.actuator_gainprm.shape[1], model.actuator_biasprm.shape[1]
+    if model.actuator_biastype[element] != 1:
+        raise ValueError(
+            f"{path!r}: kp and kv are those of a servo (position, velocity, intvelocity); "
+            "this actuator has gear and gainprm"
+        )
+    column, sets_gain = (1, True) if field == "kp" else (2, model.actuator_biasprm[element, 1] == 0)
+    places = [Place("actuator_biasprm", np.array([element * bias + column]), (), path, -1.0)]
+    if sets_gain:
+        places.append(Place("actuator_gainprm", np.array([element * gain]), (), path))
+    return places
+
+
+def reading(model: Any, path: str) -> Place:
+    """Which numbers of a state a signal's path names.
+
+    **Raises:** as `place`.
+    """
+    kind, name, field, index = _split(path, (*_READINGS, "sensor", "contact"))
+    if kind == "sensor":
+        whole = path.removeprefix("sensor/")
+        name = whole[: whole.rindex("[")] if index is not None else whole
+        return _pick(path, "sensordata", sensor_addresses(model, name, path), index)
+    fields = _READINGS[kind]
+    element = _element(model, kind, name, path)
+    if field not in fields:
+        raise unknown_name(f"signal of a {kind} in {path!r}: signal", field, fields)
+    array = fields[field]
+    if field in ("qpos", "qvel"):
+        where = (_positions if field == "qpos" else _dofs)(model, element)
+    elif field == "act":
+        where = _activations(model, element, path)
+    else:
+        width = {"xquat": 4}.get(array, 1 if array.endswith(("length", "ctrl")) else 3)
+        where = element * width + np.arange(width)
+    return _pick(path, array, where, index)
+
+
+def sensor_addresses(model: Any, name: str, path: str) -> np.ndarray:
+    """The places `[k]` of a sensor in `sensordata`."""
+    known = names(model, "sensor")
+    if name not in known:
+        raise unknown_name(f"sensor in {path!r}: sensor", name, known)
+    sensor = model.sensor(name)
+    return int(sensor.adr[0]) + np.arange(int(sensor.dim[0]))
+
+
+def _split(path: str, kinds: tuple[str, ...]) -> tuple[str, str, str, str | None]:
+    match = _PATH.match(path) if isinstance(path, str) else None
+    if match is None:
+        raise ValueError(
+            f"a part of the model is written kind/name/field, like 'body/torso/mass'; got {path!r}"
+        )
+    kind, rest, index = match["kind"], match["rest"], match["index"]
+    if kind not in kinds:
+        raise unknown_name(f"kind in {path!r}: kind", kind, kinds)
+    if kind in ("option", "sensor", "contact"):
+        return kind, "", rest, index
+    name, slash, field = rest.rpartition("/")
+    if not slash:
+        raise ValueError(f"{path!r} lacks a field: write {kind}/{rest}/FIELD")
+    return kind, name, field, index
+
+
+def _element(model: Any, kind: str, name: str, path: str) -> int:
+    known = names(model, kind)
+    if name not in known:
+        raise unknown_name(f"{kind} in {path!r}: {kind}", name, known)
+    return int(getattr(model, kind)(name).id)
+
+
+def _positions(model: Any, joint: int) -> np.ndarray:
+    width = (7, 4, 1, 1)[model.jnt_type[joint]]
+    return int(model.jnt_qposadr[joint]) + np.arange(width)
+
+
+def _dofs(model: Any, joint: int) -> np.ndarray:
+    width = (6, 3, 1, 1)[model.jnt_type[joint]]
+    return int(model.jnt_dofadr[joint]) + np.arange(width)
+
+
+def _activations(model: Any, actuator: int, path: str) -> np.ndarray:
+    if model.actuator_actnum[actuator] < 1:
+        raise ValueError(f"{path!r}: this actuator has no activation state")
+    start = int(model.actuator_actadr[actuator])
+    return start + np.arange(int(model.actuator_actnum[actuator]))
+
+
+def _flat(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    return np.arange(array.size).reshape(array.shape)[rows].ravel()
+
+
+def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Place:
+    """The part of an element's numbers that an index or a slice leaves."""
+    if index is None:
+        return Place(array, where, () if where.size == 1 else (where.size,), path)
+    try:
+        if ":" in index:
+            first, last = (int(end) if end.strip() else None for end in index.split(":"))
+            part = where[first:last]
+            if part.size == 0:
+                raise IndexError
+            return Place(array, part, (part.size,), path)
+        number = int(index)
+        if not 0 <= number < where.size:
+            raise IndexError
+        return Place(array, where[[number]], (), path)
+    except (IndexError, ValueError):
+        raise ValueError(
+            f"{path!r}: [{index}] is no part of it; its indices are 0 to {where.size - 1}"
+        ) from None

@@ -1,0 +1,287 @@
+"""MuJoCo in C: a batch in lock-step, the policy in JAX between its control periods.
+
+The physics runs on all cores through `mujoco.batch.Batch`, which measured as fast as
+`mujoco.rollout` and keeps its states where the next period continues; parameters that differ
+between rows are written into its arrays, so there is one model however large the batch. A batch is
+worked through in two halves: while one is stepped, the other's policy is evaluated.
+"""
+
+import contextlib
+import copy
+import ctypes
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.core.errors import require
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.mujoco.loop import Lived, Loop, Sampled
+
+BLOCK = 64  # Rows whose policy is evaluated together.
+HALVED = 64  # Rows from which two halves are worth their overhead.
+
+
+@dataclass(eq=False)
+class Native:
+    """Batches of one loop, and the programs that they need; made once for a system."""
+
+    loop: Loop
+    batches: dict[Any, Any] = field(default_factory=dict)
+    programs: dict[Any, Any] = field(default_factory=dict)
+
+    def simulate(self, features: Any, keys: Any) -> Trace:
+        """A batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
+        count = len(keys)
+        # Few sizes, for which programs are compiled; the rows that fill one up are never stepped.
+        size = 1 << (count - 1).bit_length()
+        filled = np.minimum(np.arange(size), count - 1)
+        program = self._program(features)
+        features = jax.tree.map(lambda leaf: np.asarray(leaf)[filled], features)
+        with _no_warnings():
+            parts = [
+                _Part(
+                    self,
+                    program,
+                    number,
+                    jax.tree.map(lambda leaf, part=part: leaf[part], features),
+                    keys[filled[part]],
+                    alive=np.arange(size)[part] < count,
+                )
+                for number, part in enumerate(_split(size))
+            ]
+            first, others = parts[0], parts[1:]
+            first.look(0)
+            for k in range(self.loop.periods + 1):
+                for part in others:
+                    part.look(k)
+                first.go()
+                if k < self.loop.periods:
+                    first.look(k + 1)
+                for part in others:
+                    part.go()
+        trace = self._trace([part.results() for part in parts])
+        return jax.tree.map(lambda leaf: leaf[:count], trace)
+
+    def _program(self, features: Any) -> "_Program":
+        leaves, form = jax.tree.flatten(features)
+        key = (form, tuple((np.shape(leaf)[1:], np.result_type(leaf)) for leaf in leaves))
+        key = (*key, bool(jax.config.read("jax_enable_x64")))
+        if key not in self.programs:
+            one = jax.tree.map(
+                lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf)[1:], _kind(leaf)), features
+            )
+            self.loop.check(one)
+            self.programs[key] = _Program(self.loop, self.loop.reads(one))
+        return self.programs[key]
+
+    def batch(self, size: int, number: int) -> Any:
+        """A `mujoco.batch.Batch` of this many rows; the one that there is already."""
+        if (size, number) not in self.batches:
+            module = require("mujoco.batch", extra="mujoco")
+            # Batches of other sizes are not needed again, or not soon.
+            self.batches = {key: b for key, b in self.batches.items() if key[0] == size}
+            compiled = self.loop.compiled
+            if self.loop.finer != 1:
+                compiled = copy.copy(compiled)
+                compiled.opt.timestep /= self.loop.finer
+            self.batches[size, number] = module.Batch(compiled, size)
+        return self.batches[size, number]
+
+    def _trace(self, results: list["_Results"]) -> Trace:
+        signals = {
+            name: np.concatenate([result.signals[name] for result in results])
+            for name in results[0].signals
+        }
+        age = np.concatenate([result.age for result in results])
+        finite = np.concatenate([result.finite for result in results])
+        failed = np.concatenate([result.failed for result in results])
+        status = np.where(finite, Status.OK, Status.NONFINITE)
+        status = np.where(failed, Status.ERROR, status).astype(np.int32)
+        ends = self.loop.terminate is not None
+        form = Trace(
+            {name: signal[0] for name, signal in signals.items()},
+            dt=self.loop.control_period,
+            valid=1 if ends else None,
+            status=0,
+            held=ends,
+            finite=self.loop.vouched(),
+        )
+        leaves = [*signals.values(), *([(age + 1).astype(np.int32)] if ends else []), status]
+        return jax.tree.unflatten(jax.tree.structure(form), leaves)
+
+
+class _Program:
+    """What is compiled for features of one form."""
+
+    def __init__(self, loop: Loop, reads: frozenset[str]) -> None:
+        self.loop = loop
+        # The state always, so that what is not finite is seen.
+        self.names = ("qpos", "qvel", "act", *sorted(reads - {"qpos", "qvel", "act"}))
+        self.sizes = [int(np.prod(loop.shapes[name])) for name in self.names]
+        self.stage = self._stage()
+        self.start = jax.jit(_in_blocks(loop.start))
+        self.leaves = jax.jit(_in_blocks(loop.bindings.leaves))
+        self.sample = jax.jit(
+            lambda k, *rows: _in_blocks(lambda *row: self._sample(k, *row))(*rows)
+        )
+
+    def _stage(self) -> int:
+        """How much MuJoCo has to compute at a sample, beside the steps."""
+        derived = set(self.names) - {"qpos", "qvel", "act"}
+        if not derived:
+            return 0
+        needed = 1
+        if "sensordata" in derived and np.any(self.loop.compiled.sensor_needstage > 1):
+            needed = 2
+        return needed
+
+    def _sample(self, k: Any, packed: Any, lived: Lived, features: Any) -> tuple[Sampled, Lived]:
+        parts = jnp.split(packed, np.cumsum(self.sizes)[:-1])
+        arrays = {
+            name: part.reshape(self.loop.shapes[name])
+            for name, part in zip(self.names, parts, strict=True)
+        }
+        if "sensordata" in arrays:
+            # Before the first step there is no acceleration yet.
+            unknown = (k == 0) & self.loop.late
+            arrays["sensordata"] = jnp.where(unknown, 0.0, arrays["sensordata"])
+        return self.loop.sample(k, arrays, lived, features)
+
+
+class _Results(NamedTuple):
+    """Signals `[n, time, ...]`, and by row: periods lived, all finite, refused by MuJoCo."""
+
+    signals: dict[str, np.ndarray]
+    age: np.ndarray
+    finite: np.ndarray
+    failed: np.ndarray
+
+
+class _Part:
+    """A half of the rows, or all of them, on their way through a simulation."""
+
+    def __init__(
+        self,
+        native: Native,
+        program: _Program,
+        number: int,
+        features: Any,
+        keys: Any,
+        alive: np.ndarray,
+    ) -> None:
+        self.alive, self.failed = alive, np.zeros(len(alive), bool)
+        self.loop, self.program = native.loop, program
+        count = len(keys)
+        self.batch = native.batch(count, number)
+        self.features = jax.device_put(features)
+        bindings = self.loop.bindings
+        if bindings.arrays:
+            for name, value in program.leaves(self.features).items():
+                self.batch.expand(name)[...] = np.asarray(value).reshape(
+                    self.batch.expand(name).shape
+                )
+            if bindings.moves_constants:
+                self.batch.set_const()
+        self.batch.reset(stage=0)
+        for name, value in program.start(self.features, keys).items():
+            self.batch.bind(name)[...] = np.asarray(value)
+        self.views = [self.batch.bind(name) for name in program.names]
+        if program.stage:
+            self.batch.forward(stage=program.stage)
+        dtype = np.float64 if jax.config.read("jax_enable_x64") else np.float32
+        self.packed = np.zeros((count, sum(program.sizes)), dtype)
+        self.lived = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.lived()
+        )
+        self.refused = require("mujoco.batch", extra="mujoco").SimulationError
+        self.samples: list[dict[str, Any]] = []
+        self.sampled: Any = None
+
+    def look(self, k: int) -> None:
+        """Start to evaluate the policy on the state at sample `k`."""
+        start = 0
+        for view, size in zip(self.views, self.program.sizes, strict=True):
+            self.packed[:, start : start + size] = view.reshape(len(view), size)
+            start += size
+        self.sampled, self.lived = self.program.sample(
+            np.int32(k), self.packed, self.lived, self.features
+        )
+
+    def go(self) -> None:
+        """Step to the next sample what has not ended, under the control that was decided."""
+        self.samples.append(self.sampled.signals)
+        ended = np.asarray(self.sampled.frozen) | ~np.asarray(self.lived.finite)
+        for name, value in self.sampled.inputs.items():
+            self.batch.bind(name)[...] = np.asarray(value).reshape(self.batch.bind(name).shape)
+        going = self.alive & ~self.failed & ~ended
+        if not going.any():
+            return
+        try:
+            self.batch.step(
+                None if going.all() else going,
+                nstep=self.loop.substeps * self.loop.finer,
+                stage=self.program.stage,
+            )
+        except self.refused as error:
+            # MuJoCo raised in these rows, which keep their state; the others went on.
+            self.failed[error.ids] = True
+
+    def results(self) -> "_Results":
+        """What came of these rows."""
+        signals = {
+            name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
+            for name in self.samples[0]
+        }
+        age, finite = np.asarray(self.lived.age), np.asarray(self.lived.finite)
+        return _Results(signals, age, finite, self.failed)
+
+
+def _in_blocks(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`jax.vmap` whose results for a row do not depend on how many other rows there are.
+
+    XLA sums in another order in products of other sizes, and through contacts a last digit becomes
+    another fall: a row that is simulated again must be the same simulation.
+    """
+
+    def blocked(*rows: Any) -> Any:
+        count = len(jax.tree.leaves(rows)[0])
+        number = -(-count // BLOCK)
+        filled = np.minimum(np.arange(number * BLOCK), count - 1)
+        blocks = jax.tree.map(
+            lambda leaf: leaf[filled].reshape(number, BLOCK, *leaf.shape[1:]), rows
+        )
+        results = jax.lax.map(lambda block: jax.vmap(function)(*block), blocks)
+        return jax.tree.map(
+            lambda leaf: leaf.reshape(len(filled), *leaf.shape[2:])[:count], results
+        )
+
+    return blocked
+
+
+def _split(size: int) -> list[slice]:
+    if size < HALVED:
+        return [slice(0, size)]
+    return [slice(0, size // 2), slice(size // 2, size)]
+
+
+def _kind(leaf: Any) -> Any:
+    return jax.dtypes.canonicalize_dtype(np.result_type(leaf))
+
+
+@contextlib.contextmanager
+def _no_warnings() -> Iterator[None]:
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT: what is not finite is reported by the status."""
+    mujoco = require("mujoco", extra="mujoco")
+    before = mujoco.get_mju_user_warning()
+    # The threads that step call it without Python: a C function that takes a text and does nothing.
+    c = ctypes.CDLL(None if os.name == "posix" else "msvcrt")
+    mujoco.set_mju_user_warning(ctypes.CFUNCTYPE(None, ctypes.c_char_p)(("strlen", c)))
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)

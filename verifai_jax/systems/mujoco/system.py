@@ -1,0 +1,268 @@
+"""A MuJoCo model in a closed loop as a system: `(features, key) -> Trace`, on one of two engines.
+
+mujoco("envs/mujoco_cartpole.xml", duration=4.0, control_period=0.02,
+bind={"masspole": "body/pole/mass", "x0": "joint/slider/qpos"},
+controller=policy, signals={"x": "joint/slider/qpos"})
+mjx(...)                              # the same in JAX: vmap, gradients, GPU
+native(...)                           # the same in C: all cores, a batch in lock-step
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.trace import Trace
+from verifai_jax.core.waveform import bound
+from verifai_jax.systems.mujoco.bindings import Bound, bindings
+from verifai_jax.systems.mujoco.loop import Loop, Signals
+from verifai_jax.systems.mujoco.mjx_rollout import constrained, reverse_hint, rollout, why_not
+from verifai_jax.systems.mujoco.model import load
+from verifai_jax.systems.mujoco.native_rollout import Native
+from verifai_jax.systems.ode.integrators import check_factor
+
+BACKENDS = ("native", "mjx")
+
+
+@dataclass(frozen=True, eq=False)
+class MuJoCo:
+    """A closed loop `(features, key) -> Trace`; made by `mujoco`, which says what its parts are.
+
+    - `backend`: `"native"`, `"mjx"`, or `"auto"` until a run chooses.
+    """
+
+    # Measured on the cart-pole in MJX: four forward sweeps take 0.8 of one reverse sweep's time,
+    # and half of its time to compile.
+    forward_up_to: ClassVar[int] = 4
+    # Lanes wait for the one whose contacts take most iterations: a ball at 144 000 steps/s with 128
+    # together, 47 000 with 512.
+    lanes: ClassVar[int] = 128
+    loop: Loop
+    backend: str = "auto"
+    # Of the native backend; another loop has its own, but the same at every step of the physics.
+    programs: dict[Any, Any] = field(default_factory=dict, repr=False, init=False)
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.loop.duration
+
+    @cached_property
+    def backends(self) -> tuple[str, ...]:
+        """The engines that can simulate this model."""
+        return BACKENDS if self.why_not("mjx") is None else ("native",)
+
+    @property
+    def likely(self) -> str:
+        """The engine that is likely faster on a CPU: MJX pays for contacts, native for the policy.
+
+        Without anything for a constraint solver to do, MJX measured three times native's speed
+        (a cart-pole); with a contact a seventh of it (a ball).
+        """
+        return "native" if constrained(self.loop.compiled) else "mjx"
+
+    def why_not(self, backend: str) -> str | None:
+        """Why an engine cannot simulate this model; None where it can."""
+        if backend not in BACKENDS:
+            raise unknown_name("backend", backend, (*BACKENDS, "auto"))
+        return None if backend == "native" else why_not(self.loop.bindings)
+
+    def with_backend(self, name: str) -> "MuJoCo":
+        """The same system on one engine, or on `"auto"`.
+
+        **Raises:** `UnknownNameError`; `ValueError` with the reason where the engine cannot.
+        """
+        if name != "auto" and (reason := self.why_not(name)) is not None:
+            raise ValueError(f"backend {name!r} is not possible: {reason}")
+        return replace(self, backend=name)
+
+    @property
+    def traced_factor(self) -> bool:
+        """Whether `refined` takes a factor that JAX traces."""
+        return not self.black_box
+
+    def refined(self, factor: int) -> "MuJoCo":
+        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+
+        Sensors of acceleration and force then describe the last of the smaller steps.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
+        """
+        if not (self.traced_factor and isinstance(factor, jax.Array)):
+            check_factor(factor)
+        finer = replace(self, loop=replace(self.loop, finer=self.loop.finer * factor))
+        object.__setattr__(finer, "programs", self.programs)
+        return finer
+
+    @property
+    def black_box(self) -> bool:
+        """Whether JAX does not see into it: native, or a model that only native can do."""
+        return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
+
+    @cached_property
+    def reverse_hint(self) -> str | None:
+        """What makes reverse mode work, where it does not."""
+        return reverse_hint(self.loop.compiled)
+
+    def check(self, features: Any) -> None:
+        """Refuse features that the system does not fit; nothing compiles.
+
+        - `features`: as `jax.ShapeDtypeStruct`, or values.
+
+        **Raises:** `ValueError`.
+        """
+        self.loop.check(bound(features, self.duration))
+
+    def abstract(self, features: Any) -> Trace:
+        """The trace of one simulation, as shapes alone."""
+        loop, features = self.loop, bound(features, self.duration)
+
+        def trace(features: Any) -> Trace:
+            zeros = {name: jnp.zeros(shape) for name, shape in loop.shapes.items()}
+            sampled, lived = loop.sample(jnp.int32(0), zeros, loop.lived(), features)
+            signals = {
+                name: jnp.broadcast_to(value, (loop.periods + 1, *value.shape))
+                for name, value in sampled.signals.items()
+            }
+            ends = loop.terminate is not None
+            return Trace(
+                signals,
+                dt=loop.control_period,
+                valid=lived.age if ends else None,
+                status=jnp.int32(0),
+                held=ends,
+                finite=loop.vouched(),
+            )
+
+        return jax.eval_shape(trace, features)
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate once: traced by JAX unless the backend is native."""
+        features = bound(features, self.duration)
+        if not self.black_box:
+            self.loop.check(features)
+            return rollout(self.loop, features, key)
+        key = jax.random.key(0) if key is None else key
+        batch = self.simulate_batch(
+            jax.tree.map(lambda leaf: np.asarray(leaf)[None], features), jnp.asarray(key)[None]
+        )
+        return jax.tree.map(lambda leaf: leaf[0], batch)
+
+    def simulate_batch(self, features: Any, keys: Any) -> Trace:
+        """Simulate a batch natively; every leaf has a leading axis `[n]`."""
+        return self._native.simulate(bound(features, self.duration), keys)
+
+    @cached_property
+    def _native(self) -> Native:
+        return Native(self.loop, programs=self.programs)
+
+
+@suggests_options
+def mujoco(
+    model: Any,
+    *,
+    duration: float,
+    control_period: float,
+    bind: Bound | None = None,
+    controller: Callable[..., Any] | None = None,
+    controller_memory: Any = None,
+    initial: Callable[..., Any] | None = None,
+    signals: Signals | None = None,
+    terminate: Callable[..., Any] | None = None,
+    backend: str = "auto",
+    solver_iterations: int | None = None,
+    ls_iterations: int | None = None,
+) -> MuJoCo:
+    """A system `(features, key) -> Trace` from a MuJoCo model and a controller.
+
+    **Arguments:**
+
+    - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
+    - `duration`: in seconds, a multiple of `control_period`.
+    - `control_period`: seconds between two runs of the controller, a multiple of the model's
+      timestep, and the sampling period of the trace. Control and forces are held in between.
+    - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `scaled(path)`
+      for a factor on the model's value, or a list of these. See docs/mujoco.md for all paths.
+    - `controller(time, state, features) -> control`: `[nu]`, or one number for one actuator;
+      `state` is a `mujoco_loop.State`.
+    - `controller_memory`: as in `ode`.
+    - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
+    - `signals`: for a signal's name a path (`"joint/slider/qpos"`, `"body/torso/xpos[2]"`,
+      `"sensor/imu"`, `"contact/floor/foot"`: how many contacts) or a function
+      `(time, state, control, features) -> value`; or one function that returns the dictionary.
+      When left out: joints `NAME` and `NAME_vel`, and sensors, by their names.
+    - `terminate(state, features) -> bool`: as in `ode`.
+    - `backend`: `"mjx"`, `"native"`, or `"auto"`: a run takes the one with gradients where it
+      needs them, else the faster.
+    - `solver_iterations`, `ls_iterations`: of the constraint solver and its line search, instead
+      of the model's.
+
+    **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
+    does not compile, times that do not fit, and paths that are not in the model.
+    """
+    if backend not in (*BACKENDS, "auto"):
+        raise unknown_name("backend", backend, (*BACKENDS, "auto"))
+    if controller is None and controller_memory is not None:
+        raise ValueError("controller_memory needs a controller; got none")
+    for name, part in (("controller", controller), ("initial", initial), ("terminate", terminate)):
+        if part is not None and not callable(part):
+            raise ValueError(f"{name} must be a function; got {part!r}")
+    for name, count in (("solver_iterations", solver_iterations), ("ls_iterations", ls_iterations)):
+        if count is not None and (not isinstance(count, int) or count < 1):
+            raise ValueError(f"{name} must be an integer of at least 1; got {count!r}")
+    if not (bind is None or isinstance(bind, Mapping)):
+        raise ValueError(f"bind must be a dictionary of paths by feature; got {bind!r}")
+    if not (signals is None or callable(signals) or isinstance(signals, Mapping)):
+        raise ValueError(f"signals must be a dictionary or a function; got {signals!r}")
+    contacts = ()
+    if isinstance(signals, Mapping):
+        if not signals:
+            raise ValueError("signals has no signal in it")
+        contacts = tuple(
+            path
+            for path in signals.values()
+            if isinstance(path, str) and path.startswith("contact/")
+        )
+    loaded = load(model, contacts, iterations=solver_iterations, ls_iterations=ls_iterations)
+    timestep = float(loaded.compiled.opt.timestep)
+    loop = Loop(
+        bindings=bindings(loaded, bind),
+        controller=controller,
+        controller_memory=controller_memory,
+        initial=initial,
+        signals=signals,
+        terminate=terminate,
+        control_period=float(control_period),
+        periods=_whole(duration, control_period, "duration", "control_period"),
+        substeps=_whole(control_period, timestep, "control_period", "the model's timestep"),
+    )
+    _ = loop.places
+    system = MuJoCo(loop)
+    return system if backend == "auto" else system.with_backend(backend)
+
+
+def mjx(model: Any, **options: Any) -> MuJoCo:
+    """A MuJoCo model stepped in JAX; the arguments are those of `mujoco`."""
+    return mujoco(model, backend="mjx", **options)
+
+
+def native(model: Any, **options: Any) -> MuJoCo:
+    """A MuJoCo model stepped in C on all cores; the arguments are those of `mujoco`."""
+    return mujoco(model, backend="native", **options)
+
+
+def _whole(seconds: float, part: float, name: str, of: str) -> int:
+    """How many times `part` goes into `seconds`; refuses anything but a whole number >= 1."""
+    number = isinstance(seconds, int | float) and math.isfinite(seconds) and part > 0
+    count = round(seconds / part) if number else 0
+    if count < 1 or abs(count * part - seconds) > 1e-6 * part:
+        raise ValueError(
+            f"{name} must be a positive multiple of {of}; got ({name}={seconds}, {of}={part})"
+        )
+    return count

@@ -1,0 +1,366 @@
+"""A system from equations of motion: a plant, a controller in the loop, a fixed step.
+
+    ode(fall, start, dt=0.01, duration=2.0)                               # a plant alone
+    ode(cart, start, controller=lqr, control_period=0.04, dt=0.02, duration=4.0)
+    ode(cart, start, controller=pid, controller_memory=0.0, dt=0.02, steps=200, terminate=fell)
+
+The result is a pure function `(features, key) -> Trace` that can be vmapped and differentiated,
+forward and reverse.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.waveform import bound
+from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.systems.ode.integrators import check_factor, integrator
+from verifai_jax.systems.structure import (
+    check_like,
+    check_signals,
+    default_signals,
+    floating,
+    outline,
+)
+
+Time = Float[Array, ""]
+
+
+@dataclass(frozen=True, eq=False)
+class Ode:
+    """A closed loop `(features, key) -> Trace`; made by `ode`, which says what its parts are.
+
+    - `substeps`: integration steps between two samples; more than one in a `refined` loop.
+    """
+
+    traced_factor: ClassVar[bool] = True
+    dynamics: Callable[..., Any]
+    initial: Callable[..., Any]
+    controller: Callable[..., Any] | None
+    controller_memory: Any
+    dt: float
+    steps: int
+    steps_per_control: int
+    method: str
+    signals: Callable[..., Mapping[str, Any]] | None
+    terminate: Callable[..., Any] | None
+    unroll: int
+    substeps: Any = 1
+
+    @property
+    def duration(self) -> float:
+        """Simulated seconds."""
+        return self.steps * self.dt
+
+    def refined(self, factor: int) -> "Ode":
+        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+
+        The factor may be traced by JAX; the loop then has no derivative in reverse mode.
+
+        **Raises:** `ValueError` for a factor that is not a positive integer.
+        """
+        if not isinstance(factor, jax.Array):
+            check_factor(factor)
+        return replace(self, substeps=self.substeps * factor)
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
+
+        Only a waveform without a duration is given that of the simulation.
+        """
+        features = bound(features, self.duration)
+        return _Rollout(self, features).trace(floating(self.initial(features, key), "initial"))
+
+    def fold(
+        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+    ) -> tuple[Any, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+
+        Behind an early end the last valid sample comes again, until the end of the duration.
+        Returns the carry and the status.
+        """
+        features = bound(features, self.duration)
+        rollout = _Rollout(self, features)
+        return rollout.folded(floating(self.initial(features, key), "initial"), carry, update)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rollout:
+    """One simulation of a closed loop: what its steps share while JAX traces them."""
+
+    loop: Ode
+    features: Any
+
+    def trace(self, state: Any) -> Trace:
+        loop = self.loop
+        memory = jax.tree.map(jnp.asarray, loop.controller_memory)
+        vouched = self.check(state, memory)
+        last, age, _, samples = self.run(state, memory, None, lambda _, seen: (None, seen))
+        ends = loop.terminate is not None
+        return Trace(
+            samples,
+            dt=loop.dt,
+            valid=age + 1 if ends else None,
+            status=_status(last),
+            held=ends,
+            finite=vouched,
+        )
+
+    def folded(self, state: Any, carry: Any, update: Any) -> Any:
+        memory = jax.tree.map(jnp.asarray, self.loop.controller_memory)
+        self.check(state, memory)
+        last, _, carry, _ = self.run(state, memory, carry, lambda c, seen: (update(c, seen), None))
+        return carry, _status(last)
+
+    def run(self, state: Any, memory: Any, kept: Any, keep: Any) -> tuple[Any, Any, Any, Any]:
+        """The last state, how many steps were lived, and what `keep` made of the samples."""
+        loop, start = self.loop, state
+
+        def sample(carry: Any, k: Int[Array, ""]) -> Any:
+            (state, memory, held, age), kept = carry
+            time, frozen = self.now(k, age, state)
+            control, next_memory = self.decide(k, age, time, state, memory, held)
+            seen = self.seen(time, state, control)
+            next_state = self.step(time, self.safe(frozen, state, start), control)
+            applied = None if held is None else control
+            following = (next_state, next_memory, applied, age + 1)
+            after = _where(frozen, (state, memory, applied, age), following)
+            kept, output = keep(kept, seen)
+            return (after, kept), output
+
+        # A controller that runs at every sample holds nothing between samples.
+        held = None
+        if loop.steps_per_control > 1:
+            time = jnp.zeros((), _dtype(state))
+            form = jax.eval_shape(self.control, time, state, memory)[0]
+            held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
+        # One iteration more than there are steps: it samples the final state and moves nothing,
+        # which is cheaper than copying all samples to append one.
+        ((state, _, _, age), kept), outputs = checkpointed_scan(
+            sample,
+            ((state, memory, held, jnp.int32(0)), kept),
+            loop.steps + 1,
+            unroll=loop.unroll,
+        )
+        return state, age, kept, outputs
+
+    def decide(self, k: Any, age: Any, time: Any, state: Any, memory: Any, held: Any) -> Any:
+        """The control from sample `k` on, and what the controller then remembers."""
+        if held is None:
+            return self.control(time, state, memory)
+        # The counter is common to all lanes of a batch, so this stays a branch under `vmap`.
+        control, next_memory = jax.lax.cond(
+            k % self.loop.steps_per_control == 0,
+            lambda: self.control(time, state, memory),
+            lambda: (held, memory),
+        )
+        if self.loop.terminate is None:
+            return control, next_memory
+        # What has ended earlier keeps the control that it ended with.
+        return _where(age < k, (held, memory), (control, next_memory))
+
+    def now(
+        self, k: Int[Array, ""], age: Int[Array, ""], state: Any
+    ) -> tuple[Time, Bool[Array, ""]]:
+        """Time in seconds at sample `k`, and whether the state stays as it is from here on."""
+        over = k >= self.loop.steps
+        if self.loop.terminate is None:
+            return k.astype(_dtype(state)) * self.loop.dt, over
+        # Time stops with the state: whatever the signals depend on, the samples behind the end
+        # repeat the last valid one.
+        ended = self.loop.terminate(state, self.features)
+        return age.astype(_dtype(state)) * self.loop.dt, over | ended
+
+    def safe(self, frozen: Bool[Array, ""], state: Any, start: Any) -> Any:
+        """A state at which the dynamics may be evaluated.
+
+        A frozen state may lie where the dynamics have no finite slope (an emptied tank), and in
+        reverse mode zero times infinity would poison the gradient of the part that counts.
+        """
+        return state if self.loop.terminate is None else _where(frozen, start, state)
+
+    def control(self, time: Time, state: Any, memory: Any) -> tuple[Any, Any]:
+        loop = self.loop
+        if loop.controller is None:
+            return None, memory
+        if loop.controller_memory is None:
+            return loop.controller(time, state, self.features), memory
+        return loop.controller(time, state, memory, self.features)
+
+    def seen(self, time: Time, state: Any, control: Any) -> Any:
+        if self.loop.signals is None:
+            return default_signals(state, control)
+        return self.loop.signals(time, state, control, self.features)
+
+    def step(self, time: Time, state: Any, control: Any) -> Any:
+        """From one sample to the next."""
+        count = self.loop.substeps
+        advance = integrator(self.loop.method)
+
+        def slope(time: Time, state: Any) -> Any:
+            return self.loop.dynamics(time, state, control, self.features)
+
+        if isinstance(count, int) and count == 1:
+            return advance(slope, time, state, self.loop.dt)
+        dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
+
+        def substep(j: Any, state: Any) -> Any:
+            return advance(slope, time + j.astype(dt.dtype) * dt, state, dt)
+
+        return jax.lax.fori_loop(0, count, substep, state)
+
+    def check(self, state: Any, memory: Any) -> tuple[str, ...]:
+        """Refuse functions that do not fit together; abstract evaluation, nothing compiles.
+
+        Returns the signals that are parts of the state itself, whose finiteness is the state's.
+        """
+        loop = self.loop
+        time = jnp.zeros((), _dtype(state))
+        if loop.method == "semi_implicit_euler" and not _is_pair(state):
+            raise ValueError(
+                "method 'semi_implicit_euler' needs a state that is a tuple "
+                f"(positions, velocities); got {outline(state)}"
+            )
+        control = None
+        if loop.controller is not None:
+            if loop.controller_memory is None:
+                control = jax.eval_shape(loop.controller, time, state, self.features)
+            else:
+                decided = jax.eval_shape(loop.controller, time, state, memory, self.features)
+                role = "(control, memory), its memory in the form of controller_memory"
+                if not _is_pair(decided):
+                    raise ValueError(f"controller must return {role}; got {outline(decided)}")
+                control = decided[0]
+                check_like(decided[1], memory, "controller", role)
+        slope = jax.eval_shape(
+            lambda control: loop.dynamics(time, state, control, self.features), control
+        )
+        check_like(slope, state, "dynamics", "the state's slope, in the form of the state")
+        parts, vouched = jax.tree.leaves(state), []
+
+        def seen(control: Any) -> Any:
+            signals = self.seen(time, state, control)
+            if isinstance(signals, Mapping):
+                vouched.extend(n for n, v in signals.items() if any(v is part for part in parts))
+            return signals
+
+        check_signals(jax.eval_shape(seen, control))
+        if loop.terminate is not None:
+            ended = jax.eval_shape(loop.terminate, state, self.features)
+            if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
+                raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
+        return tuple(vouched)
+
+
+def _status(last: Any) -> Int[Array, ""]:
+    # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the last
+    # state is finite, all were. A state frozen at its end is covered by the same check.
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(last):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    return jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+
+
+def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def _dtype(state: Any) -> Any:
+    return jax.tree.leaves(state)[0].dtype
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 2
+
+
+def _whole(seconds: float, dt: float, name: str) -> int:
+    """How many steps of `dt` make `seconds`; refuses anything but a whole number >= 1."""
+    steps = round(seconds / dt) if math.isfinite(seconds) else 0
+    if steps < 1 or abs(steps * dt - seconds) > 1e-6 * dt:
+        raise ValueError(
+            f"{name} must be a positive multiple of dt; got ({name}={seconds}, dt={dt})"
+        )
+    return steps
+
+
+@suggests_options
+def ode(
+    dynamics: Callable[..., Any],
+    initial: Callable[..., Any],
+    *,
+    controller: Callable[..., Any] | None = None,
+    dt: float,
+    duration: float | None = None,
+    steps: int | None = None,
+    method: str = "rk4",
+    control_period: float | None = None,
+    controller_memory: Any = None,
+    signals: Callable[..., Mapping[str, Any]] | None = None,
+    terminate: Callable[..., Any] | None = None,
+    unroll: int = 1,
+) -> Ode:
+    """A system `(features, key) -> Trace` from equations of motion, integrated with a fixed step.
+
+    **Arguments:**
+
+    - `dynamics(time, state, control, features) -> slope`: d state / d time, in the form of the
+      state; `time` in seconds; `control` is None without a controller.
+    - `initial(features, key) -> state`: any pytree of real numbers, all made one float dtype.
+    - `controller(time, state, features) -> control`: any pytree.
+    - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
+    - `duration`: in seconds, a multiple of `dt`; or `steps`, how many.
+    - `method`: `"rk4"`, `"euler"`, or `"semi_implicit_euler"`, whose state is a tuple
+      `(positions, velocities)`.
+    - `control_period`: seconds between two runs of the controller, a multiple of `dt`; its output
+      is held in between. `dt` when left out.
+    - `controller_memory`: what a controller with memory (an integrator, a filter) remembers at
+      first. It is then called `controller(time, state, memory, features)` and returns
+      `(control, memory)`.
+    - `signals(time, state, control, features) -> dict`: a scalar or vector for each name, at each
+      sample; `control` is the one applied from this sample on. When left out: the state's own
+      names, those of the control, and `control` for a control without names.
+    - `terminate(state, features) -> bool`: ends the simulation. The first sample at which it is
+      true is the last valid one; the state stays frozen from there on.
+    - `unroll`: steps in one iteration of the compiled loop; changes speed only.
+
+    The status of the trace is `NONFINITE` if the state became NaN or infinite.
+
+    **Raises:** `ValueError` for times that do not fit, and an unknown method; once the system is
+    traced, for functions whose results do not fit together.
+    """
+    if not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
+    if (duration is None) == (steps is None):
+        raise ValueError(f"give either duration or steps; got (duration={duration}, steps={steps})")
+    if steps is None:
+        assert duration is not None
+        steps = _whole(duration, dt, "duration")
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
+    integrator(method)
+    if controller is None and (control_period is not None or controller_memory is not None):
+        raise ValueError("control_period and controller_memory need a controller; got none")
+    if unroll < 1:
+        raise ValueError(f"unroll must be at least 1; got {unroll}")
+    return Ode(
+        dynamics=dynamics,
+        initial=initial,
+        controller=controller,
+        controller_memory=controller_memory,
+        dt=float(dt),
+        steps=steps,
+        steps_per_control=(
+            1 if control_period is None else _whole(control_period, dt, "control_period")
+        ),
+        method=method,
+        signals=signals,
+        terminate=terminate,
+        unroll=unroll,
+    )

@@ -1,0 +1,255 @@
+"""Simulators in other processes, languages and machines: a run hands them points over TCP.
+
+    with remote(port=4567) as system:                    # and there: serve(simulate, port=4567)
+        falsify(Problem("cars", space, system, "always x <= 2"))
+
+    remote(host="0.0.0.0", port=4567, token=secret, timeout=600.0)       # beyond this machine
+    remote(signals=("x", "v"), dt=0.02, length=200)      # every trace is checked against these
+
+`verifai_jax.remote_client` is the other side in Python, `docs/remote.md` the protocol for others.
+"""
+
+import ipaddress
+import logging
+import queue
+import socket
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar, Self
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.trace import Trace
+from verifai_jax.systems.blackbox._blackbox import Declared, Names, only, plain_leaves, seed_of
+from verifai_jax.systems.outcome import Outcome
+from verifai_jax.systems.remote import wire
+from verifai_jax.systems.remote.connection import Batch, Rules
+from verifai_jax.systems.remote.server import Server
+
+log = logging.getLogger("verifai_jax.remote")
+
+MOST_BYTES = 16 << 20
+BOTH = ("127.0.0.1", "::1")
+
+
+class Remote:
+    """A host-side system whose simulations other programs do; made by `remote`.
+
+    The port is opened when it is first needed, so a module that defines one does nothing yet.
+    """
+
+    black_box: ClassVar[bool] = True
+
+    def __init__(self, host: str, port: int, rules: Rules) -> None:
+        self.host, self.port, self.rules = host, port, rules
+        self._lock = threading.Lock()
+        self._server: Server | None = None
+
+    def __repr__(self) -> str:
+        return f"remote(host={self.host!r}, port={self.port})"
+
+    @property
+    def addresses(self) -> list[tuple[str, int]]:
+        """Where clients can connect: host and port, one for each protocol."""
+        return [sock.getsockname()[:2] for sock in self._open().listening]
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """The first of `addresses`."""
+        return self.addresses[0]
+
+    @property
+    def clients(self) -> list[str]:
+        """Who is connected now."""
+        return [client.name for client in tuple(self._open().clients) if client.here]
+
+    @property
+    def abstract(self) -> Callable[[Any], Trace] | None:
+        """The form of the traces, if it is declared; see `Problem.check`."""
+        return self.rules.declared.abstract
+
+    def __call__(self, features: Any, key: Any = None) -> Trace:
+        """Simulate once.
+
+        **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
+        """
+        return only(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
+
+    def simulate_each(
+        self, features: Sequence[Any], seeds: Sequence[int]
+    ) -> Iterator[tuple[int, Outcome]]:
+        """Each index exactly once, as its simulation ends; see `simulations.Each`.
+
+        **Raises:** `TypeError` for features that JSON cannot hold; `ConnectionError` if the server
+        is closed meanwhile.
+        """
+        texts = [_text(each, seed) for each, seed in zip(features, seeds, strict=True)]
+        batch, server = Batch(), self._open()
+        server.submit(batch, texts)
+        try:
+            for _ in texts:
+                yield _next(batch, server)
+        finally:
+            batch.cancelled = True
+
+    def close(self) -> None:
+        """Send the clients away and close the port. The next simulation opens it again."""
+        with self._lock:
+            server, self._server = self._server, None
+        if server is not None:
+            server.stop()
+
+    def __enter__(self) -> Self:
+        self._open()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _open(self) -> Server:
+        with self._lock:
+            if self._server is None or not self._server.is_alive():
+                self._server = Server(self.rules, _listen(self.host, self.port))
+                self._server.start()
+                # Clients are told that the run has ended, not cut off, whoever forgot to close it.
+                weakref.finalize(self, self._server.stop)
+                where = " and ".join(
+                    f"{s.getsockname()[0]} port {s.getsockname()[1]}"
+                    for s in self._server.listening
+                )
+                log.info("simulators can connect to %s", where)
+            return self._server
+
+
+@suggests_options
+def remote(
+    host: str = "127.0.0.1",
+    port: int = 0,
+    *,
+    token: str | None = None,
+    timeout: float | None = 60.0,
+    retries: int = 1,
+    patience: float | None = None,
+    signals: Names | None = None,
+    dt: float | None = None,
+    length: int | None = None,
+    most_bytes: int = MOST_BYTES,
+) -> Remote:
+    """A system whose simulations are done by programs that connect to this one.
+
+    **Arguments:**
+
+    - `host`: the address to listen at; this machine only when left out, `"localhost"` by IPv4 and
+      IPv6. Anything else needs a token.
+    - `port`: 0 for any that is free, see `Remote.address`.
+    - `token`: a secret that clients have to know. Without one, whoever can open a connection on
+      this machine may answer.
+    - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
+      `timeout` and its client is sent away; None for no limit.
+    - `retries`: how often a point is handed out again if the client vanishes that simulates it.
+    - `patience`: seconds without any client after which the points that are left become rows with
+      status `error`; waits, and says so in the log, when left out.
+    - `signals`, `dt`, `length`: what every trace must have; see `blackbox.Declared`. A client that
+      sends another is told, and the row has status `error`.
+    - `most_bytes`: of one message from a client.
+
+    **Raises:** `ValueError` for options out of range, an address beyond this machine without a
+    token; when it is first needed, `OSError` for a port that is taken.
+    """
+    if not isinstance(host, str) or not host:
+        raise ValueError(f"host must be a name or an address, such as '127.0.0.1'; got {host!r}")
+    if not isinstance(port, int) or isinstance(port, bool) or not 0 <= port < 65536:
+        raise ValueError(f"port must be an integer from 0 to 65535; got {port!r}")
+    if token is not None and (not isinstance(token, str) or not token.strip()):
+        raise ValueError("token must be a text that is hard to guess; got an empty one")
+    for name, value in (("timeout", timeout), ("patience", patience)):
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{name} must be a positive number of seconds; got {value!r}")
+    if not isinstance(retries, int) or isinstance(retries, bool) or retries < 0:
+        raise ValueError(f"retries must be an integer of at least 0; got {retries!r}")
+    if not isinstance(most_bytes, int) or not 1024 <= most_bytes < 2**31:
+        raise ValueError(f"most_bytes must be an integer from 1024 to 2**31 - 1; got {most_bytes}")
+    if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):
+        raise ValueError(
+            f"host {host!r} is open to other machines, and whoever connects answers for the "
+            "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
+        )
+    declared = Declared(signals, dt, length)
+    return Remote(host, port, Rules(token, timeout, retries, patience, most_bytes, declared))
+
+
+def _text(features: Any, seed: int) -> bytes:
+    """A point of a `work` message behind its id."""
+    text = wire.to_text({"seed": int(seed), "features": wire.plain(features)})
+    return text[1:].encode()
+
+
+def _next(batch: Batch, server: Server) -> tuple[int, Outcome]:
+    while True:
+        try:
+            outcome = batch.outcomes.get(timeout=1.0)
+        except queue.Empty:
+            if server.is_alive():
+                continue
+            raise ConnectionError("the server for remote simulators has ended") from None
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+
+def _places(host: str, port: int) -> list[Any]:
+    """What `host` resolves to, each address once; both loopbacks for `localhost`."""
+    found = []
+    for name in BOTH if host == "localhost" else (host,):
+        try:
+            kind = socket.SOCK_STREAM
+            places = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
+        except OSError as error:
+            raise ValueError(f"host {host!r} is no address of this machine: {error}") from error
+        found += [place for place in places if place[4] not in [other[4] for other in found]]
+    return found
+
+
+def _is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address.partition("%")[0]).is_loopback
+
+
+def _listen(host: str, port: int) -> list[socket.socket]:
+    """Sockets at one port, one for each address of the host."""
+    for attempt in range(10):
+        opened: list[socket.socket] = []
+        chosen = port
+        try:
+            for family, kind, _, _, place in _places(host, port):
+                if host == "localhost" and family == socket.AF_INET6 and not _has_ipv6():
+                    continue
+                sock = socket.socket(family, kind)
+                opened.append(sock)
+                # A port is free again at once, not only when its last connections are forgotten.
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                if family == socket.AF_INET6:
+                    sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+                sock.bind((place[0], chosen, *place[2:]))
+                sock.listen(128)
+                chosen = sock.getsockname()[1]
+            return opened
+        except OSError as error:
+            for sock in opened:
+                sock.close()
+            if port == 0 and len(opened) > 1 and attempt < 9:
+                continue  # The other protocol's port of this number is taken; another may not be.
+            raise OSError(
+                error.errno,
+                f"simulators cannot connect at {host!r}, port {port}: {error.strerror}; another "
+                "run may listen there. Give another port, or port=0 for any that is free",
+            ) from error
+    raise AssertionError
+
+
+def _has_ipv6() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6) as sock:
+            sock.bind(("::1", 0))
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,210 @@
+"""One client of the server: what it said of itself, what it has, and what it is owed.
+
+Nothing here waits: what is sent is kept until the socket takes it.
+"""
+
+import hashlib
+import hmac
+import itertools
+import math
+import queue
+import secrets
+import socket
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from verifai_jax.systems.blackbox._blackbox import Declared
+from verifai_jax.systems.remote import wire
+
+GREETING_SECONDS = 10.0
+GREETING_BYTES = 4096  # Before it has proved its token, a client may not fill our memory.
+LINGER_SECONDS = 2.0  # How long a client that is sent away has to read why.
+# Seconds from a point to its result that make a client's window grow, or shrink: enough points wait
+# at a fast one to keep it busy, and none at a slow one while others idle.
+SWIFT, SLOW = 0.05, 0.2
+REMEMBERED = 4096  # Answered points that a client may answer again without being told off.
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a server demands of its clients; see `remote`."""
+
+    token: str | None
+    timeout: float | None
+    retries: int
+    patience: float | None
+    most_bytes: int
+    declared: Declared
+
+
+@dataclass(eq=False)
+class Batch:
+    """The points of one call, whose outcomes go to the caller's thread."""
+
+    outcomes: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
+    cancelled: bool = False
+
+
+@dataclass(eq=False)
+class Point:
+    """One simulation: where its outcome goes, and what has happened to it so far."""
+
+    id: int
+    batch: Batch
+    index: int
+    text: bytes
+    losses: int = 0  # Clients that vanished while they simulated it,
+    lost: float = 0.0  # and when the last one did.
+    handed: float = 0.0
+    ahead: int = 0  # Points that its client had to simulate before.
+
+
+class Client:
+    """One connection."""
+
+    def __init__(self, sock: socket.socket, address: Any) -> None:
+        self.socket = sock
+        self.name = f"{address[0]}:{address[1]}"
+        self.frames = wire.Frames(GREETING_BYTES)
+        self.challenge = secrets.token_hex(16)
+        self.greeted = False
+        self.leaving = False  # It is sent away: what it says is not read any more.
+        self.since = time.monotonic()
+        self.deadline = self.since + GREETING_SECONDS
+        self.out = bytearray()
+        self.writing = False  # Whether the selector waits for room to send.
+        self.capacity = self.parallel = self.window = 1
+        self.has: dict[int, Point] = {}  # In the order in which they were handed out.
+        self.answered: dict[int, None] = {}
+        self.progress = 0.0  # When it last showed that it works.
+        self.faults = 0
+
+    @property
+    def here(self) -> bool:
+        """Whether points may be handed to it."""
+        return self.greeted and not self.leaving
+
+    @property
+    def room(self) -> int:
+        """How many more points it may have now."""
+        return min(self.window, self.capacity) - len(self.has)
+
+    def running(self) -> list[Point]:
+        """The points that it is simulating now, if it goes by their order."""
+        return list(itertools.islice(self.has.values(), self.parallel))
+
+    def hello(self, rules: Rules) -> None:
+        """Tell it what is expected of it."""
+        about = {
+            "type": "hello",
+            "protocol": wire.PROTOCOL,
+            "challenge": None if rules.token is None else self.challenge,
+            "most_bytes": rules.most_bytes,
+            "signals": rules.declared.widths or None,
+            "dt": rules.declared.dt,
+            "length": rules.declared.length,
+        }
+        self.out += wire.frame(about)
+
+    def greet(self, hello: dict[str, Any], rules: Rules) -> None:
+        """Take note of what it says of itself.
+
+        **Raises:** `WireError` for a client that cannot be used, or does not know the token.
+        """
+        if hello.get("protocol") != wire.PROTOCOL:
+            spoken = wire.brief(hello.get("protocol"))
+            raise wire.WireError(f"this server speaks protocol {wire.PROTOCOL}; got {spoken}")
+        self._authenticate(hello, rules.token)
+        for name, most in (("capacity", 10_000), ("parallel", hello.get("capacity", 1))):
+            value = hello.get(name, 1)
+            if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= most:
+                raise wire.WireError(
+                    f"{name} must be an integer from 1 to {most}; got {wire.brief(value)}"
+                )
+            setattr(self, name, value)
+        if isinstance(hello.get("name"), str):
+            self.name = f"{wire.printable(hello['name'])} ({self.name})"
+        self.window = self.parallel
+        self.greeted, self.deadline = True, math.inf
+        self.frames.most = rules.most_bytes
+
+    def _authenticate(self, hello: dict[str, Any], token: str | None) -> None:
+        if token is None:
+            return
+        if "proof" in hello:
+            right = hmac.new(token.encode(), self.challenge.encode(), hashlib.sha256).hexdigest()
+            given = hello["proof"]
+        elif "token" in hello:
+            right, given = token, hello["token"]
+        else:
+            raise wire.WireError("this server needs a token: give it, or a proof of it, in hello")
+        # In constant time, so that nobody learns a token letter by letter.
+        if not isinstance(given, str) or not hmac.compare_digest(
+            given.encode(errors="replace"), right.encode()
+        ):
+            raise wire.WireError("the token is wrong")
+
+    def hand(self, points: list[Point], now: float) -> None:
+        """Give it points to simulate."""
+        for point in points:
+            if not self.has:
+                self.progress = now
+            point.handed, point.ahead = now, len(self.has)
+            self.has[point.id] = point
+        texts = b",".join(point.text for point in points)
+        self.out += wire.frame(b'{"type":"work","points":[' + texts + b"]}")
+
+    def done(self, point: Point, now: float) -> None:
+        """It has answered."""
+        del self.has[point.id]
+        self.answered[point.id] = None
+        if len(self.answered) > REMEMBERED:
+            del self.answered[next(iter(self.answered))]
+        taken = now - point.handed
+        if taken < SWIFT:
+            self.window = min(self.window + 1, self.capacity)
+        elif taken > SLOW:
+            self.window = max(self.window - 1, self.parallel)
+
+    def overdue(self, now: float, timeout: float) -> list[Point]:
+        """Points that it has worked on for longer than that."""
+        running = self.running()
+        if now - self.progress > timeout:
+            # It shows no progress, so all that it is simulating takes too long.
+            return [point for point in running if now - point.handed > timeout]
+        # Others come in meanwhile; each had this long, and those before it as long.
+        return [
+            point
+            for point in running
+            if now - point.handed > timeout * (1 + point.ahead // self.parallel)
+        ]
+
+    def tell(self, message: str, number: int | None = None, fatal: bool = False) -> None:
+        """Send it an error."""
+        about = {"type": "error", "message": message, "id": number, "fatal": fatal}
+        self.out += wire.frame(about)
+
+    def flush(self) -> None:
+        """Send what the socket takes.
+
+        **Raises:** `OSError` if it has vanished.
+        """
+        if self.out:
+            try:
+                sent = self.socket.send(self.out)
+            except (BlockingIOError, InterruptedError):
+                return
+            del self.out[:sent]
+
+
+def keep_alive(sock: socket.socket) -> None:
+    """Let the system notice a peer whose machine is gone, within half a minute."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    # Not every system has each of them.
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3)):
+        if hasattr(socket, name):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 25_000)
