@@ -31,8 +31,7 @@ Training = Callable[[int], tuple[float, float]]
 def ours(task_name: str) -> Training:
     """A training by seed; returns CPU seconds and the mean return of what it learnt."""
     from envs.cartpole import CartPoleTask
-    from verifai_jax.rl import PPO, evaluate
-    from verifai_jax.rl import _train as train
+    from verifai_jax.rl import PPO, evaluate, train
 
     if task_name == "cartpole":
         task: Any = CartPoleTask()

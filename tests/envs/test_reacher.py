@@ -11,8 +11,7 @@ from envs import reacher as rc
 from specs.reacher import reach, reach_with
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.engine import judge
-from verifai_jax.rl import PPO, Continuous, Discrete, Policy, evaluate
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, Continuous, Discrete, Policy, evaluate, train
 from verifai_jax.rl.policy import new_layers
 
 KEY = jax.random.key(2)

@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks.control_tasks import Acrobot, Pendulum
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.rl import PPO, Configuration, Continuous, Discrete, Trainings
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, Configuration, Continuous, Discrete, Trainings, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.algorithms import ALGORITHMS, algorithm_named, fitting
 from verifai_jax.rl.pqn import PQN

@@ -8,8 +8,7 @@ import pytest
 
 from envs import cartpole as cp
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, evaluate
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, evaluate, train
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.rl.task.mjx import mjx_task
 from verifai_jax.rl.task.ode import ode_task

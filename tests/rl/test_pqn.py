@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.rl import Continuous, Discrete, evaluate
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import Continuous, Discrete, evaluate, train
 from verifai_jax.rl.advantage import Ends, advantages
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.pqn import PQN, _exploring, _next_held, q_lambda_targets

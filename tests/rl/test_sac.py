@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verifai_jax.rl import Configuration, Continuous, Discrete, Trainings, evaluate
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import Configuration, Continuous, Discrete, Trainings, evaluate, train
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.replay_buffer import Remembered, draw, empty, remember, split
 from verifai_jax.rl.sac import SAC, _act, _loss, squash_log_prob

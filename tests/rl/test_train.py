@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from envs.cartpole import CartPoleTask
-from verifai_jax.rl import PPO, Continuous, Discrete, Task, evaluate
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, Continuous, Discrete, Task, evaluate, train
 from verifai_jax.rl.observations import Seen, watch
 
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from envs.cartpole import CartPoleTask
-from verifai_jax.rl import PPO
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, train
 from verifai_jax.rl.trainings import Configuration, Trainings
 
 RATES = (1e-3, 3e-3, 1e-2)

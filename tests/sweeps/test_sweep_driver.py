@@ -9,8 +9,7 @@ from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
-from verifai_jax.rl import _train as train
-from verifai_jax.rl import evaluate
+from verifai_jax.rl import evaluate, train
 from verifai_jax.rl.policy_evaluation import nominal_returns
 from verifai_jax.sweeps import _sweep as driver
 from verifai_jax.sweeps import training_runs as lessons

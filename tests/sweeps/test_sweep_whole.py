@@ -7,8 +7,7 @@ import pytest
 import verifai_jax as vj
 from envs.cartpole import CartPoleTask
 from specs.cartpole import balance_with
-from verifai_jax.rl import PPO
-from verifai_jax.rl import _train as train
+from verifai_jax.rl import PPO, train
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import Trainer
 
