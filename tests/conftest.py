@@ -4,7 +4,13 @@ import os
 os.environ.setdefault("VERIFAI_JAX_CACHE", "off")
 
 import matplotlib
+from jaxtyping import install_import_hook
 
 matplotlib.use("Agg")
 
-import verifai_jax  # noqa: F401 - before any test starts JAX's backend, as users should
+CHECKED_ROOMS: list[str] = []
+"""Rooms whose annotations, shapes included, are checked at run time in tests."""
+
+install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "beartype.beartype")
+
+import verifai_jax  # noqa: E402, F401 - before any test starts JAX's backend, as users should
