@@ -126,7 +126,8 @@ def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
     monkeypatch.setattr(programs, "_one_by_one", lambda devices: False)
     monkeypatch.setattr(programs, "MOST_BLOCKS", 4)
     other = certify(
-        lambda policy: problem_of(policy), POLICIES, p=0.1, samples=128, seed=3, attack=0
+        lambda policy: problem_of(policy), POLICIES, p=0.1, samples=128, seed=3,
+        attack_simulations=0,
     )  # fmt: skip
     columns = ["failures", "not_finite"]
     first = other.table()[columns][other.table()["simulations"] == 128]
@@ -169,7 +170,7 @@ def test_a_digest_is_of_numbers_and_structure():
 
 def test_at_exactly_zero_the_comparator_decides():
     zero = [jax.tree.map(np.zeros_like, threshold(0.0))]
-    only = {"samples": 64, "budget": 64, "attack": 0}
+    only = {"samples": 64, "budget": 64, "attack_simulations": 0}
     assert certify(problem_of, zero, **only)[0].failures == 0
 
     def strictly(policy):
@@ -184,7 +185,9 @@ def test_without_a_verdict_is_no_pass():
     def problem_of(policy):
         return vj.Problem("nan", X, simulated(policy, 0.75), "always y <= 0")
 
-    found = certify(problem_of, [threshold(2.0), threshold(0.5)], samples=256, attack=0, p=0.1)
+    found = certify(
+        problem_of, [threshold(2.0), threshold(0.5)], samples=256, attack_simulations=0, p=0.1
+    )
     for row in found.rows:
         assert 256 * 0.15 < row.not_finite < row.simulations * 0.35
         assert row.rate.failures == row.failures + row.not_finite
@@ -230,7 +233,7 @@ def outside(policy):
 
 def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
     some = [POLICIES[2]]
-    options = {"p": 0.05, "samples": 64, "budget": 64, "attack": 64}
+    options = {"p": 0.05, "samples": 64, "budget": 64, "attack_simulations": 64}
     expected = certify(problem_of, some, **options).table()
     for make, told in [(untraceable, "compiled one by one: policy 0; JAX"), (outside, None)]:
         found = certify(make, some, **options)
@@ -239,7 +242,7 @@ def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
 
 
 def test_what_a_black_box_raises_is_told():
-    found = certify(outside, [POLICIES[1]], p=0.05, samples=64, budget=64, attack=0)
+    found = certify(outside, [POLICIES[1]], p=0.05, samples=64, budget=64, attack_simulations=0)
     assert 0 < found[0].not_finite < 20
     assert found.notes == ("a simulation of policy 0 raised RuntimeError: out of the world",)
 
@@ -261,7 +264,7 @@ def test_interrupted_it_says_what_is_known():
 def test_progress_counts_simulations():
     seen = []
     found = certify(
-        problem_of, POLICIES[:2], p=0.1, samples=128, attack=64,
+        problem_of, POLICIES[:2], p=0.1, samples=128, attack_simulations=64,
         progress=lambda done, total, text: seen.append((done, total, text)),
     )  # fmt: skip
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
@@ -287,10 +290,13 @@ def test_it_reads_well(certificates):
         ({"confidence": 95}, "confidence must lie between 0 and 1; got 95"),
         ({"samples": 0}, "samples must be an integer of at least 1; got 0"),
         ({"seed": -1}, "seed must be an integer of at least 0; got -1"),
-        ({"attack": 1.5}, "attack must be an integer of at least 0; got 1.5"),
+        (
+            {"attack_simulations": 1.5},
+            "attack_simulations must be an integer of at least 0; got 1.5",
+        ),
         ({"budget": 100}, "5 policies with 512 samples each need a budget of at least 2560"),
-        ({"search": "gradient"}, "search 'gradient' follows slopes"),
-        ({"search": "portfolio"}, "use one of uniform, halton"),
+        ({"attack": "gradient"}, "attack 'gradient' follows gradients"),
+        ({"attack": "portfolio"}, "use one of uniform, halton"),
         ({"tie": 2}, "tie must lie between 0 and 1; got 2"),
     ],
 )
@@ -303,7 +309,7 @@ def test_misspelt_names_get_the_nearest():
     with pytest.raises(UnknownNameError, match="did you mean 'confidence'"):
         certify(problem_of, POLICIES, confidance=0.9)
     with pytest.raises(UnknownNameError, match="did you mean 'cross_entropy'"):
-        certify(problem_of, POLICIES, search="cross_entopy")
+        certify(problem_of, POLICIES, attack="cross_entopy")
 
 
 def test_problems_that_do_not_fit():

@@ -373,8 +373,8 @@ def test_options_are_refused_first(monkeypatch):
         ({"halving": 3}, TypeError, "halving must be a Halving; got 3"),
         ({"sampels": 3}, UnknownNameError, "did you mean 'samples'"),
         ({"seed": -1}, ValueError, "seed must be a whole number of at least 0; got -1"),
-        ({"attacker": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
-        ({"attacker": "gradient"}, ValueError, "follows slopes"),
+        ({"attack": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
+        ({"attack": "gradient"}, ValueError, "follows gradients"),
     ):
         with pytest.raises(error, match=told):
             sweep(drifting(), **how)

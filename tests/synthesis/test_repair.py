@@ -133,7 +133,7 @@ def test_a_black_box():
         return vj.Trace({"x": x, "u": features["k"] * x}, dt=0.1)
 
     problem = dataclasses.replace(first_order, system=vj.blackbox(simulate))
-    result = repair(problem, ["k"], 1200, search="halton", held_out=100)
+    result = repair(problem, ["k"], 1200, attack="halton", held_out=100)
     assert result.repaired
     assert BOUNDARY <= result.parameters["k"] <= 1.15 * BOUNDARY
 
@@ -184,11 +184,11 @@ def test_a_simulation_without_a_verdict_is_no_repair():
         "always x >= 0",
         nominal={"k": 0.2, "e": 0.5},
     )
-    result = repair(problem, ["k"], 600, search="halton", gradient=False, held_out=50)
+    result = repair(problem, ["k"], 600, attack="halton", gradient=False, held_out=50)
     assert not result.repaired
     assert result.parameters == {"k": 0.2}
     assert "gave no verdict" in str(result)
-    options = {"search": "halton", "gradient": False, "held_out": 50}
+    options = {"attack": "halton", "gradient": False, "held_out": 50}
     started = repair(problem, ["k"], 600, nominal={"k": 0.8}, **options)
     assert started.stopped == "no verdict"
     assert "none of 50 held-out environments gave a verdict" in str(started)

@@ -157,7 +157,7 @@ def test_a_black_box_with_a_choice_and_simulations_that_raise():
         vj.blackbox(black_box),
         "always (abs(x) <= 1 & abs(u) <= 1.8)",
     )
-    result = synthesize(problem, ["gain", "direction"], 2000, search="halton", held_out=100)
+    result = synthesize(problem, ["gain", "direction"], 2000, attack="halton", held_out=100)
     assert result.parameters["direction"] == "back"
     assert margin_of(result.parameters["gain"]) == pytest.approx(BEST, abs=0.05)
     assert result.without_verdict > 0
@@ -182,7 +182,7 @@ def test_exactly_zero_is_decided_by_the_comparator():
 
     for formula, holds in (("always x >= 0", True), ("always x > 0", False)):
         problem = vj.Problem("zero", {"k": vj.Box(0, 1), "e": vj.Box(0, 1)}, system, formula)
-        result = synthesize(problem, ["k"], 300, search="halton", gradient=False, held_out=50)
+        result = synthesize(problem, ["k"], 300, attack="halton", gradient=False, held_out=50)
         assert result.holds is holds
         assert result.held_out.failures == (0 if holds else 50)
 
@@ -240,8 +240,8 @@ def test_parameters_of_every_kind_can_be_held():
         ({"margin": -1.0}, "margin must be a robustness of at least 0; got -1.0"),
         ({"environments": 0}, "environments must be an integer of at least 1; got 0"),
         ({"held_out": -1}, "held_out must be an integer of at least 0; got -1"),
-        ({"parameters": "k", "search": "halten"}, "did you mean 'halton'"),
-        ({"parameters": "k", "search": "gradient", "gradient": False}, "needs gradients"),
+        ({"parameters": "k", "attack": "halten"}, "did you mean 'halton'"),
+        ({"parameters": "k", "attack": "gradient", "gradient": False}, "needs gradients"),
     ],
 )
 def test_bad_input(options, message):

@@ -45,8 +45,8 @@ def certify(
     samples: int = 512,
     seed: int = 0,
     budget: int | None = None,
-    search: str | Search = "cross_entropy",
-    attack: int = 256,
+    attack: str | Search = "cross_entropy",
+    attack_simulations: int = 256,
     tie: float | None = None,
     remember: Remember | None = None,
     progress: ProgressReport | None = None,
@@ -67,8 +67,9 @@ def certify(
       stream than a training with this seed.
     - `budget`: samples of all policies together; four times the least number when left out. What
       is beyond the least goes to policies whose verdict is open, and to the possibly safest.
-    - `search`, `attack`: what looks for failures first, and in how many simulations of each
-      policy, rounded up to blocks; 0 for no attack. What it finds is in no rate.
+    - `attack`: the search that looks for failures first; the failures that it finds enter no rate.
+    - `attack_simulations`: simulations of each policy in the attack, rounded up to whole blocks; 0
+      for no attack.
     - `tie`: failure rates that differ by less count as equally safe. When left out, `p / 10` or
       less: as fine as takes about as many samples again as all policies have at least.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
@@ -85,14 +86,14 @@ def certify(
     """
     started = time.perf_counter()
     policies = list(policies)
-    budget = _check(policies, p, confidence, samples, seed, budget, attack, tie)
+    budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
     lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
     enable_compile_cache()  # Before the search compiles, too.
     pieces = Pieces(
         problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
     )
-    attacker = usable_search(pieces.problem, search)
-    rounds = -(-attack // lanes)
+    attacker = usable_search(pieces.problem, attack)
+    rounds = -(-attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
@@ -247,7 +248,7 @@ def _check(
     samples: int,
     seed: int,
     budget: int | None,
-    attack: int,
+    attack_simulations: int,
     tie: float | None,
 ) -> int:
     """Refuse what makes no sense; returns the budget."""
@@ -256,7 +257,11 @@ def _check(
     for name, value in (("p", p), ("confidence", confidence)):
         if not 0 < value < 1:
             raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
-    for name, value, least in (("samples", samples, 1), ("seed", seed, 0), ("attack", attack, 0)):
+    for name, value, least in (
+        ("samples", samples, 1),
+        ("seed", seed, 0),
+        ("attack_simulations", attack_simulations, 0),
+    ):
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         if not whole or value < least:
             raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")

@@ -54,13 +54,13 @@ def usable_search(problem: Problem, search: str | Search) -> Search:
     """The search, if it can attack many policies.
 
     **Raises:** `ValueError` for an unknown name, one that the space does not suit, or one that
-    follows slopes; `TypeError` for what is no search.
+    follows gradients; `TypeError` for what is no search.
     """
     found = searches.named(search) if isinstance(search, str) else search
     if isinstance(found, Search) and (found.wants_gradient or found.wants_clauses):
         known = (name for name in searches.names() if not _slopes(name))
         raise ValueError(
-            f"search {search!r} follows slopes, which the attack on many policies does without; "
+            f"attack {search!r} follows gradients, which are not computed for many policies at once; "
             f"use one of {', '.join(known)}"
         )
     return check_search(problem, found)

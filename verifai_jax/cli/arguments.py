@@ -81,7 +81,7 @@ CHOOSING = together(
             "--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."
         ),
         click.option(
-            "--search", default="cross_entropy", show_default=True, help="Attacks the choice."
+            "--attack", default="cross_entropy", show_default=True, help="Search that attacks."
         ),
         click.option(
             "--held-out", type=int, default=2000, show_default=True, help="Fresh environments."

@@ -15,7 +15,7 @@ _FIXED = (
     "confidence",
     "budget",
     "attack",
-    "attacker",
+    "attack_simulations",
     "reduction",
     "by",
     "only",
@@ -33,8 +33,8 @@ _SHOWN = 12
 @click.option("--samples", type=int, help="Simulations of a policy at most  [default: 512]")
 @click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
 @click.option("--budget", type=int, help="Simulations of the certification in all.")
-@click.option("--attack", type=int, help="Simulations of each policy's attack  [default: 256]")
-@click.option("--attacker", help="Search that attacks  [default: cross_entropy]")
+@click.option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
+@click.option("--attack-simulations", type=int, help="Of each policy's attack  [default: 256]")
 @click.option("--halving", "reduction", type=float, help="Of so many configurations one goes on.")
 @click.option("--halving-by", "by", help="return or safety  [default: return]")
 @click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
@@ -122,7 +122,7 @@ def _understood(asked: dict[str, Any], options: tuple[str, ...]) -> dict[str, An
 
     how = {
         name: asked[name]
-        for name in ("seed", "samples", "confidence", "budget", "attack", "attacker")
+        for name in ("seed", "samples", "confidence", "budget", "attack", "attack_simulations")
         if asked[name] is not None
     }
     search, given = asked["search"] or "halton", plain_values("--set", options)

@@ -19,6 +19,7 @@ from verifai_jax._version import __version__
 from verifai_jax.certification.attack import usable_search
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.policy_evaluation import EPISODES, each_return
+from verifai_jax.search import Search
 from verifai_jax.sweeps.cache import Store
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, OutOfTime, Watch
 from verifai_jax.sweeps.fingerprint import describe
@@ -48,8 +49,8 @@ def sweep(
     samples: int = 512,
     confidence: float = 0.95,
     budget: int | None = None,
-    attack: int = 256,
-    attacker: Any = "cross_entropy",
+    attack: str | Search = "cross_entropy",
+    attack_simulations: int = 256,
     halving: Halving | None = None,
     batch: int | None = None,
     episodes: int = EPISODES,
@@ -73,8 +74,8 @@ def sweep(
     - `seed`: of the search and of the samples; training seeds are the study's.
     - `samples`, `confidence`, `budget`: of the certification: samples of each policy at least,
       confidence of all verdicts together, and samples in all; see `certify`.
-    - `attack`, `attacker`: simulations of each policy in which this search tries to refute it
-      first; what it finds is in no rate.
+    - `attack`, `attack_simulations`: the search that tries to make each policy fail first, and its
+      simulations of each policy; the failures that it finds enter no rate.
     - `halving`: stop all but the best at each snapshot.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: over which the nominal return is a mean.
@@ -95,14 +96,14 @@ def sweep(
         samples=samples,
         confidence=confidence,
         budget=budget,
-        attack=attack,
+        attack_simulations=attack_simulations,
         halving=halving,
         batch=batch,
         episodes=episodes,
         max_seconds=max_seconds,
     )
     study.check()
-    usable_search(study.untrained_problem(), attacker)
+    usable_search(study.untrained_problem(), attack)
     asker = asker_for(search, study.space, configurations=configurations, seed=seed, batch=batch)
     options = {
         "search": asker.described(),
@@ -110,8 +111,8 @@ def sweep(
         "samples": samples,
         "confidence": confidence,
         "budget": budget,
-        "attack": attack,
-        "attacker": attacker if isinstance(attacker, str) else repr(attacker),
+        "attack": attack if isinstance(attack, str) else repr(attack),
+        "attack_simulations": attack_simulations,
         "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
         "episodes": episodes,
     }
@@ -124,7 +125,7 @@ def sweep(
             memory.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
-        sweeping = _Sweeping(study, options, memory, watch, halving, attacker)
+        sweeping = _Sweeping(study, options, memory, watch, halving, attack)
         return Sweep(sweeping.run(asker), study)
 
 
@@ -146,7 +147,7 @@ class _Sweeping:
     store: Store
     watch: Watch
     halving: Halving | None
-    attacker: Any
+    attack: str | Search
     lessons: Lessons = field(init=False)
     found: list[_Configuration] = field(default_factory=list)
     known: dict[str, int] = field(default_factory=dict)
@@ -305,7 +306,7 @@ class _Sweeping:
                 samples=samples,
                 budget=samples * len(policies),
                 seed=seed,
-                attack=min(QUICK, self.options["attack"]),
+                attack_simulations=min(QUICK, self.options["attack_simulations"]),
                 progress=None,
             )
             if getattr(quick.certificates, "stopped", "") == "interrupted":
@@ -346,7 +347,7 @@ class _Sweeping:
                 samples=self.options["samples"],
                 budget=self.options["budget"],
                 seed=self.options["seed"],
-                attack=self.options["attack"],
+                attack_simulations=self.options["attack_simulations"],
                 progress=self.watch.told,
             )
         self.judged = dict(zip(places, made.policies, strict=True))
@@ -366,7 +367,7 @@ class _Sweeping:
             policies,
             p=self.study.p,
             confidence=self.options["confidence"],
-            attacker=self.attacker,
+            attack=self.attack,
             remember=remember,
             **how,
         )

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
+from verifai_jax.search import Search
 
 QUICK = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses;
@@ -47,8 +48,8 @@ def certify_policies(
     samples: int,
     seed: int,
     budget: int | None,
-    attack: int,
-    attacker: Any,
+    attack: str | Search,
+    attack_simulations: int,
     remember: Callable[[str, Callable[[], Any]], Any],
     progress: Callable[[int, int, str], None] | None,
 ) -> Judgement:
@@ -63,8 +64,8 @@ def certify_policies(
         samples=samples,
         seed=seed,
         budget=budget,
-        search=attacker,
         attack=attack,
+        attack_simulations=attack_simulations,
         remember=remember,
         progress=progress,
     )

@@ -15,7 +15,7 @@ def check_asked(
     samples: int,
     confidence: float,
     budget: int | None,
-    attack: int,
+    attack_simulations: int,
     halving: Any,
     batch: int | None,
     episodes: int,
@@ -34,7 +34,7 @@ def check_asked(
         counts["batch"] = batch
     for name, value in counts.items():
         _check_count(name, value, 1)
-    for name, value in {"seed": seed, "attack": attack}.items():
+    for name, value in {"seed": seed, "attack_simulations": attack_simulations}.items():
         _check_count(name, value, 0)
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")

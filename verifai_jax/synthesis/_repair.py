@@ -58,7 +58,7 @@ def repair(
     *,
     nominal: Mapping[str, Any] | None = None,
     system_of: Callable[[Any], Any] | None = None,
-    search: str | Search = "cross_entropy",
+    attack: str | Search = "cross_entropy",
     margin: float = 0.0,
     rounds: int = 30,
     held_out: int = 2000,
@@ -78,7 +78,7 @@ def repair(
     - `budget`: simulations at most, the check not counted.
     - `nominal`: values of the parameters to start from; the problem's own when left out.
     - `system_of(parameters) -> system`: pure, and traced by JAX. All features are the environment.
-    - `search`: attacks the parameters, over the environment.
+    - `attack`: the search over the environment that attacks the parameters.
     - `margin`: robustness that is wanted.
     - `rounds`: turns of attack and repair at most.
     - `held_out`: fresh environments for the failure rates before and after; 0 for no check.
@@ -108,7 +108,7 @@ def repair(
         loop, start = _features(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
-    search = attacker(whole, search, loop)
+    search = attacker(whole, attack, loop)
     limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
     work = _Repair(loop, start, search, limits, margin, seed)
     try:

@@ -64,7 +64,7 @@ def synthesize(
     parameters: Sequence[str] | str | None = None,
     budget: int = 10_000,
     *,
-    search: str | Search = "cross_entropy",
+    attack: str | Search = "cross_entropy",
     margin: float = 0.0,
     environments: int = 16,
     held_out: int = 2000,
@@ -82,7 +82,7 @@ def synthesize(
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
     - `budget`: simulations at most, the check not counted.
-    - `search`: attacks the parameters, over the environment.
+    - `attack`: the search over the environment that attacks the parameters.
     - `margin`: robustness that is wanted.
     - `environments`: in the set at first.
     - `held_out`: fresh environments in which the result is checked; 0 for no check.
@@ -100,7 +100,7 @@ def synthesize(
     check_options(budget, batch, seed, max_seconds, None)
     check_numbers(margin, environments=environments, held_out=held_out)
     loop = feature_loop(problem, parameters, gradient, batch, budget, precision, backend, seed)
-    search = attacker(problem, search, loop)
+    search = attacker(problem, attack, loop)
     limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
     work = _Search(loop, search, limits, margin, environments, seed)
     try:
@@ -404,12 +404,13 @@ def attacker(problem: Problem, search: Any, loop: Any) -> Search:
 
     checked = check_search(problem, search) if loop.problem.black_box else search
     if not isinstance(checked, Search):
-        raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
+        raise TypeError(f"attack must be a name or a search like CrossEntropy(); got {search!r}")
     checked.check(loop.environment.cube)
     clauses = bool(getattr(checked, "wants_clauses", False))
     if clauses or (checked.wants_gradient and not loop.differentiable):
         raise ValueError(
-            f"search {checked!r} needs gradients that an attack does not have; use one that does "
-            "not, such as 'cross_entropy': its worst environments are followed downhill anyway"
+            f"attack {checked!r} needs gradients that are not available here; use a search that "
+            "needs none, such as 'cross_entropy', whose worst environments are followed downhill "
+            "anyway"
         )
     return checked
