@@ -17,6 +17,8 @@ from verifai_jax.analysis.data.cells import cut, occupied
 from verifai_jax.analysis.data.marginals import Marginal, marginals
 from verifai_jax.analysis.data.samples import Samples, whole
 from verifai_jax.analysis.holes import MOST_TREE, alike, largest_hole
+from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_features
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,16 +68,12 @@ class Coverage:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw how often each cell is occupied, and the least occupied pair; returns the figure."""
-        from verifai_jax.plotting.coverage import plot_coverage
-
-        return plot_coverage(self, path)
+        return late("verifai_jax.plotting.coverage", "plot_coverage")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
 
     def __str__(self) -> str:
-        from verifai_jax.core.text import format_features
-
         expected = "expected_pairs" if len(self.table) > 1 else "expected"
         what = "pairs of cells" if len(self.table) > 1 else "cells"
         share, uniform = self.occupied, float(np.nanmean(self.table[expected].to_numpy(float)))

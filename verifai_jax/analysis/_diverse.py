@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, distances, whole
+from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
-from verifai_jax.plotting.rows import draw_rows, two_columns
-from verifai_jax.plotting.style import FAILING, new_figure, show_or_save, tidy
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -52,27 +51,7 @@ class Diverse:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the rows among all, in their order, and the distances; returns the figure."""
-        figure = new_figure(figsize=(8.6, 4.0))
-        cloud, curve = figure.subplots(1, 2, width_ratios=(1.4, 1))
-        across, up = two_columns(self.samples)
-        drawn = draw_rows(
-            cloud, self.samples, self.rows, FAILING, f"{len(self.rows)} chosen", (across, up)
-        )
-        for i, (x, y) in enumerate(drawn[:12]):
-            if np.isfinite(x) and np.isfinite(y):
-                place = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
-                cloud.annotate(str(i + 1), (x, y), **place)
-        curve.plot(
-            np.arange(2, len(self.rows) + 1), self.distances[1:], "o-", color=FAILING, markersize=3
-        )
-        curve.set_ylim(bottom=0)
-        curve.set_xlabel("rows chosen")
-        curve.set_ylabel("distance of the last from those before")
-        curve.xaxis.get_major_locator().set_params(integer=True)
-        for axes in (cloud, curve):
-            tidy(axes)
-        figure.suptitle(f"{len(self.rows)} diverse rows, {self.samples.kind}", fontsize=10)
-        return show_or_save(figure, path)
+        return late("verifai_jax.plotting.diverse", "plot_diverse")(self, path)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.samples import Samples, whole
+from verifai_jax.core.lazy import late
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,10 +33,11 @@ MOST_ENTRIES = 4_000_000
 TREES = 60
 LEAST = {"failing": 0.65, "rho": 0.2}
 """Scores on held-out rows below which the importances mean nothing."""
+NAMES = {"failing": "failing", "rho": "robustness"}
+"""Targets of the models, as a person calls them."""
 SCORES = {"failing": "AUC", "rho": "R^2"}
 LEAST_LOSS = 0.01
 MOST_NAMED = 6
-MOST_SHOWN = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,23 +67,14 @@ class Importance:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the losses as bars; returns the figure."""
-        from verifai_jax.plotting.bars import plot_bars
-
-        columns = {target: f"{_WHAT[target]} ({self._score(target)})" for target in self.scores}
-        title = f"importance of the features of {self.name}"
-        weak = [target for target in self.scores if not self.trusted(target)]
-        if weak:
-            what = " and of ".join(_WHAT[target] for target in weak)
-            title += f"\nmeaningless for {what}: the model does not predict"
-        shown = self.table.head(MOST_SHOWN)
-        return plot_bars(shown, columns, title, "loss of score when shuffled", path)
+        return late("verifai_jax.plotting.bars", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
 
     def __str__(self) -> str:
         lines = []
-        for target, what in _WHAT.items():
+        for target, what in NAMES.items():
             if target in self.missing:
                 lines.append(f"{what}: {self.missing[target]}")
                 continue
@@ -91,19 +84,17 @@ class Importance:
                 f"{self.table.index[i]} ({losses[i]:.2f})" for i in order[:MOST_NAMED]
             )
             if self.trusted(target):
-                lines.append(f"{what} depends on {listed}; {self._score(target)}")
+                lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
             else:
                 lines.append(
                     f"{what}: importances mean nothing, a model from these rows does not predict "
-                    f"others ({self._score(target)})"
+                    f"others ({self.score_words(target)})"
                 )
         return "\n".join(lines)
 
-    def _score(self, target: str) -> str:
+    def score_words(self, target: str) -> str:
+        """Write the score of the model of `"failing"` or `"rho"`."""
         return f"{SCORES[target]} {self.scores[target]:.2f} on rows kept aside"
-
-
-_WHAT = {"failing": "failing", "rho": "robustness"}
 
 
 def importance(
@@ -148,7 +139,7 @@ def importance(
         mean, spread = losses.mean(axis=1), 2 * losses.std(axis=1, ddof=1)
         columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
     if not scores:
-        reasons = "; ".join(f"{_WHAT[target]}: {reason}" for target, reason in missing.items())
+        reasons = "; ".join(f"{NAMES[target]}: {reason}" for target, reason in missing.items())
         raise ValueError(f"no importance can be learned from {samples.name!r}: {reasons}")
     import pandas as pd
 

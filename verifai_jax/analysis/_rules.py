@@ -19,6 +19,7 @@ from verifai_jax.analysis.conditions import Condition, Region, everywhere
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, whole
 from verifai_jax.analysis.trees import proposals
+from verifai_jax.core.lazy import late
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -106,9 +107,7 @@ class Rules:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the rules over the two features that they use most; returns the figure."""
-        from verifai_jax.plotting.panels import plot_rules
-
-        return plot_rules(self, path)
+        return late("verifai_jax.plotting.panels", "plot_rules")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

@@ -24,16 +24,14 @@ from jaxtyping import Bool, Int
 
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples, Which, whole
+from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
-from verifai_jax.plotting.rows import shortened
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MOST_COMBINATIONS = 50_000
-BARS = 16
 
 
 @dataclass(frozen=True)
@@ -129,7 +127,7 @@ class Recurrent:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the shares of the most telling combinations, and what was expected; the figure."""
-        return _plot(self, path)
+        return late("verifai_jax.plotting.frequent_patterns", "plot_frequent_patterns")(self, path)
 
     def __str__(self) -> str:
         sizes = [len(one) for one in self.combinations]
@@ -330,39 +328,3 @@ def _cells(
 
 def _number(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
-
-
-def _plot(found: Recurrent, path: str | Path | None) -> Any:
-    compared = found.against != "nothing"
-    shown = found.telling.head(BARS).sort_values("share", ascending=False, kind="stable")
-    longest = max((len(text) for text in shown["combination"]), default=0)
-    figure = new_figure(figsize=(5.2 + 0.055 * min(longest, 60), 1.5 + 0.34 * max(2, len(shown))))
-    axes = figure.subplots()
-    place = np.arange(len(shown))
-    color = SAFE if found.samples.which == "safe" else FAILING
-    axes.barh(place, shown["share"], 0.66, color=color, label="share of the rows looked at")
-    if compared:
-        axes.plot(
-            shown["expected"],
-            place,
-            linestyle="",
-            marker="|",
-            markersize=13,
-            markeredgewidth=2.2,
-            color=BOUND,
-            label="of all rows" if found.against == "table" else "in the prior",
-        )
-        rows: Any = shown.itertuples()
-        for y, row in zip(place, rows, strict=True):
-            if np.isfinite(row.lift):
-                right = max(row.share, row.expected)
-                axes.text(right + 0.015, y, f"{row.lift:.2f}x", va="center", fontsize=8)
-    axes.set_yticks(place, [shortened(text) for text in shown["combination"]])
-    axes.invert_yaxis()
-    axes.set_xlim(0, min(1.1, 1.15 * max(shown[["share", "expected"]].max().max(), 0.05)))
-    axes.set_xlabel("share")
-    tidy(axes)
-    axes.grid(visible=False, axis="y")
-    figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
-    figure.suptitle(f"Recurrent values, {found.samples.kind}", fontsize=10)
-    return show_or_save(figure, path)

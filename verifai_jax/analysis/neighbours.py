@@ -28,9 +28,8 @@ from verifai_jax.analysis.data.samples import (
 )
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
-from verifai_jax.plotting.rows import draw_rows
-from verifai_jax.plotting.style import BOUND, new_figure, show_or_save, tidy
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -62,12 +61,7 @@ class Neighbours:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the rows among the others, over the two features that vary most; the figure."""
-        figure = new_figure(figsize=(5.2, 4.2))
-        axes = figure.subplots()
-        draw_rows(axes, self.samples, self.rows, color=BOUND, label=f"{len(self.rows)} rows")
-        tidy(axes)
-        figure.suptitle(f"{self.how}, {self.samples.kind}", fontsize=10)
-        return show_or_save(figure, path)
+        return late("verifai_jax.plotting.neighbours", "plot_neighbours")(self, path)
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -23,6 +23,7 @@ from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.frequent_patterns import recurrent
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features
 from verifai_jax.falsification.run import Run
 
@@ -101,9 +102,7 @@ class Analysis:
 
         With the boxes of the rules, the representatives of clusters, and the importances as bars.
         """
-        from verifai_jax.plotting.overview import plot_overview
-
-        return plot_overview(self, path)
+        return late("verifai_jax.plotting.overview", "plot_overview")(self, path)
 
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; returns the report.

@@ -2,14 +2,24 @@
 
 import functools
 import io
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    # Importing matplotlib takes longer than importing everything else here.
+    Axes = Figure = object
 
 
-def new_figure(**options: Any) -> Any:
-    """A `matplotlib.figure.Figure`: nothing pops up, and nothing has to be closed.
+def new_figure(**options: Any) -> Figure:
+    """Return an empty figure: nothing pops up, and nothing has to be closed.
 
-    Takes the options of `Figure`. As the last value of a notebook cell it is drawn, with or
-    without `%matplotlib inline`.
+    As the last value of a notebook cell it is drawn, with or without `%matplotlib inline`.
+
+    **Arguments:**
+
+    - `options`: those of `matplotlib.figure.Figure`.
     """
     return _figure_class()(**options)
 

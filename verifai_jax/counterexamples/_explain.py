@@ -18,9 +18,11 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.lazy import late
 from verifai_jax.counterexamples.candidates import Judge
-from verifai_jax.counterexamples.description import Span, paragraph, spans_of
+from verifai_jax.counterexamples.description import describe
 from verifai_jax.counterexamples.fixed_key import with_key_of
+from verifai_jax.counterexamples.influence import Influence, spans_of
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.counterexamples.selection import problem_of, row_of
 from verifai_jax.falsification.run import Replay, Run, replay
@@ -28,31 +30,6 @@ from verifai_jax.mtl import Explanation
 
 MATTERS = 0.05
 """Share of the greatest influence below which a feature does not matter."""
-
-
-@dataclass(frozen=True)
-class Influence:
-    """What one feature has to do with a failure.
-
-    **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
-    when each coordinate acts, for the control points of a signal, else None; `reverted`: the
-    robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
-    back; `slope` `[k]`: change of the smooth robustness over the whole range of each coordinate, as
-    seen from the row. What is not known is NaN. `gone`: whether the failure vanishes with the whole
-    feature back.
-    """
-
-    name: str
-    coordinates: tuple[str, ...]
-    value: tuple[Any, ...]
-    nominal: tuple[Any, ...]
-    spans: tuple[Span, ...] | None
-    reverted: float
-    gone: bool
-    departs: bool
-    each: Float[np.ndarray, " k"]
-    each_gone: tuple[bool, ...]
-    slope: Float[np.ndarray, " k"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +52,7 @@ class Explained:
 
     def effect(self, influence: Influence) -> float:
         """By how much a feature moves the robustness: back at nominal, or else by its slope."""
-        if np.isfinite(influence.reverted):
-            return influence.reverted - self.rho
-        return float(np.nan_to_num(np.abs(influence.slope)).max(initial=0.0))
+        return influence.effect(self.rho)
 
     @property
     def matter(self) -> tuple[Influence, ...]:
@@ -89,12 +64,13 @@ class Explained:
 
     def plot(self, path: Any = None) -> Any:
         """Draw the deciding signal with its bound and instant, and the features; the figure."""
-        from verifai_jax.plotting.counterexamples import draw_explained
-
-        return draw_explained(self, path)
+        return late("verifai_jax.plotting.counterexamples", "plot_explanation")(self, path)
 
     def __str__(self) -> str:
-        return paragraph(self)
+        name = self.replay.problem.name
+        return describe(
+            name, self.row, self.why, self.rho, self.influences, self.matter, self.notes
+        )
 
     __repr__ = __str__
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.lazy import late
 from verifai_jax.counterexamples.candidates import Judge
 from verifai_jax.counterexamples.fixed_key import with_key_of
 from verifai_jax.counterexamples.minimize_count import fewest, grown, reduced
@@ -88,9 +89,7 @@ class Shrunk:
 
     def plot(self, path: Any = None) -> Any:
         """Draw what departs, and the signals of the simulation; returns the figure."""
-        from verifai_jax.plotting.counterexamples import draw_shrunk
-
-        return draw_shrunk(self, path)
+        return late("verifai_jax.plotting.counterexamples", "plot_shrunk")(self, path)
 
     def __str__(self) -> str:
         d = len(self.u)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
@@ -76,9 +77,7 @@ class Replay:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the signals with the violated bound and instant marked; returns the figure."""
-        from verifai_jax.plotting import plot_replay
-
-        return plot_replay(self, path)
+        return late("verifai_jax.plotting.replay", "plot_replay")(self, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +185,7 @@ class Run:
 
     def analyze(self, **options: Any) -> Any:
         """What the table says: rules, importance, clusters, coverage; see `analysis.analyze`."""
-        from verifai_jax.analysis import analyze
-
-        return analyze(self, **options)
+        return late("verifai_jax.analysis.overview", "analyze")(self, **options)
 
     def replay(
         self, row: "int | pd.Series | Mapping[str, Any]", precision: str | None = None
@@ -223,9 +220,7 @@ class Run:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
-        from verifai_jax.plotting import plot_features
-
-        return plot_features(self, path)
+        return late("verifai_jax.plotting.scatter", "plot_features")(self, path)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder."""

@@ -1,31 +1,88 @@
-"""Influence of features as a picture: bars with intervals, and strength against irregularity."""
+"""Influence of features: bars with intervals, and size of effects against their irregularity."""
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
+from verifai_jax.analysis._importance import NAMES, Importance
+from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
+from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.plotting.style import BOUND, FAILING, new_figure, show_or_save, tidy
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SECOND = "#8d99ae"
 """Colour of what is shown next to failures and to total influence."""
+MOST_IMPORTANCES = 15
+MOST_SENSITIVITIES = 20
+
+
+def plot_importance(importance: Importance, path: str | Path | None = None) -> Figure:
+    """Draw the losses of the models' scores as bars.
+
+    **Arguments:**
+
+    - `importance`: what `analysis.importance` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
+    columns = {
+        target: f"{NAMES[target]} ({importance.score_words(target)})"
+        for target in importance.scores
+    }
+    title = f"importance of the features of {importance.name}"
+    weak = [target for target in importance.scores if not importance.trusted(target)]
+    if weak:
+        what = " and of ".join(NAMES[target] for target in weak)
+        title += f"\nmeaningless for {what}: the model does not predict"
+    shown = importance.table.head(MOST_IMPORTANCES)
+    return plot_bars(shown, columns, title, "loss of score when shuffled", path)
+
+
+def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -> Figure:
+    """Draw sensitivity indices with their intervals.
+
+    **Arguments:**
+
+    - `sensitivity`: what `analysis.sobol_indices`, `morris` or `gradient_sensitivity` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
+    shown = sensitivity.table.head(MOST_SENSITIVITIES)
+    title = (
+        f"{sensitivity.method} of {sensitivity.problem}, {sensitivity.simulations:,} simulations"
+    )
+    if "mu_star" in shown:
+        return plot_effects(shown, title, path)
+    if "total" in shown:
+        columns = {"total": "in all", "first": "alone"}
+        return plot_bars(shown, columns, title, "share of the variance", path)
+    # Above 1 a bound says nothing; at its own length it would hide those that do.
+    shown = shown.clip(upper=1)
+    return plot_bars(shown, {"bound": ""}, title, "upper bound on the total index", path)
 
 
 def plot_bars(
-    table: "pd.DataFrame",
+    table: pd.DataFrame,
     columns: Mapping[str, str],
     title: str,
     label: str,
     path: str | Path | None = None,
-) -> Any:
-    """Draw one horizontal bar a row and column; returns the figure.
+) -> Figure:
+    """Draw one horizontal bar for each row and column of a table.
 
-    - `columns`: column -> its name in the legend, empty for none; intervals are in `column_low` and
-      `column_high`, or in `low` and `high`.
+    **Arguments:**
+
+    - `table`: a row for each feature; intervals are in the columns `NAME_low` and `NAME_high`, or
+      in `low` and `high`.
+    - `columns`: the name in the legend of each column to draw, empty for none.
+    - `title`: above the bars.
+    - `label`: of the horizontal axis.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
     """
     figure = new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
     axes = figure.subplots()
@@ -35,7 +92,7 @@ def plot_bars(
     return show_or_save(figure, path)
 
 
-def draw_bars(axes: Any, table: "pd.DataFrame", columns: Mapping[str, str]) -> None:
+def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> None:
     """Draw the bars of `plot_bars` into `axes`, the first row on top."""
     height = 0.76 / len(columns)
     place = np.arange(len(table))
@@ -65,8 +122,17 @@ def draw_bars(axes: Any, table: "pd.DataFrame", columns: Mapping[str, str]) -> N
         axes.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def plot_effects(table: "pd.DataFrame", title: str, path: str | Path | None = None) -> Any:
-    """Draw mean size of the effects against their standard deviation; returns the figure."""
+def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None) -> Figure:
+    """Draw the mean size of elementary effects against their standard deviation.
+
+    **Arguments:**
+
+    - `table`: that of `analysis.morris`.
+    - `title`: above the picture.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
     figure = new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()
     across, up = table["mu_star"].to_numpy(float), table["sigma"].to_numpy(float)

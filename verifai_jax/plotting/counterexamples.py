@@ -1,7 +1,7 @@
 """Pictures of an explanation and of a shrunk counterexample.
 
-draw_explained(explain(run), "why.png")             # what broke, when, and which features did it
-draw_shrunk(shrink(run), "small.png")               # what departs from nominal, and what broke
+plot_explanation(explain(run), "why.png")             # what broke, when, and which features did it
+plot_shrunk(shrink(run), "small.png")               # what departs from nominal, and what broke
 """
 
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from verifai_jax.core.waveform import is_waveform
-from verifai_jax.counterexamples.description import close, number
+from verifai_jax.counterexamples.description import format_apart, format_number
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.formula import Arithmetic, Atom, Number, Predicate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -24,7 +24,7 @@ MOST_BARS = 12
 MOST_SIGNALS = 3
 
 
-def draw_explained(explained: "Explained", path: str | Path | None = None) -> Any:
+def plot_explanation(explained: "Explained", path: str | Path | None = None) -> Any:
     """The deciding signal with its bound and instant, signals that were fed in, and the features.
 
     Returns the figure.
@@ -88,10 +88,10 @@ def draw_decision(axes: Any, why: Explanation) -> None:
         place = int(np.argmin(np.abs(clock - why.time)))
         axes.axvline(clock[place], color=FAILING, linewidth=1, linestyle=":")
         axes.plot([clock[place]], [values[place]], "o", color=FAILING, markersize=6)
-        shown = number(float(values[place]))
+        shown = format_number(float(values[place]))
         if bounds:
             nearest = min(bounds, key=lambda b: abs(b - values[place]))
-            shown = close(float(values[place]), nearest)[0]
+            shown = format_apart(float(values[place]), nearest)[0]
         low, high = axes.get_ylim()
         late = place > len(clock) / 2
         # Beside the instant's line, at the end of it that is away from the curve.
@@ -159,7 +159,8 @@ def _draw_bars(axes: Any, explained: "Explained") -> None:
             if np.isfinite(end):
                 inside = end - explained.rho > 0.5 * (np.nanmax(ends) - explained.rho)
                 axes.annotate(
-                    number(float(end), 3), (max(end, explained.rho), y), fontsize=8, va="center",
+                    format_number(float(end), 3), (max(end, explained.rho), y),
+                    fontsize=8, va="center",
                     xytext=(-4 if inside else 4, 0), textcoords="offset points",
                     ha="right" if inside else "left", color="white" if inside else BOUND,
                 )  # fmt: skip
@@ -178,7 +179,7 @@ def _draw_bars(axes: Any, explained: "Explained") -> None:
     axes.grid(visible=False, axis="y")
 
 
-def draw_shrunk(shrunk: "Shrunk", path: str | Path | None = None) -> Any:
+def plot_shrunk(shrunk: "Shrunk", path: str | Path | None = None) -> Any:
     """What departs from nominal, in its range, beside the signal that breaks; the figure."""
     replay = shrunk.replay()
     names = list(shrunk.changed) or ["nothing departs"]
@@ -196,7 +197,7 @@ def draw_shrunk(shrunk: "Shrunk", path: str | Path | None = None) -> Any:
         left.plot([shrunk.nominal[i]], [y], "o", color=SAFE, markersize=6)
         left.plot([shrunk.u[i]], [y], "o", color=FAILING, markersize=7)
         left.annotate(
-            f"{number(was)} to {number(now)}", (0.5, y), xytext=(0, 5), ha="center",
+            f"{format_number(was)} to {format_number(now)}", (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
     left.set_yticks(range(len(places)), [_short(name, 18) for name in shown[: len(places)]])

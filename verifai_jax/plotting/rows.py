@@ -87,8 +87,3 @@ def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
             axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])
         else:
             axis.get_major_locator().set_params(nbins=5)
-
-
-def shortened(text: str, most: int = 60) -> str:
-    """At most so many characters; the end of a name says more than its middle."""
-    return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"

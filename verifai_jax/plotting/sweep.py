@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.plotting.rows import shortened
+from verifai_jax.core.text import shorten
 from verifai_jax.plotting.style import (
     BOUND,
     FAILING,
@@ -46,7 +46,7 @@ def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
     if bars:
         trusted = any(importance.trusted(target) for target in importance.scores)
         (draw_importance if trusted else draw_trends)(panels.pop(0), importance)
-    title = f"{shortened(sweep.name, 40)}: {lead(sweep)}"
+    title = f"{shorten(sweep.name, 40)}: {lead(sweep)}"
     if len(title) > 10 * figure.get_figwidth():
         title = title.replace("; ", "\n", 1)
     figure.suptitle(title, fontsize=11)
@@ -257,7 +257,7 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
             linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else None,
         )
-    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.set_yticks(place, [shorten(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
@@ -290,7 +290,7 @@ def draw_trends(axes: Any, found: HyperparameterImportance) -> None:
             label=what,
         )
     axes.axvline(0, color=BOUND, linewidth=0.8)
-    axes.set_yticks(place, [shortened(str(name), 18) for name in shown.index])
+    axes.set_yticks(place, [shorten(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.core.lazy import late
 from verifai_jax.problem.problem import Problem
 from verifai_jax.synthesis.held_out import HeldOut
 from verifai_jax.synthesis.parametric import held
@@ -227,19 +228,7 @@ class Repair:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the worst robustness that each attack found; returns the figure."""
-        from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
-
-        figure = new_figure(figsize=(5.0, 3.0))
-        axes = figure.subplots()
-        worst = [turn.worst for turn in self.rounds]
-        colours = [FAILING if turn.counterexamples else SAFE for turn in self.rounds]
-        axes.plot(range(1, len(worst) + 1), worst, color=BOUND, linewidth=0.8)
-        axes.scatter(range(1, len(worst) + 1), worst, color=colours, zorder=3)
-        axes.axhline(self.margin, color=BOUND, linewidth=0.8, linestyle="--")
-        axes.set(xlabel="round", ylabel="worst robustness found", title=self.name)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        tidy(axes)
-        return show_or_save(figure, path)
+        return late("verifai_jax.plotting.repair", "plot_repair")(self, path)
 
 
 def _worse(before: HeldOut | None, after: HeldOut | None) -> bool:

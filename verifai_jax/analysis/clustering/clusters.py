@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, Key
+from jaxtyping import Int, Key
 
 from verifai_jax.analysis.clustering.density import dbscan
 from verifai_jax.analysis.clustering.prototypes import prototypes
@@ -30,10 +30,9 @@ from verifai_jax.analysis.data.samples import (
     generator,
     whole,
 )
+from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features
 from verifai_jax.features import FeatureSpace
-from verifai_jax.plotting.rows import PALETTE, name_axes, pair, positions
-from verifai_jax.plotting.style import WITHOUT_VERDICT, new_figure, show_or_save, tidy
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -43,7 +42,6 @@ Method = Literal["auto", "kmeans", "kmodes", "kprototypes", "dbscan"]
 METHODS = ("auto", "kmeans", "kmodes", "kprototypes", "dbscan")
 # Kaufman and Rousseeuw, Finding Groups in Data, 1990: below, there is no substantial structure.
 LEAST_SILHOUETTE = 0.25
-DOTS = 4000
 _JUDGED = 2000
 _TRIED = 5000
 _STARTS = 8
@@ -140,7 +138,7 @@ class Clusters:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the clusters over the two columns that tell them apart best; returns the figure."""
-        return _plot(self, path)
+        return late("verifai_jax.plotting.clusters", "plot_clusters")(self, path)
 
     def __str__(self) -> str:
         score = f", silhouette {self.silhouette:.2f}" if np.isfinite(self.silhouette) else ""
@@ -151,14 +149,15 @@ class Clusters:
         more = ", ..." if len(features) > 8 else ""
         for cluster in list(self.table.index)[:12]:
             where = format_features({name: self.centres.at[cluster, name] for name in features[:8]})
-            size, share, typical, worst = (self._own(cluster, name) for name in _OWN[:4])
+            size, share, typical, worst = (self.entry(cluster, name) for name in _OWN[:4])
             lines.append(
                 f"  {f'{cluster}:' if cluster >= 0 else 'noise:'} {size:,} rows ({share:.0%}) "
                 f"around {where}{more}; typical row {typical}, worst row {worst}"
             )
         return "\n".join(lines)
 
-    def _own(self, cluster: int, name: str) -> Any:
+    def entry(self, cluster: int, name: str) -> Any:
+        """Return what `table` says of a cluster, also where a feature has taken the name."""
         return self.table.at[cluster, f"{name}_" if f"{name}_" in self.table else name]
 
 
@@ -311,76 +310,3 @@ def _by_size(labels: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     new = np.full(int(labels.max(initial=-1)) + 2, -1, np.int64)
     new[kinds[order]] = np.arange(len(kinds))
     return new[labels]
-
-
-def telling_columns(found: Clusters) -> tuple[str, str]:
-    """The two columns of which the clusters explain most of the variation."""
-
-    def explained(total: Float[np.ndarray, " n"]) -> float:
-        spread = ((total - total.mean(axis=0)) ** 2).sum()
-        means = np.stack([total[found.assigned == c].mean(axis=0) for c in kinds])
-        inner = ((total - means[np.searchsorted(kinds, found.assigned)]) ** 2).sum()
-        return 1 - inner / spread if spread > 0 else -1.0
-
-    kinds = np.unique(found.assigned)
-    samples, scores = found.samples, {}
-    matrix = iter(samples.matrix("standard").T)
-    codes = iter(samples.codes().T)
-    for column in samples.columns:
-        if column.ordered:
-            scores[column.name] = explained(next(matrix)[:, None])
-        else:
-            scores[column.name] = explained(np.eye(len(column.choices) + 1)[next(codes)])
-    best = sorted(scores, key=lambda name: -scores[name])
-    return pair(samples, best)
-
-
-def _plot(found: Clusters, path: str | Path | None) -> Any:
-    samples = found.samples
-    across, up = telling_columns(found)
-    figure = new_figure(figsize=(6.2, 4.4))
-    axes = figure.subplots()
-    table = found.table
-    for cluster in reversed(list(table.index)):
-        color = PALETTE[cluster % len(PALETTE)] if cluster >= 0 else WITHOUT_VERDICT
-        rows = found.rows(cluster)
-        shown = samples.at(rows[:: max(1, len(samples) // DOTS)])
-        name = f"cluster {cluster}" if cluster >= 0 else "noise"
-        axes.scatter(
-            positions(samples, across, shown),
-            positions(samples, up, shown),
-            c=color,
-            s=10,
-            alpha=0.6 if cluster >= 0 else 0.4,
-            linewidths=0,
-            label=f"{name}: {found._own(cluster, 'size'):,}",
-        )
-        if cluster >= 0:
-            one = samples.at([found._own(cluster, "representative")])
-            axes.scatter(
-                positions(samples, across, one),
-                positions(samples, up, one),
-                c=color,
-                marker="*",
-                s=190,
-                edgecolors="white",
-                linewidths=1.1,
-                zorder=4,
-            )
-    name_axes(axes, samples, across, up)
-    tidy(axes)
-    handles, labels = axes.get_legend_handles_labels()
-    axes.legend(
-        handles[::-1],
-        labels[::-1],
-        frameon=False,
-        fontsize=8,
-        loc="center left",
-        bbox_to_anchor=(1, 0.5),
-    )
-    figure.suptitle(
-        f"{samples.kind}: {found.count} cluster{'' if found.count == 1 else 's'} ({found.method}); "
-        "stars are typical rows",
-        fontsize=10,
-    )
-    return show_or_save(figure, path)

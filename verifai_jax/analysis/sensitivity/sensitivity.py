@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.lazy import late
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -49,18 +50,7 @@ class Sensitivity:
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the indices with their intervals; returns the figure."""
-        from verifai_jax.plotting.bars import plot_bars, plot_effects
-
-        shown = self.table.head(MOST_SHOWN)
-        title = f"{self.method} of {self.problem}, {self.simulations:,} simulations"
-        if "mu_star" in shown:
-            return plot_effects(shown, title, path)
-        if "total" in shown:
-            columns = {"total": "in all", "first": "alone"}
-            return plot_bars(shown, columns, title, "share of the variance", path)
-        # Above 1 a bound says nothing; at its own length it would hide those that do.
-        shown = shown.clip(upper=1)
-        return plot_bars(shown, {"bound": ""}, title, "upper bound on the total index", path)
+        return late("verifai_jax.plotting.bars", "plot_sensitivity")(self, path)
 
     def __repr__(self) -> str:
         return str(self)

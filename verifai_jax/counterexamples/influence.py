@@ -1,0 +1,69 @@
+"""The part that each feature has in a failure."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.features import Domain, Signal
+
+
+class Span(NamedTuple):
+    """When a control point acts, in seconds."""
+
+    begin: float
+    end: float
+
+
+def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
+    """When each coordinate of a signal acts; None for what is no signal.
+
+    A point between two lines acts from the point before to the one behind.
+    """
+    if not isinstance(domain, Signal):
+        return None
+    length = domain.duration or duration
+    if domain.hold == "constant":
+        edges = np.linspace(0, length, domain.knots + 1)
+        spans = [Span(float(a), float(b)) for a, b in pairwise(edges)]
+    else:
+        times = np.linspace(0, length, domain.knots)
+        ends = np.concatenate([[0.0], times, [length]])
+        spans = [Span(float(a), float(b)) for a, b in zip(ends[:-2], ends[2:], strict=True)]
+    return tuple(span for span in spans for _ in range(domain.domain.size))
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What one feature has to do with a failure.
+
+    **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
+    when each coordinate acts, for the control points of a signal, else None; `reverted`: the
+    robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
+    back; `slope` `[k]`: change of the smooth robustness over the whole range of each coordinate, as
+    seen from the row. What is not known is NaN. `gone`: whether the failure vanishes with the whole
+    feature back.
+    """
+
+    name: str
+    coordinates: tuple[str, ...]
+    value: tuple[Any, ...]
+    nominal: tuple[Any, ...]
+    spans: tuple[Span, ...] | None
+    reverted: float
+    gone: bool
+    departs: bool
+    each: Float[np.ndarray, " k"]
+    each_gone: tuple[bool, ...]
+    slope: Float[np.ndarray, " k"]
+
+    def effect(self, rho: float) -> float:
+        """Return by how much the feature moves the robustness `rho` of the row.
+
+        That of the whole feature back at nominal, or where it is not known its steepest slope.
+        """
+        if np.isfinite(self.reverted):
+            return self.reverted - rho
+        return float(np.nan_to_num(np.abs(self.slope)).max(initial=0.0))
