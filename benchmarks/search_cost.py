@@ -16,7 +16,7 @@ import numpy as np
 
 import verifai_jax as vj
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 
 CUBE = Cube((0, 0, 0, 0))
 
@@ -33,7 +33,7 @@ def rounds(search, batch, warm, count):
         u, state = jax.block_until_ready(ask(state, CUBE, batch))
         asked = time.perf_counter() - started
         gradient = 2 * (u - 0.3) if search.wants_gradient else None
-        told = jax.block_until_ready(Evaluated(u, rho(u), jnp.ones(batch, bool), gradient))
+        told = jax.block_until_ready(Observations(u, rho(u), jnp.ones(batch, bool), gradient))
         started = time.perf_counter()
         state = jax.block_until_ready(tell(state, CUBE, told))
         seconds.append(asked + time.perf_counter() - started)

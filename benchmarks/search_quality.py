@@ -22,7 +22,7 @@ from landscapes import LANDSCAPES
 
 import verifai_jax as vj
 from verifai_jax.core.targets import load_target
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 
 BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}
 ACTIVE_BATCH = 16
@@ -56,7 +56,7 @@ def advance(search, rho, cube, batch, rounds, state):
         u, state = search.ask(state, cube, batch)
         value = jax.vmap(rho)(u)
         gradient = jax.vmap(jax.grad(rho))(u) if search.wants_gradient else None
-        told = Evaluated(u, value, jnp.ones(batch, bool), gradient)
+        told = Observations(u, value, jnp.ones(batch, bool), gradient)
         return search.tell(state, cube, told), value
 
     def one(state):

@@ -54,8 +54,8 @@ class Wayward(Search):
     def total(self, cube):
         return 0 if self.flaw == "total" else None
 
-    def warm(self, state, cube, evaluated):
-        return {} if self.flaw == "warm" else state
+    def warm_start(self, state, cube, observations):
+        return {} if self.flaw == "warm_start" else state
 
     def init(self, key, cube, batch):
         return {"key": key, "shift": jnp.zeros((), jnp.float32)}
@@ -68,9 +68,9 @@ class Wayward(Search):
             u = jnp.clip(u, 0, 1)
         return u, {**state, "key": next_key}
 
-    def tell(self, state, cube, evaluated):
-        weight = 1.0 if self.flaw == "padding" else evaluated.counted
-        rho = jnp.where(weight, evaluated.rho, 0.0)
+    def tell(self, state, cube, observations):
+        weight = 1.0 if self.flaw == "padding" else observations.valid
+        rho = jnp.where(weight, observations.rho, 0.0)
         shift = jnp.nan_to_num(jnp.mean(jnp.abs(rho)))
         if self.flaw == "types":
             shift = shift.astype(jnp.float16)
@@ -83,9 +83,9 @@ class Wayward(Search):
         ("shape", r"ask must give shape \[16, 2\]; got \[17, 2\]"),
         ("range", r"points must stay in \[0, 1\]"),
         ("types", "tell must keep the types of the state"),
-        ("padding", "rows that are not counted must not influence the search"),
+        ("padding", "rows that are not valid must not influence the search"),
         ("total", "total must be None or a positive integer; got 0"),
-        ("warm", "warm must keep the state's form"),
+        ("warm_start", "warm_start must keep the state's form"),
     ],
 )
 def test_searches(flaw, message):

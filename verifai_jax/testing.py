@@ -18,7 +18,7 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl.clauses import ABSENT, CLAUSES
-from verifai_jax.search import Evaluated, Search
+from verifai_jax.search import Observations, Search
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 
@@ -100,7 +100,7 @@ def check_search(
     init = jax.jit(search.init, static_argnums=(1, 2))
     ask = jax.jit(search.ask, static_argnums=(1, 2))
     tell = jax.jit(search.tell, static_argnums=1)
-    warm = jax.jit(search.warm, static_argnums=1)
+    warm = jax.jit(search.warm_start, static_argnums=1)
     key = jax.random.key(seed)
     odd = np.arange(batch) % 3 == 1
 
@@ -136,7 +136,7 @@ def check_search(
     _same(after, resumed, "a resumed state must go on as the saved one", exact=True)
 
     spoiled = [run(state, 0, rounds, value)[1] for value in (-1e9, np.nan)]
-    law = "rows that are not counted must not influence the search"
+    law = "rows that are not valid must not influence the search"
     _same(spoiled[0], spoiled[1], law, exact=True)
     for points in spoiled[0]:
         assert np.all(np.isfinite(points)), "points must be finite"
@@ -145,14 +145,14 @@ def check_search(
     first, asked = ask(state, cube, batch)
     second, asked = ask(asked, cube, batch)
     mixed = _evaluate(jnp.where(odd[:, None], second, first), search, asked, cube)
-    refused = mixed._replace(counted=mixed.counted & (np.arange(batch) % 4 != 0))
+    refused = mixed._replace(valid=mixed.valid & (np.arange(batch) % 4 != 0))
     after = tell(asked, cube, refused)
     _same_type(asked, after)
 
     earlier = jax.random.uniform(jax.random.key(seed + 1), (batch, cube.dim), jnp.float32)
     rho = _evaluate(earlier, search, asked, cube).rho
-    warmed = warm(state, cube, Evaluated(earlier, rho, jnp.ones(batch, bool)))
-    _same_type(state, warmed, "warm")
+    warmed = warm(state, cube, Observations(earlier, rho, jnp.ones(batch, bool)))
+    _same_type(state, warmed, "warm_start")
     for beginning in (after, warmed):
         for points in run(beginning, 0, 2)[1]:
             assert np.all(np.isfinite(points)), "points must be finite"
@@ -293,11 +293,11 @@ def _status(trace: Trace) -> str:
     return Status(0 if trace.status is None else int(trace.status)).name
 
 
-def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Evaluated:
+def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Observations:
     """A bowl with its bottom, and failures, off the middle, told as the search wants it."""
     offset = u - 0.3
     rho, slope = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
-    told = Evaluated(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
     if not search.wants_clauses:
         return told
     plan = search.plan(asked, cube, len(u))
@@ -308,15 +308,15 @@ def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Evaluated:
         f"the plan must be for 1 to {len(u)} rows; got {plan.rows}"
     )
     clauses = jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho)
-    slopes = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(slope)
+    gradients = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(slope)
     return told._replace(
-        counted=jnp.arange(len(u)) < plan.rows,
+        valid=jnp.arange(len(u)) < plan.rows,
         clauses=clauses,
-        slopes=jnp.where(plan.slopes, slopes, 0.0),
+        clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),
     )
 
 
-def _spoiled(told: Evaluated, rows: Any, value: float) -> Evaluated:
+def _spoiled(told: Observations, rows: Any, value: float) -> Observations:
     def spoil(leaf: Any) -> Any:
         if leaf is None:
             return None
@@ -324,10 +324,10 @@ def _spoiled(told: Evaluated, rows: Any, value: float) -> Evaluated:
 
     return told._replace(
         rho=spoil(told.rho),
-        counted=told.counted & ~rows,
+        valid=told.valid & ~rows,
         gradient=spoil(told.gradient),
         clauses=spoil(told.clauses),
-        slopes=spoil(told.slopes),
+        clause_gradients=spoil(told.clause_gradients),
     )
 
 

@@ -13,7 +13,7 @@ from verifai_jax.core.waveform import Waveform
 from verifai_jax.plotting.style import new_figure
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
 from verifai_jax.rl.policy import new_layers
-from verifai_jax.search import Listed
+from verifai_jax.search import PointList
 
 KEY = jax.random.key(0)
 PROBLEMS = {name: p for name in dir(specs) if isinstance(p := getattr(specs, name), vj.Problem)}
@@ -222,7 +222,7 @@ def test_nominal_is_safe_and_failures_are_there_but_rare(name):
     nominal = space.flatten(space.coerce(problem.nominal))
     points = np.random.default_rng(0).uniform(size=(2047, space.dim))
     run = vj.falsify(
-        problem, Listed(np.vstack([nominal, points])), 2048, batch=2048, progress=False
+        problem, PointList(np.vstack([nominal, points])), 2048, batch=2048, progress=False
     )
     table = run.table.all
     assert set(table.status) == {"ok"}

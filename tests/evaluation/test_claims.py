@@ -79,8 +79,8 @@ def test_slopes_are_left_out_where_there_are_none():
     assert not informative(counted)
     assert informative(vj.Problem("slopes", space, count, "gear < 9 & a < 9.5"))
     search, notes = usable(counted, Portfolio())
-    assert search == Portfolio(slopes=False)
-    assert notes == ("portfolio without slopes: the robustness is constant almost everywhere",)
+    assert search == Portfolio(gradients=False)
+    assert notes == ("portfolio without gradients: the robustness is constant almost everywhere",)
     run = vj.falsify(counted, budget=64, batch=8, stop_after=1)
     assert len(run.table.counterexamples) >= 1
     assert "differentiated" not in run.table.all

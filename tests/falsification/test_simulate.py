@@ -6,7 +6,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Listed
+from verifai_jax.search import PointList
 from verifai_jax.testing import check_batch_independence, check_search
 
 SPACE = vj.FeatureSpace({"a": vj.Box(0, 2), "kind": vj.Categorical("slow", "fast")})
@@ -40,8 +40,8 @@ def test_features_as_a_person_writes_them(problem):
 
 def test_contract():
     points = np.random.default_rng(0).random((50, 2), np.float32)
-    check_search(Listed(points), Cube((0, 0)))
-    check_batch_independence(Listed(points), Cube((0, 0)))
+    check_search(PointList(points), Cube((0, 0)))
+    check_batch_independence(PointList(points), Cube((0, 0)))
 
 
 @pytest.mark.parametrize(
@@ -53,10 +53,10 @@ def test_contract():
             lambda p: vj.simulate(p, vj.falsify(p, budget=4).table.all.drop(columns="kind")),
             "unknown column 'kind'",
         ),
-        (lambda p: Listed(np.zeros((0, 2))), r"n >= 1; got shape \[0, 2\]"),
-        (lambda p: Listed([[1.5, 0]]), "must lie in the unit cube"),
+        (lambda p: PointList(np.zeros((0, 2))), r"n >= 1; got shape \[0, 2\]"),
+        (lambda p: PointList([[1.5, 0]]), "must lie in the unit cube"),
         (
-            lambda p: vj.falsify(p, Listed([[0.5]])),
+            lambda p: vj.falsify(p, PointList([[0.5]])),
             "the points have 1 coordinates, the space has 2",
         ),
     ],

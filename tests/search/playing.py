@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.landscapes import LANDSCAPES
 from verifai_jax.mtl.clauses import ABSENT, CLAUSES
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 
 SEEDS = 25
 # Those on one cube run in one program: compiling is what takes time.
@@ -24,15 +24,15 @@ ROUNDS = {FLAT: 75, MIXED: 50, WIDE: 22}
 
 def tell_of(search, state, cube, u, rho, slope):
     """What a search is told of points of one clause."""
-    told = Evaluated(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
     if not search.wants_clauses:
         return told
     plan = search.plan(state, cube, len(u))
-    slopes = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
+    gradients = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
     return told._replace(
-        counted=jnp.arange(len(u)) < plan.rows,
+        valid=jnp.arange(len(u)) < plan.rows,
         clauses=jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho),
-        slopes=jnp.where(plan.slopes, slopes, 0.0),
+        clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),
     )
 
 
@@ -55,7 +55,7 @@ def play(search, names, batch, rounds, seeds, together=True):
             value = jax.vmap(rho)(u)
             told = tell_of(search, state, cube, u, value, jax.vmap(jax.grad(rho))(u))
             # A row that is not simulated finds nothing.
-            return search.tell(state, cube, told), (u, jnp.where(told.counted, value, jnp.inf))
+            return search.tell(state, cube, told), (u, jnp.where(told.valid, value, jnp.inf))
 
         _, seen = jax.lax.scan(step, search.init(key, cube, batch), None, length=rounds)
         return jax.tree.map(lambda leaf: leaf.reshape(rounds * batch, *leaf.shape[2:]), seen)

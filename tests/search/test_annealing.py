@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.annealing import (
     Annealing,
     _best_to_median,
@@ -22,7 +22,7 @@ def run(search, cube, batch, rho, rounds, key=0):
 
     def step(state, _):
         u, state = search.ask(state, cube, batch)
-        state = search.tell(state, cube, Evaluated(u, rho(u), jnp.ones(batch, bool)))
+        state = search.tell(state, cube, Observations(u, rho(u), jnp.ones(batch, bool)))
         return state, (u, state)
 
     state = search.init(jax.random.key(key), cube, batch)
@@ -114,7 +114,7 @@ def test_a_chain_that_stays_starts_again():
     @jax.jit
     def step(state):
         u, state = search.ask(state, cube, 8)
-        return search.tell(state, cube, Evaluated(u, jnp.full(8, 1e6), jnp.ones(8, bool)))
+        return search.tell(state, cube, Observations(u, jnp.full(8, 1e6), jnp.ones(8, bool)))
 
     for round in range(3):
         assert np.all(np.isfinite(held.energy)), round
@@ -129,13 +129,13 @@ def test_warm_starts_at_the_best_points():
     rng = np.random.default_rng(0)
     tables = [rng.random((16, 2)).astype(np.float32) for _ in range(3)]
     for number, u in enumerate(tables):
-        counted = jnp.arange(16) != 4
-        told = Evaluated(u, jnp.where(counted, u[:, 0] + 1, -1e9), counted)
+        valid = jnp.arange(16) != 4
+        told = Observations(u, jnp.where(valid, u[:, 0] + 1, -1e9), valid)
         if number == 0:
             kept = np.delete(u[:, 0], 4)
         else:
             kept = np.concatenate([kept, np.delete(u[:, 0], 4)])
-        state = search.warm(state, cube, told)
+        state = search.warm_start(state, cube, told)
     np.testing.assert_allclose(state.u[:, 0], np.sort(kept)[:16])
     np.testing.assert_allclose(state.energy, np.sort(kept)[:16] + 1)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.bandit import Bandit, _draw, _fill
 
 
-def told(u, rho, counted=None):
-    return Evaluated(u, rho, jnp.ones(len(u), bool) if counted is None else counted)
+def told(u, rho, valid=None):
+    return Observations(u, rho, jnp.ones(len(u), bool) if valid is None else valid)
 
 
 def learned(search, cube, rho, rounds, batch=16, key=0):

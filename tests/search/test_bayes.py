@@ -7,7 +7,7 @@ import pytest
 from playing import gain, play
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.bayes import Bayes
 from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search
@@ -49,20 +49,20 @@ def test_goes_on_failing():
         assert len(np.unique(points[failing], axis=0)) == failing.sum()
 
 
-def asked(search, cube, rho, rounds, batch=8, counted=True):
+def asked(search, cube, rho, rounds, batch=8, valid=True):
     """Points of the first rounds, with this robustness, and the last state."""
     ask, tell = jitted(search)
     state, seen = search.init(KEY, cube, batch), []
     for _ in range(rounds):
         u, state = ask(state, cube, batch)
         value = jnp.asarray(rho(u), jnp.float32)
-        state = tell(state, cube, Evaluated(u, value, jnp.full(batch, counted)))
+        state = tell(state, cube, Observations(u, value, jnp.full(batch, valid)))
         seen.append(np.asarray(u))
     return np.concatenate(seen), state
 
 
 @pytest.mark.parametrize(
-    ("value", "counted"),
+    ("value", "valid"),
     [
         (np.nan, True),
         *(
@@ -71,8 +71,8 @@ def asked(search, cube, rho, rounds, batch=8, counted=True):
         ),
     ],
 )
-def test_the_same_robustness_everywhere_gives_the_prior(value, counted):
-    u, _ = asked(SMALL, Cube((0, 3)), lambda u: np.full(8, value), 3, counted=counted)
+def test_the_same_robustness_everywhere_gives_the_prior(value, valid):
+    u, _ = asked(SMALL, Cube((0, 3)), lambda u: np.full(8, value), 3, valid=valid)
     expected = halton_points(jnp.arange(1, 25, dtype=jnp.uint32), 2, KEY)
     np.testing.assert_allclose(u, expected, atol=1e-6)
 
@@ -109,7 +109,7 @@ def test_what_is_kept():
     state = search.init(KEY, cube, 50)
     u = np.random.default_rng(0).permutation(200)[:, None].astype(np.float32) / 200
     for part in np.split(u, 4):
-        state = tell(state, cube, Evaluated(part, 1 + part[:, 0], jnp.ones(50, bool)))
+        state = tell(state, cube, Observations(part, 1 + part[:, 0], jnp.ones(50, bool)))
     kept = np.sort(np.asarray(state.u[:, 0]))
     np.testing.assert_allclose(kept[:16], np.arange(16) / 200, atol=1e-6)
     # The others are from everywhere and from all times.

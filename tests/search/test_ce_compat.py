@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.ce_compat import CECompat
 from verifai_jax.testing import check_search
 
@@ -18,7 +18,7 @@ def histories(search, cube, rows):
     state = search.init(jax.random.key(0), cube, 1)
     seen = []
     for u, rho in rows:
-        told = Evaluated(
+        told = Observations(
             jnp.array([u], jnp.float32), jnp.array([rho]), jnp.array([not np.isnan(rho)])
         )
         state = search.tell(state, cube, told)
@@ -62,7 +62,7 @@ def test_each_length_has_histograms_of_its_own():
     def step(state, _):
         u, state = search.ask(state, cube, 1)
         rho = jnp.where((u[:, 0] < 0.5) & (u[:, 1] < 0.5), -1.0, 1.0)
-        return search.tell(state, cube, Evaluated(u, rho, jnp.ones(1, bool))), u
+        return search.tell(state, cube, Observations(u, rho, jnp.ones(1, bool))), u
 
     state = search.init(jax.random.key(0), cube, 1)
     state, u = jax.jit(lambda state: jax.lax.scan(step, state, None, length=100))(state)
@@ -76,8 +76,8 @@ def row_by_row(search, cube, histograms, told):
     """The rule as VerifAI has it, in NumPy."""
     histograms = np.array(histograms, np.float64)
     sizes = [level or search.buckets for level in cube.levels]
-    for u, rho, counted in zip(*map(np.asarray, told[:3]), strict=True):
-        if not counted or not rho < search.threshold:
+    for u, rho, valid in zip(*map(np.asarray, told[:3]), strict=True):
+        if not valid or not rho < search.threshold:
             continue
         bins = [min(int(x * size), size - 1) for x, size in zip(u, sizes, strict=True)]
         which = 0
@@ -100,7 +100,7 @@ def test_a_batch_is_as_its_rows_one_by_one(alpha):
     for _ in range(3):
         rho = rng.normal(size=64).astype(np.float32)
         rho[::9] = np.nan
-        told = Evaluated(rng.random((64, 5)).astype(np.float32), rho, rng.random(64) < 0.8)
+        told = Observations(rng.random((64, 5)).astype(np.float32), rho, rng.random(64) < 0.8)
         state = tell(state, cube, told)
         expected = row_by_row(search, cube, expected, told)
     np.testing.assert_allclose(state.histograms, expected, atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 from playing import gain, play
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.cmaes import CMAES
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
@@ -26,7 +26,7 @@ def test_the_same_robustness_everywhere_gives_the_prior():
 
     def step(state, _):
         u, state = search.ask(state, cube, 16)
-        told = Evaluated(u, jnp.ones(16), jnp.ones(16, bool))
+        told = Observations(u, jnp.ones(16), jnp.ones(16, bool))
         return search.tell(state, cube, told), u
 
     _, seen = jax.jit(lambda state: jax.lax.scan(step, state, None, 4))(search.init(KEY, cube, 16))
@@ -116,10 +116,10 @@ def test_discrete_coordinates_keep_moving():
 def test_a_warm_start_begins_at_the_best_point():
     search, cube = CMAES(small_step=0.01), Cube((0, 0, 3), ordered=(True, True, False))
     u = jnp.array([[0.2, 0.9, 0.5], [0.7, 0.1, 0.9], [0.4, 0.4, 0.1], [0.1, 0.1, 0.1]])
-    told = Evaluated(u, jnp.array([3.0, 1.0, 2.0, -1.0]), jnp.array([True, True, True, False]))
+    told = Observations(u, jnp.array([3.0, 1.0, 2.0, -1.0]), jnp.array([True, True, True, False]))
     state = search.init(KEY, cube, 4)
     worse = told._replace(rho=told.rho + 5)
-    warm = jax.jit(search.warm, static_argnums=1)
+    warm = jax.jit(search.warm_start, static_argnums=1)
     for table in (worse, told, worse):
         state = warm(state, cube, table)
     asked = np.asarray(jax.jit(search.ask, static_argnums=(1, 2))(state, cube, 4)[0])

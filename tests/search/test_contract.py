@@ -99,7 +99,7 @@ def test_active_searches_do_learn(search):
 
 @pytest.mark.parametrize(
     ("search", "spoil"),
-    [(CrossEntropy(), "uncounted"), (Gradient(), "uncounted"), (Gradient(), "nan gradient")],
+    [(CrossEntropy(), "invalid"), (Gradient(), "invalid"), (Gradient(), "nan gradient")],
     ids=str,
 )
 def test_useless_batches_leave_a_search_alive(search, spoil):
@@ -112,10 +112,10 @@ def test_useless_batches_leave_a_search_alive(search, spoil):
         assert np.all(np.isfinite(u))
         planned = int(search.plan(state, cube, 8).rows) if search.wants_clauses else 8
         assert len(np.unique(np.asarray(u[:planned, 0]))) == planned
-        rho = jnp.full(8, jnp.nan) if spoil == "uncounted" else jnp.ones(8)
+        rho = jnp.full(8, jnp.nan) if spoil == "invalid" else jnp.ones(8)
         told = tell_of(search, state, cube, u, rho, jnp.full((8, 3), jnp.nan))
-        counted = told.counted & (spoil != "uncounted")
-        state = tell(state, cube, told._replace(counted=counted))
+        valid = told.valid & (spoil != "invalid")
+        state = tell(state, cube, told._replace(valid=valid))
 
 
 class TestNames:

@@ -10,7 +10,7 @@ from scipy.optimize import linprog
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
-from verifai_jax.search import Evaluated, Gradient, Portfolio
+from verifai_jax.search import Gradient, Observations, Portfolio
 from verifai_jax.search.gradient import _least
 
 D, K = 5, 4
@@ -18,12 +18,12 @@ FREE = np.ones(D, bool)
 solve = jax.jit(_least, static_argnums=())
 
 
-def exact(clauses, slopes, point, radius):
+def exact(clauses, gradients, point, radius):
     """The least greatest clause, by a linear program."""
     there = clauses > ABSENT / 2
     low, high = np.maximum(point - radius, 0), np.minimum(point + radius, 1)
-    above = slopes[there] @ point - clauses[there]
-    rows = np.hstack([slopes[there], -np.ones((there.sum(), 1))])
+    above = gradients[there] @ point - clauses[there]
+    rows = np.hstack([gradients[there], -np.ones((there.sum(), 1))])
     bounds = [*zip(low, high, strict=True), (None, None)]
     return linprog([0] * D + [1], rows, above, bounds=bounds).fun
 
@@ -34,15 +34,15 @@ def exact(clauses, slopes, point, radius):
 def test_least_against_a_linear_program(seed, count):
     rng = np.random.default_rng(seed)
     clauses = np.full(K, ABSENT)
-    slopes = np.zeros((K, D))
-    clauses[:count], slopes[:count] = rng.normal(size=count), rng.normal(size=(count, D))
+    gradients = np.zeros((K, D))
+    clauses[:count], gradients[:count] = rng.normal(size=count), rng.normal(size=(count, D))
     point, radius = rng.random(D), rng.uniform(0.05, 1)
-    arguments = [jnp.asarray(x, jnp.float32) for x in (clauses, slopes, point, radius)]
+    arguments = [jnp.asarray(x, jnp.float32) for x in (clauses, gradients, point, radius)]
     found = np.asarray(solve(*arguments, FREE), np.float64)
     assert np.all(np.abs(found - point) <= radius + 1e-5)
     assert np.all((found >= 0) & (found <= 1))
-    value = np.max((clauses + slopes @ (found - point))[:count])
-    best = exact(clauses, slopes, point, radius)
+    value = np.max((clauses + gradients @ (found - point))[:count])
+    best = exact(clauses, gradients, point, radius)
     # Exact for one and two; of three it may miss where all meet, but never by going up.
     if count < 3:
         assert value <= best + 1e-3
@@ -50,7 +50,7 @@ def test_least_against_a_linear_program(seed, count):
 
 
 def played(search, rho, clauses, cube, budget, seed=0):
-    """Simulations, with slopes counted as two, until both clauses are negative; one a round."""
+    """Simulations until both clauses are negative, one a round; with gradients they count twice."""
     ask = jax.jit(search.ask, static_argnums=(1, 2))
     tell = jax.jit(search.tell, static_argnums=1)
     state, cost = search.init(jax.random.key(seed), cube, 1), 0
@@ -58,12 +58,12 @@ def played(search, rho, clauses, cube, budget, seed=0):
     while cost < budget:
         u, state = ask(state, cube, 1)
         plan = search.plan(state, cube, 1)
-        value, each, slopes = told(u)
-        cost += 1 + bool(plan.slopes)
+        value, each, gradients = told(u)
+        cost += 1 + bool(plan.differentiate)
         if value[0] < 0:
             return cost
-        slopes = jnp.where(plan.slopes, slopes, 0.0)
-        state = tell(state, cube, Evaluated(u, value, jnp.ones(1, bool), None, each, slopes))
+        gradients = jnp.where(plan.differentiate, gradients, 0.0)
+        state = tell(state, cube, Observations(u, value, jnp.ones(1, bool), None, each, gradients))
     return np.inf
 
 
@@ -87,17 +87,17 @@ def test_a_maximum_of_clauses_does_not_stall_a_descent():
 
 
 @pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.slow), np.nan])
-def test_the_portfolio_leaves_slopes_that_say_nothing(slope):
+def test_the_portfolio_leaves_gradients_that_say_nothing(slope):
     cube, search = Cube((0, 0, 0)), Portfolio()
     ask = jax.jit(search.ask, static_argnums=(1, 2))
     tell = jax.jit(search.tell, static_argnums=1)
     state, asked = search.init(jax.random.key(1), cube, 1), 0
     for _ in range(60):
         u, state = ask(state, cube, 1)
-        asked += bool(search.plan(state, cube, 1).slopes)
+        asked += bool(search.plan(state, cube, 1).differentiate)
         rho = 1 + jnp.sum(jnp.round(8 * u), axis=1)
         clauses = jnp.full((1, K), ABSENT).at[:, 0].set(rho)
-        slopes = jnp.full((1, K, 3), slope)
-        state = tell(state, cube, Evaluated(u, rho, jnp.ones(1, bool), None, clauses, slopes))
+        gradients = jnp.full((1, K, 3), slope)
+        state = tell(state, cube, Observations(u, rho, jnp.ones(1, bool), None, clauses, gradients))
     assert 1 <= asked <= 5
     assert float(state.mutation.score[0]) < 4

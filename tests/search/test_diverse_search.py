@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import CrossEntropy, Evaluated, Gradient, Search, Uniform
+from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform
 from verifai_jax.search.diverse import Diverse, apart, distinct
 from verifai_jax.testing import check_search
 
@@ -41,11 +41,11 @@ class Descent(Search):
     def ask(self, state, cube, batch):
         return state[1], state
 
-    def tell(self, state, cube, evaluated):
-        step = jnp.where(evaluated.judged[:, None], evaluated.gradient, 0.0)
+    def tell(self, state, cube, observations):
+        step = jnp.where(observations.usable[:, None], observations.gradient, 0.0)
         return state[0], jnp.clip(state[1] - 0.1 * step, 0, 1)
 
-    def warm(self, state, cube, evaluated):
+    def warm_start(self, state, cube, observations):
         return state
 
     def temperature(self, state):
@@ -97,7 +97,7 @@ def modes_found(search, d, count, batch, rounds, seeds, after):
         def step(state, _):
             u, state = search.ask(state, cube, batch)
             value = jax.vmap(rho)(u)
-            told = Evaluated(u, value, jnp.ones(batch, bool))
+            told = Observations(u, value, jnp.ones(batch, bool))
             return search.tell(state, cube, told), (u, value)
 
         state, (u, value) = jax.lax.scan(step, search.init(key, cube, batch), None, length=rounds)
@@ -135,7 +135,7 @@ def test_modes_in_other_dimensions(d, count, least):
 def told(search, state, cube, u, rho, gradient=None):
     u, rho = jnp.asarray(u, jnp.float32), jnp.asarray(rho, jnp.float32)
     tell = jax.jit(search.tell, static_argnums=1)
-    return tell(state, cube, Evaluated(u, rho, jnp.ones(len(u), bool), gradient))
+    return tell(state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient))
 
 
 def test_the_archive_holds_failures_that_are_apart():
@@ -158,7 +158,7 @@ def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     u = jnp.array([[0.2, 0.2], [0.25, 0.2], [0.35, 0.2], [0.9, 0.9]], jnp.float32)
     rho = jnp.array([-1.0, -0.5, 0.1, 0.3], jnp.float32)
     state = told(search, state, cube, u, rho)
-    seen = search._deflated(state, cube, Evaluated(u, rho, jnp.ones(4, bool)))
+    seen = search._deflated(state, cube, Observations(u, rho, jnp.ones(4, bool)))
     assert float(seen.rho[0]) > float(seen.rho[1]) > 0.3
     assert float(seen.rho[2]) > 0.1
     assert float(seen.rho[3]) == np.float32(0.3)
@@ -175,14 +175,14 @@ def test_the_gradient_is_that_of_the_raised_robustness():
         return jnp.sum(u**2) + 0.2
 
     u = jax.random.uniform(jax.random.key(1), (4, 3), jnp.float32)
-    told_of = Evaluated(u, jax.vmap(rho)(u), jnp.ones(4, bool), jax.vmap(jax.grad(rho))(u))
+    told_of = Observations(u, jax.vmap(rho)(u), jnp.ones(4, bool), jax.vmap(jax.grad(rho))(u))
     seen = search._deflated(state, cube, told_of)
     wanted = jax.vmap(jax.grad(lambda p: search._raised(state, cube, p[None], rho(p)[None])[0]))(u)
     assert seen.gradient is not None
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_clauses_and_their_slopes_are_raised_alike():
+def test_clauses_and_their_gradients_are_raised_alike():
     cube, search = Cube((0, 0, 0)), Diverse(Uniform(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)
     state = told(search, state, cube, jnp.full((4, 3), 0.3), [-1.0] * 4)
@@ -194,12 +194,12 @@ def test_clauses_and_their_slopes_are_raised_alike():
     seen = search._deflated(
         state,
         cube,
-        Evaluated(
+        Observations(
             u,
             jnp.ones(4),
             jnp.ones(4, bool),
             clauses=jax.vmap(clauses)(u),
-            slopes=jax.vmap(jax.jacobian(clauses))(u),
+            clause_gradients=jax.vmap(jax.jacobian(clauses))(u),
         ),
     )
 
@@ -210,11 +210,11 @@ def test_clauses_and_their_slopes_are_raised_alike():
         )
 
     assert seen.clauses is not None
-    assert seen.slopes is not None
+    assert seen.clause_gradients is not None
     np.testing.assert_allclose(seen.clauses[:, :2], jax.vmap(raised)(u), rtol=1e-5)
     assert np.all(np.asarray(seen.clauses[:, 2]) == -1e9)
     np.testing.assert_allclose(
-        seen.slopes[:, :2], jax.vmap(jax.jacobian(raised))(u), rtol=1e-4, atol=1e-5
+        seen.clause_gradients[:, :2], jax.vmap(jax.jacobian(raised))(u), rtol=1e-4, atol=1e-5
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Evaluated
+from verifai_jax.search import Observations
 from verifai_jax.search.epsilon_greedy import EpsilonGreedy
 
 
@@ -15,7 +15,7 @@ def learned(search, cube, rho, rounds, batch=16, key=0):
 
     def step(state, _):
         u, state = search.ask(state, cube, batch)
-        state = search.tell(state, cube, Evaluated(u, rho(u), jnp.ones(batch, bool)))
+        state = search.tell(state, cube, Observations(u, rho(u), jnp.ones(batch, bool)))
         return state, (state, u)
 
     state = search.init(jax.random.key(key), cube, batch)
@@ -123,7 +123,7 @@ def test_warm_start():
     state = search.init(jax.random.key(0), cube, 16)
     u = jnp.linspace(0, 1, 16)[:, None] * jnp.ones(2)
     rho = jnp.abs(u[:, 0] - 0.5)
-    state = search.warm(state, cube, Evaluated(u, rho, jnp.arange(16) != 7))
+    state = search.warm_start(state, cube, Observations(u, rho, jnp.arange(16) != 7))
     np.testing.assert_allclose(state.best[0], u[8])
     assert not np.any(np.all(np.isclose(state.best, u[7]), axis=1))
     # The prior's draws of the first round are not of the table.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Observations
+from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, TrainingData
 
 KEY = jax.random.key(0)
 LENGTHS = np.array([0.3, 0.8, 1.7])
@@ -26,7 +26,7 @@ def data(rows=40, padding=24, dtype=jnp.float32):
     y = np.sin(6 * x[:, 0]) + x[:, 1] ** 2 + 0.1 * rng.standard_normal(len(x))
     mask = rng.permutation(len(x)) < rows
     y[~mask] = np.nan
-    seen = Observations(jnp.asarray(x, dtype), jnp.asarray(y, dtype), jnp.asarray(mask))
+    seen = TrainingData(jnp.asarray(x, dtype), jnp.asarray(y, dtype), jnp.asarray(mask))
     return seen, x[mask], y[mask]
 
 
@@ -95,7 +95,7 @@ def test_sampled_functions_have_the_moments_of_the_posterior(process):
     for places in (x, points):
         places[:, process.unordered] = np.floor(3 * places[:, process.unordered])
     y = np.sin(5 * x[:, 0]) + x[:, 1]
-    seen = Observations(
+    seen = TrainingData(
         jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), jnp.arange(24) % 4 != 3
     )
     given = hyper(jnp.float32)
@@ -120,7 +120,7 @@ def test_fitting_finds_the_coordinates_that_matter():
     rng = np.random.default_rng(4)
     x = rng.random((96, 3))
     y = np.sin(9 * x[:, 0])
-    seen = Observations(
+    seen = TrainingData(
         jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), jnp.arange(96) < 80
     )
     fit = jax.jit(PLAIN.fit, static_argnums=2)
@@ -149,7 +149,7 @@ def test_fitting_finds_the_coordinates_that_matter():
     ids=["same", "contradictions", "nothing", "one"],
 )
 def test_degenerate_observations(x, y, mask):
-    seen = Observations(jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), jnp.asarray(mask))
+    seen = TrainingData(jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), jnp.asarray(mask))
 
     @jax.jit
     def all_of_it(seen):
@@ -175,7 +175,7 @@ def test_a_singular_covariance_is_made_regular():
 
 def test_no_coordinates():
     empty = GaussianProcess(())
-    seen = Observations(jnp.zeros((4, 0)), jnp.full(4, 2.0), jnp.ones(4, bool))
+    seen = TrainingData(jnp.zeros((4, 0)), jnp.full(4, 2.0), jnp.ones(4, bool))
     given = empty.first()._replace(noise=jnp.log(1.0))
     mean, std = empty.predict(empty.condition(given, seen), jnp.zeros((2, 0)))
     # The mean of four noisy values, shrunk: 4 * 2 / (4 + 1), with variance 1 / (4 + 1).

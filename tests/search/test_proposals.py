@@ -49,7 +49,7 @@ def test_every_search(name):
     points = play(proposals, 8, search.wants_gradient)
     features = jax.vmap(SPACE.unflatten)(jnp.asarray(points))
     assert np.all(jax.vmap(below)(features))
-    # Rounds with slopes are of few rows.
+    # Differentiated rounds have few rows.
     assert len(points) >= (16 if search.wants_clauses else 64)
     assert proposals.accepted == len(points) <= proposals.asked
     again = play(Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint), 8, search.wants_gradient)

@@ -64,7 +64,7 @@ def test_the_failure_rates_are_as_stated(name):
 @EACH
 def test_beats_uniform(search, name):
     if (type(search), name) in POINTLESS:
-        pytest.skip("slopes say nothing here")
+        pytest.skip("gradients say nothing here")
     assert gain(name, played(search, name)[1]) > GAIN[search]
 
 
@@ -78,7 +78,7 @@ def test_beats_uniform_in_fifty_dimensions(search, name):
 @EACH
 def test_is_not_much_worse_than_uniform_where_nothing_can_be_learned(search):
     if (type(search), "needle") in POINTLESS:
-        pytest.skip("slopes say nothing here")
+        pytest.skip("gradients say nothing here")
     assert gain("needle", played(search, "needle")[1]) > 1 / 1.6
 
 

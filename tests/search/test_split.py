@@ -52,10 +52,10 @@ def test_parts_learn_from_their_own_coordinates():
     search = Split({"x": Gradient()}, Uniform())
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)
     state = search.init(jax.random.key(1), CUBE, 16)
-    for slopes in (True, False):
+    for gradients in (True, False):
         u, state = ask(state, CUBE, 16)
         plan = search.plan(state, CUBE, 16)
-        assert bool(plan.slopes) == slopes
+        assert bool(plan.differentiate) == gradients
         gradient = jnp.zeros_like(u).at[:, 0].set(1.0).at[:, 2].set(-1.0)
         told = tell_of(search, state, CUBE, u, 1 + u[:, 0], gradient)
         state = tell(state, CUBE, told)

@@ -169,7 +169,7 @@ def simulate(
         listed = [rows] if isinstance(rows, Mapping) else list(rows)
         points = np.stack([problem.space.flatten(problem.space.coerce(row)) for row in listed])
     return falsify(
-        problem, searches.Listed(points), len(points),
+        problem, searches.PointList(points), len(points),
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
         confirm=False, progress=progress,
     )  # fmt: skip

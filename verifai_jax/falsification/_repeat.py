@@ -27,7 +27,7 @@ from verifai_jax.evaluation.engine import Engine
 from verifai_jax.falsification.lockstep import lockstep
 from verifai_jax.falsification.validation import check_options, check_search, usable, usual_batch
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Evaluated, Search
+from verifai_jax.search import Observations, Search
 
 SIMULATIONS_A_CALL = 512
 """Of each seed between two looks at who has found a failure."""
@@ -195,7 +195,9 @@ def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precisi
             temperature: Any = search.temperature(state) if search.wants_gradient else 1.0
             simulate = jax.vmap(engine.told_row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
-            told = Evaluated(u, row.rho.astype(jnp.float32), row.status == Status.OK, row.gradient)
+            told = Observations(
+                u, row.rho.astype(jnp.float32), row.status == Status.OK, row.gradient
+            )
             return search.tell(state, cube, told) if search.learns else state, row.rho
 
         state, rho = jax.lax.scan(step, state, jnp.arange(rounds, dtype=jnp.int32))

@@ -18,7 +18,7 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Evaluated, Search
+from verifai_jax.search import Observations, Search
 from verifai_jax.search.base import CLAUSES
 
 VALUES_AT_ONCE, SLOPES_AT_ONCE = 256, 64
@@ -58,19 +58,19 @@ def lockstep(
     while True:
         u, plan, state = ask(state)
         u, rows, slopes, temperature = map(
-            np.asarray, (u, plan.rows, plan.slopes, plan.temperature)
+            np.asarray, (u, plan.rows, plan.differentiate, plan.temperature)
         )
         left = np.array([budget - len(each) for each in found])
         left[failed] *= not stop_early
         rows = np.minimum(rows, left)
         if not rows.any():
             break
-        told = Evaluated(
+        told = Observations(
             u=u,  # pyright: ignore[reportArgumentType]
             rho=np.full((n, batch), np.nan, np.float32),  # pyright: ignore[reportArgumentType]
-            counted=np.zeros((n, batch), bool),  # pyright: ignore[reportArgumentType]
+            valid=np.zeros((n, batch), bool),  # pyright: ignore[reportArgumentType]
             clauses=np.zeros((n, batch, CLAUSES), np.float32),  # pyright: ignore[reportArgumentType]
-            slopes=np.zeros((n, batch, CLAUSES, cube.dim), np.float32),  # pyright: ignore[reportArgumentType]
+            clause_gradients=np.zeros((n, batch, CLAUSES, cube.dim), np.float32),  # pyright: ignore[reportArgumentType]
         )
         asked = np.arange(batch) < rows[:, None]
         for kind in (False, True):
@@ -82,10 +82,10 @@ def lockstep(
                 u[who, row], simulation_keys, who, numbers, temperature[who, row]
             )
             told.rho[who, row] = result["rho"]  # pyright: ignore[reportIndexIssue]
-            told.counted[who, row] = result["status"] == Status.OK  # pyright: ignore[reportIndexIssue]
+            told.valid[who, row] = result["status"] == Status.OK  # pyright: ignore[reportIndexIssue]
             told.clauses[who, row] = result["clauses"]  # pyright: ignore[reportOptionalSubscript]
             if kind:
-                told.slopes[who, row] = result["slopes"]  # pyright: ignore[reportOptionalSubscript]
+                told.clause_gradients[who, row] = result["slopes"]  # pyright: ignore[reportOptionalSubscript]
         for seed in range(n):
             found[seed].extend(told.rho[seed, : rows[seed]].tolist())
             flags[seed].extend([bool(slopes[seed])] * int(rows[seed]))

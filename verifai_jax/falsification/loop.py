@@ -186,7 +186,7 @@ class Rounds:
 
     def _evaluated(self, points: Any, first: int) -> Evaluation:
         temperature = self._proposals.temperature
-        if self._slopes_engine is None or not self._proposals.slopes:
+        if self._slopes_engine is None or not self._proposals.differentiate:
             if self._slopes_engine is not None:
                 temperature = 1.0  # Nothing is differentiated.
             return self.engine.evaluate(points, self.simulation_key, first, temperature)
@@ -220,7 +220,7 @@ class Rounds:
         if self._objective is not None and all(name in proper for name in names):
             each = proper[names].to_numpy(np.float64)
             rho = self._objective(each, each < 0).astype(np.float32)
-        self._proposals.warm(self.problem.space.points(proper), rho)
+        self._proposals.warm_start(self.problem.space.points(proper), rho)
         self._keep()
 
     def save(self, seldom: bool = False) -> None:

@@ -113,9 +113,9 @@ def check_gradient(problem: Problem, search: Search) -> None:
 def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
     """The search as it can work on this problem, and notes on what it does without.
 
-    A portfolio does without slopes where there are none.
+    A portfolio does without gradients where there are none.
     """
-    if not isinstance(search, searches.Portfolio) or not search.slopes:
+    if not isinstance(search, searches.Portfolio) or not search.gradients:
         return search, ()
     if problem.black_box:
         why = "the system is a black box"
@@ -127,7 +127,7 @@ def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
         why = "the robustness is constant almost everywhere"
     else:
         return search, ()
-    return search.without_slopes(), (f"portfolio without slopes: {why}",)
+    return search.without_gradients(), (f"portfolio without gradients: {why}",)
 
 
 def check_rule(search: Search, rule: StoppingRule | None) -> None:

@@ -13,7 +13,7 @@ from verifai_jax.core.cube import Cube as Cube
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.search.annealing import Annealing as Annealing
 from verifai_jax.search.bandit import Bandit as Bandit
-from verifai_jax.search.base import Evaluated as Evaluated
+from verifai_jax.search.base import Observations as Observations
 from verifai_jax.search.base import Plan as Plan
 from verifai_jax.search.base import Search as Search
 from verifai_jax.search.bayes import Bayes as Bayes
@@ -26,8 +26,8 @@ from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
 from verifai_jax.search.gradient import Gradient as Gradient
 from verifai_jax.search.grid import Grid as Grid
 from verifai_jax.search.halton import Halton as Halton
-from verifai_jax.search.listed import Listed as Listed
 from verifai_jax.search.mutation import Mutation as Mutation
+from verifai_jax.search.point_list import PointList as PointList
 from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.split import Split as Split

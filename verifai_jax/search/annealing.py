@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
-    Evaluated,
+    Observations,
     Search,
     check_count,
     check_fraction,
@@ -54,7 +54,7 @@ class AnnealingState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Annealing(Search):
+class Annealing(Search[AnnealingState]):
     """Parallel tempering; each row of the batch is a chain at a temperature of its own.
 
     **Arguments:**
@@ -134,11 +134,11 @@ class Annealing(Search):
         anywhere = jnp.isinf(state.energy[turn]) | (self._coldness(chains) == 0)[turn]
         return jnp.where(anywhere[:, None], prior, u), state._replace(asks=state.asks + 1)
 
-    def tell(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
-        batch, chains = len(evaluated.rho), len(state.energy)
+    def tell(self, state: AnnealingState, cube: Cube, observations: Observations) -> AnnealingState:
+        batch, chains = len(observations.rho), len(state.energy)
         turn = self._turn(state, batch)
-        usable = evaluated.judged
-        new = evaluated.score
+        usable = observations.usable
+        new = observations.score
         before = state.energy[turn]
         spread = self._spread(state, turn, new)
         coldness = self._coldness(chains) / jnp.where(spread > 0, spread, 1.0)
@@ -155,7 +155,7 @@ class Annealing(Search):
         step = state.step[turn] * jnp.exp(rate)
         state = state._replace(
             tells=state.tells + 1,
-            u=state.u.at[turn].set(jnp.where(accepted[:, None], evaluated.u, state.u[turn])),
+            u=state.u.at[turn].set(jnp.where(accepted[:, None], observations.u, state.u[turn])),
             energy=state.energy.at[turn].set(energy),
             rests=state.rests.at[turn].set(rests.astype(jnp.int32)),
             step=state.step.at[turn].set(jnp.clip(step, LEAST_SCALE, LARGEST_SCALE)),
@@ -167,12 +167,14 @@ class Annealing(Search):
             u=state.u[place], energy=state.energy[place], rests=state.rests[place]
         )
 
-    def warm(self, state: AnnealingState, cube: Cube, evaluated: Evaluated) -> AnnealingState:
+    def warm_start(
+        self, state: AnnealingState, cube: Cube, observations: Observations
+    ) -> AnnealingState:
         """Put the chains at the best points, the best at the coldest."""
-        usable = evaluated.judged
-        new = evaluated.score
+        usable = observations.usable
+        new = observations.score
         energy = jnp.concatenate([new, state.energy])
-        u = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
+        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
         best = jnp.argsort(energy)[: len(state.energy)]
         spread = jnp.where(state.spread == 0, _best_to_median(new), state.spread)
         return state._replace(u=u[best], energy=energy[best], spread=spread)

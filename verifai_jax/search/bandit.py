@@ -28,7 +28,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, check_positive
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    check_count,
+    check_fraction,
+    check_positive,
+)
 
 BISECTIONS = 20
 
@@ -41,7 +47,7 @@ class BanditState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bandit(Search):
+class Bandit(Search[BanditState]):
     """Upper confidence bounds over buckets of each coordinate, and buckets of those buckets.
 
     Ordered cells of discrete coordinates are grouped into buckets; unordered ones are an arm each.
@@ -108,10 +114,10 @@ class Bandit(Search):
         u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
         return u, state._replace(round=state.round + 1)
 
-    def tell(self, state: BanditState, cube: Cube, evaluated: Evaluated) -> BanditState:
-        usable = evaluated.judged
-        new = evaluated.score
-        u = jnp.where(usable[:, None], evaluated.u, 0.5)
+    def tell(self, state: BanditState, cube: Cube, observations: Observations) -> BanditState:
+        usable = observations.usable
+        new = observations.score
+        u = jnp.where(usable[:, None], observations.u, 0.5)
         u = u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
         score = jnp.concatenate([new, state.score])
         # Points without a verdict push none out.

@@ -1,8 +1,8 @@
-"""What every search is: `init / ask / tell` over the unit cube.
+"""The contract of every search: `init / ask / tell` over the unit cube.
 
     state = search.init(key, cube, batch)
     u, state = search.ask(state, cube, batch)                            # [batch, d] in [0, 1]
-    state = search.tell(state, cube, Evaluated(u, rho, counted, gradient))
+    state = search.tell(state, cube, Observations(u, rho, valid, gradient))
 
 A search is a frozen dataclass of hyper-parameters; its functions are pure and its state is a
 pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing of features.
@@ -10,7 +10,7 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 
 import abc
 import math
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,54 +20,61 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.core.cube import Cube
 
 CLAUSES = 4
-"""Clauses that `Evaluated` tells apart."""
+"""Number of clauses that `Observations` distinguishes."""
 
 
-class Evaluated(NamedTuple):
-    """A batch of points and what came of them.
+class Observations(NamedTuple):
+    """A batch of points and the results of their simulations.
 
+    - `u`: the points, in the unit cube.
     - `rho`: robustness; negative is a failure.
-    - `counted`: False for padding and for simulations without a verdict: such a row must not
+    - `valid`: False for padding and for simulations without a verdict: such a row must not
       influence the search, whatever its other entries are (NaN included).
-    - `gradient`: of the smooth robustness with respect to `u`; only where a search wants it.
-    - `clauses`: values of what has to be broken together, without unit, all negative in a failure;
-      very low where there are fewer than `CLAUSES`. Only for a search that wants clauses.
-    - `slopes`: their derivatives with respect to `u`; zero in rounds that asked for none.
+    - `gradient`: of the smooth robustness with respect to `u`; only for a search that
+      `wants_gradient`.
+    - `clauses`: values of the clauses to violate together, without unit, all negative in a failure;
+      very low where there are fewer than `CLAUSES`. Only for a search that `wants_clauses`.
+    - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
+      differentiate.
     """
 
     u: Float[Array, "n d"]
     rho: Float[Array, " n"]
-    counted: Bool[Array, " n"]
+    valid: Bool[Array, " n"]
     gradient: Float[Array, "n d"] | None = None
     clauses: Float[Array, "n clauses"] | None = None
-    slopes: Float[Array, "n clauses d"] | None = None
+    clause_gradients: Float[Array, "n clauses d"] | None = None
 
     @property
-    def judged(self) -> Bool[Array, " n"]:
-        """Rows from which something can be learned: counted ones with a finite robustness."""
-        return self.counted & jnp.isfinite(self.rho)
+    def usable(self) -> Bool[Array, " n"]:
+        """Rows to learn from: the valid ones with a finite robustness."""
+        return self.valid & jnp.isfinite(self.rho)
 
     @property
     def score(self) -> Float[Array, " n"]:
-        """Robustness with all failures equally good, 0; infinite where nothing can be learned."""
-        return jnp.where(self.judged, jnp.maximum(self.rho, 0.0), jnp.inf)
+        """Robustness with all failures equally good, 0; infinite in rows that are not usable."""
+        return jnp.where(self.usable, jnp.maximum(self.rho, 0.0), jnp.inf)
 
 
 class Plan(NamedTuple):
-    """What a search that wants clauses has in mind for the points of its last `ask`.
+    """The simulations that a search with `wants_clauses` wants of its last proposals.
 
-    - `rows`: how many of them, from the first on, are to be simulated; the others are told as not
-      counted.
-    - `slopes`: whether with the slopes of the clauses, which cost another simulation or two.
-    - `temperature`: of the smooth robustness whose slopes they are, row by row, without unit.
+    - `rows`: number of proposals to simulate, from the first on; the others are told as not valid.
+    - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
+      another simulation or two.
+    - `temperature`: of the smooth robustness to differentiate, row by row, without unit.
     """
 
     rows: Int[Array, ""]
-    slopes: Bool[Array, ""]
+    differentiate: Bool[Array, ""]
     temperature: Float[Array, " batch"]
 
 
-class Search(abc.ABC):
+State = TypeVar("State")
+"""The state of a search: a pytree of arrays."""
+
+
+class Search(abc.ABC, Generic[State]):
     """The contract; `verifai_jax.testing.check_search` tests it.
 
     `cube` and `batch` are static under `jit`. A state from `init` with one `batch` takes part in
@@ -76,72 +83,74 @@ class Search(abc.ABC):
     """
 
     wants_gradient: ClassVar[bool] = False
-    """Whether `tell` needs `Evaluated.gradient`."""
+    """Whether `tell` needs `Observations.gradient`."""
 
     wants_clauses: ClassVar[bool] = False
-    """Whether `tell` needs `Evaluated.clauses` and, in rounds that `plan` says, `slopes`."""
+    """Whether `tell` needs `Observations.clauses`, with `clause_gradients` in the rounds whose
+    `plan` says so."""
 
     samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""
 
     learns: ClassVar[bool] = True
-    """Whether `tell` changes what is asked next; False for sequences fixed from the start."""
+    """Whether `tell` changes the next proposals; False for sequences fixed from the start."""
 
     most_at_once: ClassVar[int] = 1024
     """Points in a round beyond which more rounds are worth more than larger ones."""
 
-    def check(self, cube: Cube) -> None:  # noqa: B027 - most searches work on every cube
+    def check(self, cube: Cube) -> None:
         """Raise `ValueError` if this search cannot work on this cube."""
 
     def total(self, cube: Cube) -> int | None:
-        """How many points there are in all; None where they never end."""
+        """Return the number of points in all; None for a search that never ends."""
         return None
 
     @abc.abstractmethod
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> Any:
-        """The state before the first round; all randomness comes from `key`."""
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> State:
+        """Return the state before the first round; all randomness comes from `key`."""
 
     @abc.abstractmethod
-    def ask(self, state: Any, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], Any]:
-        """The next points to simulate."""
+    def ask(self, state: State, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], State]:
+        """Propose the next points to simulate."""
 
     @abc.abstractmethod
-    def tell(self, state: Any, cube: Cube, evaluated: Evaluated) -> Any:
-        """Learn from the points of the last `ask`, which are in `evaluated`, row by row."""
+    def tell(self, state: State, cube: Cube, observations: Observations) -> State:
+        """Learn from the points of the last `ask`, row by row."""
 
-    def warm(self, state: Any, cube: Cube, evaluated: Evaluated) -> Any:
-        """Learn from points of an earlier table, a batch of them, before the first `ask`."""
-        return self.tell(state, cube, evaluated)
+    def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
+        """Learn from a batch of an earlier table's points, before the first `ask`."""
+        return self.tell(state, cube, observations)
 
-    def plan(self, state: Any, cube: Cube, batch: int) -> Plan:
-        """Which rows of the last `ask`, and with what; only where `wants_clauses`."""
+    def plan(self, state: State, cube: Cube, batch: int) -> Plan:
+        """Return the simulations wanted of the last proposals; only where `wants_clauses`."""
         raise NotImplementedError(f"{type(self).__name__} has no plans")
 
-    def temperature(self, state: Any) -> Float[Array, ""]:
-        """Of the smooth robustness to differentiate next; only where `wants_gradient`."""
+    def temperature(self, state: State) -> Float[Array, ""]:
+        """Return the temperature of the smooth robustness; only where `wants_gradient`."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
 
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Standard normal numbers from uniform ones in `[0, 1)`, finite at 0."""
+    """Map uniform numbers in `[0, 1)` to standard normal ones, finite at 0."""
     return ndtri(jnp.maximum(uniform, np.float32(2**-25)))
 
 
-def check_positive(name: str, value: Any) -> None:
+def check_positive(name: str, value: object) -> None:
     """Raise `ValueError` unless `value` is a positive finite number."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and 0 < value < math.inf):
+    number = math.nan if isinstance(value, bool) else value
+    if not (isinstance(number, int | float) and 0 < number < math.inf):
         raise ValueError(f"{name} must be positive and finite; got {value!r}")
 
 
-def check_fraction(name: str, value: Any, *, or_zero: bool = False) -> None:
+def check_fraction(name: str, value: object, *, or_zero: bool = False) -> None:
     """Raise `ValueError` unless `value` is a number in `(0, 1]`, or in `[0, 1]`."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and (0 < value <= 1 or (or_zero and value == 0))):
+    number = math.nan if isinstance(value, bool) else value
+    within = isinstance(number, int | float) and (0 < number <= 1 or (or_zero and number == 0))
+    if not within:
         raise ValueError(f"{name} must be in {'[' if or_zero else '('}0, 1]; got {value!r}")
 
 
-def check_count(name: str, value: Any, least: int = 1) -> None:
+def check_count(name: str, value: object, least: int = 1) -> None:
     """Raise `ValueError` unless `value` is an integer of at least `least`."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")

@@ -24,12 +24,18 @@ from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    check_count,
+    check_fraction,
+    standard_normal,
+)
 from verifai_jax.search.gaussian_process import (
     GaussianProcess,
     Hyper,
-    Observations,
     Posterior,
+    TrainingData,
 )
 from verifai_jax.search.halton import halton_points
 
@@ -59,7 +65,7 @@ class BayesState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Bayes(Search):
+class Bayes(Search[BayesState]):
     """Gaussian process on the robustness; asks where it may be negative.
 
     **Arguments:**
@@ -153,16 +159,16 @@ class Bayes(Search):
         chosen = jnp.where(again[:, None], anywhere[:batch], chosen)
         return jnp.where(prior[:, None], fresh, chosen), asked
 
-    def tell(self, state: BayesState, cube: Cube, evaluated: Evaluated) -> BayesState:
-        usable = evaluated.counted & (evaluated.rho < jnp.inf)
-        score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
+    def tell(self, state: BayesState, cube: Cube, observations: Observations) -> BayesState:
+        usable = observations.valid & (observations.rho < jnp.inf)
+        score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
         number = state.told + jnp.arange(len(score), dtype=jnp.uint32)
         progress = jnp.min(score) < 0.99 * jnp.min(state.score)
         progress |= jnp.any(score == 0)
         told = jnp.sum(usable, dtype=jnp.int32)
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
         luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
-        u = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.u])
+        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
         score = jnp.concatenate([score, state.score])
         luck = jnp.concatenate([luck, state.luck])
         kept = _kept(score, luck, self.capacity)
@@ -180,9 +186,9 @@ class Bayes(Search):
 
     def _fit(self, state: BayesState, cube: Cube) -> Hyper:
         some = _kept(state.score, state.luck, min(FIT_POINTS, self.capacity))
-        seen = _observations(state, cube)
+        data = _training_data(state, cube)
         return _process(cube).fit(
-            state.hyper, jax.tree.map(lambda leaf: leaf[some], seen), FIT_STEPS
+            state.hyper, jax.tree.map(lambda leaf: leaf[some], data), FIT_STEPS
         )
 
     def _propose(
@@ -194,7 +200,7 @@ class Bayes(Search):
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
         """Points that the acquisition likes best."""
-        posterior = _process(cube).condition(state.hyper, _observations(state, cube))
+        posterior = _process(cube).condition(state.hyper, _training_data(state, cube))
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
         if self.acquisition == "thompson":
@@ -366,7 +372,7 @@ def _encoded(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
     return u.at[:, cube.discrete].set(jnp.where(codes, cells, cube.centres(cells)))
 
 
-def _observations(state: BayesState, cube: Cube) -> Observations:
+def _training_data(state: BayesState, cube: Cube) -> TrainingData:
     """What the process is told: a logarithm of the robustness, with mean 0 and deviation 1."""
     mask = jnp.isfinite(state.score)
     score = jnp.where(mask, state.score, 0.0)
@@ -377,7 +383,7 @@ def _observations(state: BayesState, cube: Cube) -> Observations:
     count = jnp.maximum(jnp.sum(mask), 1)
     y = y - jnp.sum(y, where=mask) / count
     std = jnp.sqrt(jnp.sum(y**2, where=mask) / count)
-    return Observations(_encoded(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
+    return TrainingData(_encoded(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
 
 
 def _kept(score: Float[Array, " n"], luck: Float[Array, " n"], count: int) -> Int[Array, " count"]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction
+from verifai_jax.search.base import Observations, Search, check_count, check_fraction
 
 MOST_COMBINATIONS = 1024
 MOST_BINS = 2**22
@@ -30,7 +30,7 @@ class CECompatState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CECompat(Search):
+class CECompat(Search[CECompatState]):
     """VerifAI's one-sample histogram rule, exactly.
 
     Histograms start at the prior. Those of continuous coordinates have equally wide buckets, those
@@ -108,11 +108,11 @@ class CECompat(Search):
         lengths = np.array(cube.lengths, np.int32)
         return u.at[:, lengths].set(pick[:, lengths]), after
 
-    def tell(self, state: CECompatState, cube: Cube, evaluated: Evaluated) -> CECompatState:
-        fails = evaluated.counted & (evaluated.rho < self.threshold)  # False where it is NaN
+    def tell(self, state: CECompatState, cube: Cube, observations: Observations) -> CECompatState:
+        fails = observations.valid & (observations.rho < self.threshold)  # False where it is NaN
         if cube.dim == 0:
             return state
-        which = self._set(evaluated.u, cube)
+        which = self._set(observations.u, cube)
         sets, _, most = state.histograms.shape
         own = jax.nn.one_hot(which, sets, dtype=jnp.int32) * fails[:, None]
         total = jnp.sum(own, axis=0)
@@ -120,7 +120,7 @@ class CECompat(Search):
         later = jnp.take_along_axis(total - jnp.cumsum(own, axis=0), which[:, None], axis=1)[:, 0]
         share = jnp.where(fails, (1 - self.alpha) * self._power(later), 0.0)
         new = jnp.zeros((sets, cube.dim, most), jnp.float32)
-        bins = self._bins(evaluated.u, cube)
+        bins = self._bins(observations.u, cube)
         new = new.at[which[:, None], np.arange(cube.dim), bins].add(share[:, None])
         histograms = self._power(total)[:, None, None] * state.histograms + new
         return state._replace(histograms=histograms)

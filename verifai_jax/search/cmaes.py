@@ -28,7 +28,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    check_count,
+    check_fraction,
+    standard_normal,
+)
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 
@@ -62,7 +68,7 @@ class CMAESState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CMAES(Search):
+class CMAES(Search[CMAESState]):
     """Covariance matrix adaptation, with restarts; a generation is a batch.
 
     Batches smaller than a population should be (`4 + 3 log d`) are collected until there is one.
@@ -131,9 +137,9 @@ class CMAES(Search):
         u = jnp.where(prior[:, None], fresh, drawn)
         return u, state._replace(round=state.round + 1, explored=number[-1])
 
-    def tell(self, state: CMAESState, cube: Cube, evaluated: Evaluated) -> CMAESState:
-        batch = len(evaluated.rho)
-        u, score = _judged(evaluated)
+    def tell(self, state: CMAESState, cube: Cube, observations: Observations) -> CMAESState:
+        batch = len(observations.rho)
+        u, score = _scored(observations)
         # Points of exploration are far away from the run: they say nothing about its next step.
         outside = self._explores(state, batch) & (state.generation > 0)
         state = _reserved(state, u, jnp.where(outside, score, jnp.inf))
@@ -149,9 +155,9 @@ class CMAES(Search):
         complete = state.filled * batch == len(state.score)
         return _where(complete, self._next(state, cube), state)
 
-    def warm(self, state: CMAESState, cube: Cube, evaluated: Evaluated) -> CMAESState:
+    def warm_start(self, state: CMAESState, cube: Cube, observations: Observations) -> CMAESState:
         """Begin with small steps at the best of these points."""
-        u, score = _judged(evaluated)
+        u, score = _scored(observations)
         # The best of all calls so far is the mean of the run that would begin now.
         better = jnp.min(score, initial=jnp.inf) < state.best
         found = _reserved(state._replace(reserve_score=jnp.float32(jnp.inf)), u, score)
@@ -327,11 +333,11 @@ def _margins(cube: Cube) -> Float[np.ndarray, " n"]:
     )
 
 
-def _judged(evaluated: Evaluated) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+def _scored(observations: Observations) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
     """Points and their scores: 0 for all failures, infinite where there is no verdict."""
-    usable = evaluated.counted & (evaluated.rho < jnp.inf)
-    score = jnp.where(usable, jnp.clip(evaluated.rho, 0.0, LARGEST), jnp.inf)
-    return jnp.where(usable[:, None], evaluated.u, 0.5), score
+    usable = observations.valid & (observations.rho < jnp.inf)
+    score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
+    return jnp.where(usable[:, None], observations.u, 0.5), score
 
 
 def _reserved(state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n"]) -> CMAESState:

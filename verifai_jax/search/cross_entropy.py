@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
-    Evaluated,
+    Observations,
     Search,
     check_count,
     check_fraction,
@@ -47,7 +47,7 @@ class CrossEntropyState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class CrossEntropy(Search):
+class CrossEntropy(Search[CrossEntropyState]):
     """Cross-entropy over Gaussian and categorical mixtures around the best points so far.
 
     **Arguments:**
@@ -105,11 +105,13 @@ class CrossEntropy(Search):
         explored = state.explored + batch - exploited
         return u, state._replace(round=state.round + 1, explored=explored)
 
-    def tell(self, state: CrossEntropyState, cube: Cube, evaluated: Evaluated) -> CrossEntropyState:
-        usable = evaluated.judged
-        score = evaluated.score
+    def tell(
+        self, state: CrossEntropyState, cube: Cube, observations: Observations
+    ) -> CrossEntropyState:
+        usable = observations.usable
+        score = observations.score
         # New points come first: of equally good ones the first, so the newest, are kept.
-        u = jnp.where(usable[:, None], evaluated.u, 0.5)
+        u = jnp.where(usable[:, None], observations.u, 0.5)
         points = jnp.concatenate([u, state.elite])
         scores = jnp.concatenate([score, state.score])
         _, best = jax.lax.top_k(-scores, len(state.score))

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Plan, Search, check_count, check_fraction
+from verifai_jax.search.base import Observations, Plan, Search, check_count, check_fraction
 
 AT_ONCE = 16
 """Failures archived in a round at most."""
@@ -46,7 +46,7 @@ class DiverseState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Diverse(Search):
+class Diverse(Search[DiverseState]):
     """Another search, kept away from failures already found.
 
     **Arguments:**
@@ -143,27 +143,29 @@ class Diverse(Search):
         u, inner = self.search.ask(state.inner, cube, batch)
         return u, state._replace(inner=inner)
 
-    def tell(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> DiverseState:
-        return self._told(state, cube, evaluated, warm=False)
+    def tell(self, state: DiverseState, cube: Cube, observations: Observations) -> DiverseState:
+        return self._told(state, cube, observations, warm=False)
 
-    def warm(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> DiverseState:
-        return self._told(state, cube, evaluated, warm=True)
+    def warm_start(
+        self, state: DiverseState, cube: Cube, observations: Observations
+    ) -> DiverseState:
+        return self._told(state, cube, observations, warm=True)
 
     def _told(
-        self, state: DiverseState, cube: Cube, evaluated: Evaluated, warm: bool
+        self, state: DiverseState, cube: Cube, observations: Observations, warm: bool
     ) -> DiverseState:
-        judged = evaluated.judged
-        u = jnp.where(judged[:, None], evaluated.u, 0.5)
-        size = jnp.sum(jnp.where(judged, jnp.abs(evaluated.rho), 0.0))
+        usable = observations.usable
+        u = jnp.where(usable[:, None], observations.u, 0.5)
+        size = jnp.sum(jnp.where(usable, jnp.abs(observations.rho), 0.0))
         before = state.count
         state = state._replace(
             round=state.round + 1,
             size=state.size + size.astype(jnp.float32),
-            seen=state.seen + jnp.sum(judged),
+            seen=state.seen + jnp.sum(usable),
         )
-        state = self._archived(state, cube, u, judged & (evaluated.rho < 0))
+        state = self._archived(state, cube, u, usable & (observations.rho < 0))
         found = state.count > before
-        raised = self._raised(state, cube, u, jnp.where(judged, evaluated.rho, jnp.inf))
+        raised = self._raised(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
         nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
         progress = found | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
         idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
@@ -174,12 +176,12 @@ class Diverse(Search):
             radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
             level=jnp.where(found | tired, jnp.inf, jnp.minimum(state.level, nearest)),
         )
-        state = self._remembered(state, cube, u, jnp.where(judged, evaluated.rho, jnp.inf))
+        state = self._remembered(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
         # What it had come to without finding anything leads nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
-        told = self._deflated(state, cube, evaluated)
-        verb = self.search.warm if warm else self.search.tell
+        told = self._deflated(state, cube, observations)
+        verb = self.search.warm_start if warm else self.search.tell
         inner = verb(state.inner, cube, told)
         if self.search.learns and self.search.total(cube) is None:
             inner = jax.lax.cond(found | tired, lambda: self._afresh(state, cube), lambda: inner)
@@ -230,14 +232,16 @@ class Diverse(Search):
         near, _ = self._nearness(state, cube, u)
         return jnp.where(near > 0, jnp.maximum(rho, 0.0) + self._scale(state) * near, rho)
 
-    def _deflated(self, state: DiverseState, cube: Cube, evaluated: Evaluated) -> Evaluated:
-        judged = evaluated.judged
-        u = jnp.where(judged[:, None], evaluated.u, 0.5)
+    def _deflated(
+        self, state: DiverseState, cube: Cube, observations: Observations
+    ) -> Observations:
+        usable = observations.usable
+        u = jnp.where(usable[:, None], observations.u, 0.5)
         near, nearest = self._nearness(state, cube, u)
-        inside = judged & (near > 0)
-        rho = jnp.where(inside, self._raised(state, cube, u, evaluated.rho), evaluated.rho)
-        told = evaluated._replace(rho=rho)
-        if evaluated.gradient is None and evaluated.clauses is None:
+        inside = usable & (near > 0)
+        rho = jnp.where(inside, self._raised(state, cube, u, observations.rho), observations.rho)
+        told = observations._replace(rho=rho)
+        if observations.gradient is None and observations.clauses is None:
             return told
 
         offset = jnp.where(np.array(cube.levels) == 0, u - state.archive[nearest], 0.0)
@@ -245,22 +249,22 @@ class Diverse(Search):
         # Of the root mean square over the coordinates.
         away = offset / (max(cube.dim, 1) * jnp.maximum(length, 1e-6))[:, None]
         falls = -away / (1.5 * state.radius)
-        if evaluated.gradient is not None:
-            own = jnp.where((evaluated.rho > 0)[:, None], evaluated.gradient, 0.0)
+        if observations.gradient is not None:
+            own = jnp.where((observations.rho > 0)[:, None], observations.gradient, 0.0)
             raised = own + self._scale(state) * falls
-            told = told._replace(gradient=jnp.where(inside[:, None], raised, evaluated.gradient))
-        if evaluated.clauses is not None:
+            told = told._replace(gradient=jnp.where(inside[:, None], raised, observations.gradient))
+        if observations.clauses is not None:
             # These have no unit, and of clauses that there are not the values stay very low.
-            there = inside[:, None] & (evaluated.clauses > ABSENT)
-            lifted = jnp.maximum(evaluated.clauses, 0.0) + near[:, None]
-            told = told._replace(clauses=jnp.where(there, lifted, evaluated.clauses))
-            slopes = evaluated.slopes
-            if slopes is not None:
-                own = jnp.where((evaluated.clauses > 0)[:, :, None], slopes, 0.0)
+            there = inside[:, None] & (observations.clauses > ABSENT)
+            lifted = jnp.maximum(observations.clauses, 0.0) + near[:, None]
+            told = told._replace(clauses=jnp.where(there, lifted, observations.clauses))
+            gradients = observations.clause_gradients
+            if gradients is not None:
+                own = jnp.where((observations.clauses > 0)[:, :, None], gradients, 0.0)
                 # Zero where the round asked for none.
-                asked = there & jnp.any(slopes != 0)
-                own = jnp.where(asked[:, :, None], own + falls[:, None, :], slopes)
-                told = told._replace(slopes=own)
+                asked = there & jnp.any(gradients != 0)
+                own = jnp.where(asked[:, :, None], own + falls[:, None, :], gradients)
+                told = told._replace(clause_gradients=own)
         return told
 
     def _remembered(
@@ -280,7 +284,7 @@ class Diverse(Search):
         inner = self.search.init(jax.random.fold_in(state.key, state.round), cube, batch)
         known = jnp.isfinite(state.rho)
         raised = self._raised(state, cube, state.points, jnp.where(known, state.rho, 1.0))
-        return self.search.warm(inner, cube, Evaluated(state.points, raised, known))
+        return self.search.warm_start(inner, cube, Observations(state.points, raised, known))
 
 
 def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:

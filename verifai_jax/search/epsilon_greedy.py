@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
-    Evaluated,
+    Observations,
     Search,
     check_count,
     check_fraction,
@@ -51,7 +51,7 @@ class EpsilonGreedyState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class EpsilonGreedy(Search):
+class EpsilonGreedy(Search[EpsilonGreedyState]):
     """Draws around the best points so far, and a share `epsilon` from the prior.
 
     **Arguments:**
@@ -140,11 +140,11 @@ class EpsilonGreedy(Search):
         return jnp.where(greedy[:, None], u, prior), state._replace(asks=state.asks + 1)
 
     def tell(
-        self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
+        self, state: EpsilonGreedyState, cube: Cube, observations: Observations
     ) -> EpsilonGreedyState:
-        usable = evaluated.judged
-        exploring = self._exploring(state, len(evaluated.rho))
-        score = evaluated.score
+        usable = observations.usable
+        exploring = self._exploring(state, len(observations.rho))
+        score = observations.score
 
         # What greed gained over the prior; equally good draws count half.
         greedy = usable & ~exploring
@@ -157,7 +157,7 @@ class EpsilonGreedy(Search):
         # Whatever the robustness says, close to failures there are others.
         useless &= state.score[0] > 0
 
-        state = self._learned(state, evaluated.u, score)
+        state = self._learned(state, observations.u, score)
         stale = jnp.where(state.begun < self.begin, 0, state.stale)
         again = (stale >= self.patience * max(len(score), self.begin)) | useless
         # The newest draws of the prior first.
@@ -174,12 +174,12 @@ class EpsilonGreedy(Search):
             better=jnp.where(again, 0.0, better),
         )
 
-    def warm(
-        self, state: EpsilonGreedyState, cube: Cube, evaluated: Evaluated
+    def warm_start(
+        self, state: EpsilonGreedyState, cube: Cube, observations: Observations
     ) -> EpsilonGreedyState:
         """Take the best points; what the prior gives has to be seen yet."""
-        score = evaluated.score
-        return self._learned(state, evaluated.u, score)._replace(stale=state.stale)
+        score = observations.score
+        return self._learned(state, observations.u, score)._replace(stale=state.stale)
 
     def _learned(
         self, state: EpsilonGreedyState, u: Float[Array, "n d"], score: Float[Array, " n"]

@@ -35,7 +35,7 @@ class Hyper(NamedTuple):
     noise: Float[Array, ""]  # variance of the noise
 
 
-class Observations(NamedTuple):
+class TrainingData(NamedTuple):
     """Points, their targets, and which rows there are."""
 
     x: Float[Array, "n d"]
@@ -97,10 +97,10 @@ class GaussianProcess:
         differ = (a[:, None, codes] != b[None, :, codes]).astype(value.dtype)
         return value * jnp.exp(-differ @ inverse[codes])
 
-    def evidence(self, hyper: Hyper, seen: Observations) -> Float[Array, ""]:
+    def evidence(self, hyper: Hyper, data: TrainingData) -> Float[Array, ""]:
         """Logarithm of the marginal likelihood of the observations."""
-        return _evidence(self._noisy(hyper, seen.x, seen.mask), _masked(seen)) - (
-            0.5 * math.log(2 * math.pi) * jnp.sum(seen.mask)
+        return _evidence(self._noisy(hyper, data.x, data.mask), _masked(data)) - (
+            0.5 * math.log(2 * math.pi) * jnp.sum(data.mask)
         )
 
     def log_prior(self, hyper: Hyper) -> Float[Array, ""]:
@@ -117,14 +117,14 @@ class GaussianProcess:
         lengths = lengths + jnp.sum((hyper.lengths[codes] - mean) ** 2)
         return -0.5 * (lengths + hyper.variance**2 + (hyper.noise + 6.0) ** 2 / 2)
 
-    def fit(self, hyper: Hyper, seen: Observations, steps: int, rate: float = 0.15) -> Hyper:
+    def fit(self, hyper: Hyper, data: TrainingData, steps: int, rate: float = 0.15) -> Hyper:
         """The most probable hyper-parameters, by Adam from `hyper` on.
 
         A step that is not finite is not taken.
         """
 
         def loss(hyper: Hyper) -> Float[Array, ""]:
-            return -self.evidence(hyper, seen) - self.log_prior(hyper)
+            return -self.evidence(hyper, data) - self.log_prior(hyper)
 
         def step(carry: tuple[Hyper, Hyper, Hyper], count: Array) -> tuple:
             hyper, first, second = carry
@@ -146,10 +146,10 @@ class GaussianProcess:
         (fitted, _, _), _ = jax.lax.scan(step, (hyper, zero, zero), counts)
         return fitted
 
-    def condition(self, hyper: Hyper, seen: Observations) -> Posterior:
+    def condition(self, hyper: Hyper, data: TrainingData) -> Posterior:
         """The process given these observations."""
-        noisy = self._noisy(hyper, seen.x, seen.mask)
-        y = _masked(seen)
+        noisy = self._noisy(hyper, data.x, data.mask)
+        y = _masked(data)
 
         def bad(carry: tuple[Array, Array]) -> Array:
             return ~jnp.isfinite(carry[0][-1, -1]) & (carry[1] < 1)
@@ -162,7 +162,7 @@ class GaussianProcess:
         factor = jnp.linalg.cholesky(noisy)
         factor, _ = jax.lax.while_loop(bad, more, (factor, jnp.zeros((), y.dtype)))
         weights = cho_solve((factor, True), y)
-        return Posterior(hyper, seen.x, seen.mask, y, factor, weights)
+        return Posterior(hyper, data.x, data.mask, y, factor, weights)
 
     def predict(
         self, posterior: Posterior, x: Float[Array, "m d"]
@@ -243,8 +243,8 @@ class GaussianProcess:
         return np.flatnonzero(~codes), np.flatnonzero(codes)
 
 
-def _masked(seen: Observations) -> Float[Array, " n"]:
-    return jnp.where(seen.mask, seen.y, 0.0)
+def _masked(data: TrainingData) -> Float[Array, " n"]:
+    return jnp.where(data.mask, data.y, 0.0)
 
 
 def _bounded(hyper: Hyper) -> Hyper:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import (
     CLAUSES,
-    Evaluated,
+    Observations,
     Plan,
     Search,
     check_count,
@@ -50,7 +50,7 @@ class GradientState(NamedTuple):
     known: Bool[Array, " descents"]  # descents that know the slopes at their point
     point: Float[Array, "descents d"]
     clauses: Float[Array, "descents clauses"]
-    slopes: Float[Array, "descents clauses d"]
+    gradients: Float[Array, "descents clauses d"]
     radius: Float[Array, " descents"]
     flips: Int[Array, " descents"]  # coordinates of a corner that were tried the other way
     number: UInt32[Array, " descents"]  # of the start
@@ -68,7 +68,7 @@ class GradientState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Gradient(Search):
+class Gradient(Search[GradientState]):
     """Sequential linear programming on the clauses; discrete coordinates keep their start's value.
 
     **Arguments:**
@@ -131,7 +131,7 @@ class Gradient(Search):
             known=jnp.zeros(n, bool),
             point=jnp.full((n, d), 0.5, jnp.float32),
             clauses=jnp.zeros((n, CLAUSES), jnp.float32),
-            slopes=jnp.zeros((n, CLAUSES, d), jnp.float32),
+            gradients=jnp.zeros((n, CLAUSES, d), jnp.float32),
             radius=jnp.ones(n, jnp.float32),
             flips=jnp.zeros(n, jnp.int32),
             number=jnp.zeros(n, jnp.uint32),
@@ -171,12 +171,12 @@ class Gradient(Search):
         solve = jax.vmap(_least, in_axes=(0, 0, 0, 0, None))
         free = np.array(cube.levels) == 0
         tried = solve(
-            state.clauses[descent], state.slopes[descent], state.point[descent], box, free
+            state.clauses[descent], state.gradients[descent], state.point[descent], box, free
         )
         stays = jnp.max(jnp.abs(tried - state.point[descent]), axis=1, initial=0.0) < 1e-6
         number = state.flips[descent] + size
         other = jax.vmap(_turned, in_axes=(0, 0, 0, 0, None))(
-            state.clauses[descent], state.slopes[descent], state.point[descent], number, free
+            state.clauses[descent], state.gradients[descent], state.point[descent], number, free
         )
         tried = jnp.where(stays[:, None], other, tried)
         u = jnp.where(differentiates, starts[descent], tried)
@@ -191,40 +191,40 @@ class Gradient(Search):
     def plan(self, state: GradientState, cube: Cube, batch: int) -> Plan:
         return Plan(state.rows, state.differentiates, state.temperature[state.descent])
 
-    def tell(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
-        assert evaluated.clauses is not None, "the gradient search is told of clauses"
-        assert evaluated.slopes is not None
+    def tell(self, state: GradientState, cube: Cube, observations: Observations) -> GradientState:
+        assert observations.clauses is not None, "the gradient search is told of clauses"
+        assert observations.clause_gradients is not None
         if not cube.dim:
             return state
-        n, batch = len(state.fresh), len(evaluated.rho)
+        n, batch = len(state.fresh), len(observations.rho)
         mine = jnp.arange(batch) < state.rows
-        judged = evaluated.judged & mine
+        usable = observations.usable & mine
         # A single clause is the robustness itself, whose scale does not change from trace to trace.
-        several = evaluated.clauses[:, 1] > NOTHING
-        first = jnp.where(several, evaluated.clauses[:, 0], evaluated.rho)
-        clauses = jnp.where(judged[:, None], evaluated.clauses.at[:, 0].set(first), 0.0)
-        merit = jnp.where(judged, jnp.max(clauses, axis=1), jnp.inf)
+        several = observations.clauses[:, 1] > NOTHING
+        first = jnp.where(several, observations.clauses[:, 0], observations.rho)
+        clauses = jnp.where(usable[:, None], observations.clauses.at[:, 0].set(first), 0.0)
+        merit = jnp.where(usable, jnp.max(clauses, axis=1), jnp.inf)
         owner = (state.descent[None] == jnp.arange(n)[:, None]) & mine[None]
         # For each descent the best of its rows, the first of equally good ones.
-        scores = jnp.where(owner & judged[None], merit[None], jnp.inf)
+        scores = jnp.where(owner & usable[None], merit[None], jnp.inf)
         best = jnp.argmin(scores, axis=1)
         least = jnp.min(scores, axis=1)
-        failed = jnp.any(owner & (judged & (evaluated.rho < 0))[None], axis=1)
+        failed = jnp.any(owner & (usable & (observations.rho < 0))[None], axis=1)
 
-        slopes = jnp.where(judged[best][:, None, None], evaluated.slopes[best], 0.0)
-        finite = jnp.all(jnp.isfinite(slopes), axis=(1, 2))
-        slopes = jnp.where(finite[:, None, None], slopes, 0.0)
-        told = finite & jnp.any(slopes != 0, axis=(1, 2)) & jnp.isfinite(least)
+        gradients = jnp.where(usable[best][:, None, None], observations.clause_gradients[best], 0.0)
+        finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
+        gradients = jnp.where(finite[:, None, None], gradients, 0.0)
+        told = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(least)
         asked = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
 
-        # With slopes: a descent goes on from where they are known, or starts elsewhere.
+        # With gradients: a descent goes on from where they are known, or starts elsewhere.
         # Of descents that may be given up early every second one begins with a smaller box.
         begin = jnp.where((state.number % 3 > 0) & (state.number % 2 == 1), self.shrinks, 1.0)
-        with_slopes = state._replace(
-            point=_rows(told & asked, evaluated.u[best], state.point),
+        differentiated = state._replace(
+            point=_rows(told & asked, observations.u[best], state.point),
             clauses=_rows(told & asked, clauses[best], state.clauses),
-            slopes=_rows(told & asked, slopes, state.slopes),
+            gradients=_rows(told & asked, gradients, state.gradients),
             known=jnp.where(asked, told & ~failed, state.known),
             fresh=jnp.where(asked, ~told | failed, state.fresh),
             radius=jnp.where(asked & state.fresh, begin, state.radius),
@@ -251,8 +251,8 @@ class Gradient(Search):
         over |= better & (slow >= self.patience)
         kept = asked & ~over
         colder = jnp.maximum(0.5 * state.temperature, self.coldest)
-        without = state._replace(
-            point=_rows(kept & better, evaluated.u[best], state.point),
+        undifferentiated = state._replace(
+            point=_rows(kept & better, observations.u[best], state.point),
             clauses=_rows(kept & better, clauses[best], state.clauses),
             known=jnp.where(asked, ~over & ~better, state.known),
             fresh=jnp.where(asked, over, state.fresh),
@@ -262,13 +262,15 @@ class Gradient(Search):
             steps=jnp.where(asked & better, state.steps + 1, state.steps),
             slow=jnp.where(asked & better, slow, state.slow).astype(jnp.int32),
         )
-        return _either(state.differentiates, with_slopes, without)
+        return _either(state.differentiates, differentiated, undifferentiated)
 
-    def warm(self, state: GradientState, cube: Cube, evaluated: Evaluated) -> GradientState:
+    def warm_start(
+        self, state: GradientState, cube: Cube, observations: Observations
+    ) -> GradientState:
         """Start the first descents from the most nearly failing points; failures are found."""
-        usable = evaluated.judged & (evaluated.rho >= 0)
-        rho = jnp.concatenate([jnp.where(usable, evaluated.rho, jnp.inf), state.near])
-        points = jnp.concatenate([jnp.where(usable[:, None], evaluated.u, 0.5), state.offered])
+        usable = observations.usable & (observations.rho >= 0)
+        rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), state.near])
+        points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.offered])
         _, nearest = jax.lax.top_k(-rho, len(state.near))
         return state._replace(offered=points[nearest], near=rho[nearest])
 
@@ -302,7 +304,7 @@ def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:
 
 def _least(
     clauses: Float[Array, " clauses"],
-    slopes: Float[Array, "clauses d"],
+    gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
     radius: Float[Array, ""],
     free: Bool[np.ndarray, " d"],
@@ -319,10 +321,10 @@ def _least(
         return jnp.where(free, found, point)
 
     def linear(points: Float[Array, "*m d"]) -> Float[Array, "*m clauses"]:
-        return clauses + (points - point) @ slopes.T
+        return clauses + (points - point) @ gradients.T
 
     pairs = np.array(list(combinations(range(CLAUSES), 2)))
-    one, two = slopes[pairs[:, 0]], slopes[pairs[:, 1]]
+    one, two = gradients[pairs[:, 0]], gradients[pairs[:, 1]]
 
     def gap(points: Float[Array, "m d"]) -> Float[Array, " m"]:
         values = linear(points)
@@ -341,7 +343,7 @@ def _least(
     a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (least, most))
     above, below = jnp.maximum(gap(a), 0.0), jnp.maximum(-gap(b), 0.0)
     share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
-    candidates = jnp.concatenate([corner(slopes), share * a + (1 - share) * b])
+    candidates = jnp.concatenate([corner(gradients), share * a + (1 - share) * b])
     greatest = jnp.max(linear(candidates), axis=1)
     # Of clauses that there are not, and of equally good points the first: a corner.
     there = clauses > NOTHING
@@ -357,14 +359,14 @@ def _least(
 
 def _turned(
     clauses: Float[Array, " clauses"],
-    slopes: Float[Array, "clauses d"],
+    gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
     number: Int[Array, ""],
     free: Bool[np.ndarray, " d"],
 ) -> Float[Array, " d"]:
     """The point with its `number`-th weakest coordinate at the other end of its range."""
-    steep = jnp.abs(slopes[jnp.argmax(clauses)])
-    # Coordinates without any slope come last: they seem to have no effect.
+    steep = jnp.abs(gradients[jnp.argmax(clauses)])
+    # Coordinates without a derivative come last: they seem to have no effect.
     order = jnp.argsort(jnp.where((steep > 0) & free, steep, jnp.inf))
     chosen = order[jnp.minimum(number, len(point) - 1)]
     other = jnp.where(point[chosen] > 0.5, 0.0, 1.0)

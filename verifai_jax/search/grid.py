@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count
+from verifai_jax.search.base import Observations, Search, check_count
 
 MOST_POINTS = 2**31 - 1
 
@@ -19,7 +19,7 @@ class GridState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Grid(Search):
+class Grid(Search[GridState]):
     """A grid with both ends of each continuous coordinate and the middle of each cell.
 
     Discrete coordinates change fastest, and among the discrete and among the continuous ones the
@@ -88,7 +88,7 @@ class Grid(Search):
         # Stays at the end, so that the number never wraps around.
         return u, GridState(jnp.minimum(state.index + batch, np.uint32(total)).astype(jnp.uint32))
 
-    def tell(self, state: GridState, cube: Cube, evaluated: Evaluated) -> GridState:
+    def tell(self, state: GridState, cube: Cube, observations: Observations) -> GridState:
         return state
 
     def _sizes(self, cube: Cube) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search
+from verifai_jax.search.base import Observations, Search
 
 BITS = 32  # of the index
 PLAIN_UP_TO = 8  # coordinates; beyond, the bases are so large that lines are visible
@@ -28,7 +28,7 @@ class HaltonState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Halton(Search):
+class Halton(Search[HaltonState]):
     """Halton points, the first one with index 1; the same for any batch size.
 
     **Arguments:**
@@ -57,7 +57,7 @@ class Halton(Search):
         u = halton_points(index, cube.dim, state.key if scramble else None)
         return u, state._replace(index=state.index + batch)
 
-    def tell(self, state: HaltonState, cube: Cube, evaluated: Evaluated) -> HaltonState:
+    def tell(self, state: HaltonState, cube: Cube, observations: Observations) -> HaltonState:
         return state
 
 

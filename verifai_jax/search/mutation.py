@@ -20,7 +20,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search, check_count, check_fraction, standard_normal
+from verifai_jax.search.base import (
+    Observations,
+    Search,
+    check_count,
+    check_fraction,
+    standard_normal,
+)
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before."""
@@ -45,7 +51,7 @@ class MutationState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Mutation(Search):
+class Mutation(Search[MutationState]):
     """Mutations of the best points so far, by steps of all sizes, and exploration.
 
     **Arguments:**
@@ -107,22 +113,22 @@ class Mutation(Search):
         u = jnp.where(explores[:, None], fresh, changed)
         return u, state._replace(round=state.round + 1)
 
-    def tell(self, state: MutationState, cube: Cube, evaluated: Evaluated) -> MutationState:
-        score = evaluated.score
+    def tell(self, state: MutationState, cube: Cube, observations: Observations) -> MutationState:
+        score = observations.score
         # New points come first: of equally good ones the newest are kept.
         points = jnp.concatenate(
-            [jnp.where(evaluated.judged[:, None], evaluated.u, 0.5), state.points]
+            [jnp.where(observations.usable[:, None], observations.u, 0.5), state.points]
         )
         scores = jnp.concatenate([score, state.score])
         _, best = jax.lax.top_k(-scores, self.kept)
-        judged = jnp.sum(evaluated.judged).astype(jnp.int32)
+        usable = jnp.sum(observations.usable).astype(jnp.int32)
         progress = scores[best[0]] < 0.999 * state.score[0]
-        stale = jnp.where(progress, 0, state.stale + judged)
+        stale = jnp.where(progress, 0, state.stale + usable)
         again = stale >= self.patience
         return state._replace(
             points=points[best],
             score=jnp.where(again, jnp.inf, scores[best]),
-            seen=jnp.where(again, 0, state.seen + judged),
+            seen=jnp.where(again, 0, state.seen + usable),
             stale=jnp.where(again, 0, stale),
         )
 

@@ -1,11 +1,11 @@
 """Several searches that share what they learn, and a budget that goes where it helps.
 
-The members are complementary: slopes of clauses jump to corners and along where clauses meet,
-mutations need few simulations and no slopes, cross-entropy fills the region of failures in large
-batches. Which one helps shows on the way. A bandit gives each a share of the simulations by the
+The members are complementary: gradients of clauses jump to corners and along where clauses meet,
+mutations need few simulations and no gradients, cross-entropy fills the region of failures in large
+batches. A bandit learns on the way which one helps: it gives each a share of the simulations by the
 rate at which its points come among the best so far, discounted, and none less than a little; a
-member whose slopes turn out zero or not finite gets next to nothing at once. Every point is told to
-all, and descents start from the best points of the others as often as from new ones.
+member whose gradients turn out zero or not finite gets next to nothing at once. Every point is told
+to all, and descents start from the best points of the others as often as from new ones.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
 from verifai_jax.search.mutation import Mutation, MutationState
@@ -43,33 +43,33 @@ class PortfolioState(NamedTuple):
     gains: Float[Array, " members"]
     costs: Float[Array, " members"]
     rows: Int[Array, " members"]  # of the last ask, one member after the other
-    slopes: Bool[Array, ""]
+    differentiates: Bool[Array, ""]
     opening: Bool[Array, ""]  # the first descents are on their way, beyond their share
 
 
 @dataclass(frozen=True)
-class Portfolio(Search):
+class Portfolio(Search[PortfolioState]):
     """Gradient, mutations and cross-entropy together, with the budget by evidence; no tuning.
 
     **Arguments:**
 
-    - `slopes`: whether to use slopes of the robustness. They are left out by itself where there
-      are none: for black boxes, where all features are discrete, where robustness is constant
-      almost everywhere, as over signals that are whole numbers.
+    - `gradients`: whether to use gradients of the robustness. They are left out automatically where
+      there are none: for black boxes, where all features are discrete, where the robustness is
+      constant almost everywhere, as over signals that are whole numbers.
     """
 
-    slopes: bool = True
+    gradients: bool = True
 
     @property
     def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.slopes
+        return self.gradients
 
-    def without_slopes(self) -> "Portfolio":
-        """The same without slopes."""
-        return replace(self, slopes=False)
+    def without_gradients(self) -> "Portfolio":
+        """Return the same search without gradients."""
+        return replace(self, gradients=False)
 
     def _differentiates(self, cube: Cube) -> bool:
-        return self.slopes and len(cube.continuous) > 0
+        return self.gradients and len(cube.continuous) > 0
 
     def _cross_entropy(self, batch: int) -> CrossEntropy:
         # In small batches a round says little: patience counts simulations.
@@ -88,7 +88,7 @@ class Portfolio(Search):
             gains=jnp.asarray(gains, jnp.float32),
             costs=jnp.asarray(PRIOR_COSTS, jnp.float32),
             rows=jnp.zeros(3, jnp.int32),
-            slopes=jnp.array(False),
+            differentiates=jnp.array(False),
             opening=jnp.array(False),
         )
 
@@ -100,8 +100,8 @@ class Portfolio(Search):
         state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
         share = self._shares(state)
         credit = state.credit + share * batch
-        slopes, descents, points = jnp.array(False), jnp.int32(0), mutated
-        opening = slopes
+        differentiates, descents, points = jnp.array(False), jnp.int32(0), mutated
+        opening = differentiates
         if state.gradient is not None:
             points, gradient = Gradient().ask(state.gradient, cube, batch)
             plan = Gradient().plan(gradient, cube, batch)
@@ -109,10 +109,10 @@ class Portfolio(Search):
             opening = gradient.starts <= max(OPENING, len(gradient.fresh))
             opening &= gradient.useless == 0
             turn = opening | (credit[GRADIENT] >= 1)
-            slopes = plan.slopes & turn
+            differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
             descents = jnp.where(turn, jnp.minimum(plan.rows, allowed), 0)
-            descents = jnp.where(slopes, plan.rows, descents)
+            descents = jnp.where(differentiates, plan.rows, descents)
             state = state._replace(
                 gradient=jax.tree.map(
                     lambda new, old: new if new is old else jnp.where(turn, new, old),
@@ -120,7 +120,7 @@ class Portfolio(Search):
                     state.gradient,
                 )
             )
-        others = jnp.where(slopes, 0, batch - descents)
+        others = jnp.where(differentiates, 0, batch - descents)
         draws = jnp.minimum(jnp.floor(credit[CROSS_ENTROPY]).astype(jnp.int32), others)
         draws = jnp.maximum(draws, 0)
         rows = jnp.stack([descents, others - draws, draws]).astype(jnp.int32)
@@ -128,34 +128,34 @@ class Portfolio(Search):
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
-        return u, state._replace(rows=rows, slopes=slopes, opening=opening)
+        return u, state._replace(rows=rows, differentiates=differentiates, opening=opening)
 
     def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
         if state.gradient is None:
             temperature = jnp.ones(batch, jnp.float32)
         else:
             temperature = state.gradient.temperature[state.gradient.descent]
-        return Plan(jnp.sum(state.rows), state.slopes, temperature)
+        return Plan(jnp.sum(state.rows), state.differentiates, temperature)
 
-    def tell(self, state: PortfolioState, cube: Cube, evaluated: Evaluated) -> PortfolioState:
-        batch = len(evaluated.rho)
+    def tell(self, state: PortfolioState, cube: Cube, observations: Observations) -> PortfolioState:
+        batch = len(observations.rho)
         asked = jnp.arange(batch) < jnp.sum(state.rows)
-        evaluated = evaluated._replace(counted=evaluated.counted & asked)
-        common = self._common(evaluated)
+        observations = observations._replace(valid=observations.valid & asked)
+        common = self._common(observations)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them.
         limit = state.mutation.score[AMONG - 1]
         gained = jnp.isfinite(limit) & ((common.score < limit) | (common.score == 0))
-        gained &= common.judged
+        gained &= common.usable
         is_member = (member[None] == jnp.arange(3)[:, None]) & asked[None]
-        spent = jnp.sum(is_member, axis=1) * jnp.where(state.slopes, 2.0, 1.0)
+        spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
         credit = state.credit + self._shares(state) * total - spent
         credit = jnp.where(state.opening, state.credit, credit)
         mutation = Mutation().tell(state.mutation, cube, common)
         # Mutations begin when enough is explored, whatever descents have seen.
-        descended = jnp.sum(common.judged & is_member[GRADIENT]).astype(jnp.int32)
+        descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
         state = state._replace(
             mutation=mutation._replace(seen=jnp.maximum(mutation.seen - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
@@ -171,7 +171,7 @@ class Portfolio(Search):
         )
         if state.gradient is None:
             return state
-        own = evaluated._replace(counted=evaluated.counted & (member == GRADIENT))
+        own = observations._replace(valid=observations.valid & (member == GRADIENT))
         told = Gradient().tell(state.gradient, cube, own)
         turn = state.rows[GRADIENT] > 0
         told = jax.tree.map(
@@ -187,12 +187,14 @@ class Portfolio(Search):
         told = told._replace(offered=state.mutation.points[ranks], near=near)
         return state._replace(gradient=told)
 
-    def warm(self, state: PortfolioState, cube: Cube, evaluated: Evaluated) -> PortfolioState:
-        common = evaluated._replace(gradient=None, clauses=None, slopes=None)
-        batch = len(evaluated.rho)
+    def warm_start(
+        self, state: PortfolioState, cube: Cube, observations: Observations
+    ) -> PortfolioState:
+        common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
+        batch = len(observations.rho)
         gradient = state.gradient
         if gradient is not None:
-            gradient = Gradient().warm(gradient, cube, common)
+            gradient = Gradient().warm_start(gradient, cube, common)
         return state._replace(
             gradient=gradient,
             mutation=Mutation().tell(state.mutation, cube, common),
@@ -217,12 +219,12 @@ class Portfolio(Search):
         row = jnp.arange(batch)
         return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
 
-    def _common(self, evaluated: Evaluated) -> Evaluated:
+    def _common(self, observations: Observations) -> Observations:
         """What those members are told that know of no clauses."""
-        rho = evaluated.rho
-        if evaluated.clauses is not None:
+        rho = observations.rho
+        if observations.clauses is not None:
             # Where clauses of different units have to be broken together, without unit.
-            several = evaluated.clauses[:, 1] > NOTHING
-            greatest = jnp.max(evaluated.clauses, axis=1)
+            several = observations.clauses[:, 1] > NOTHING
+            greatest = jnp.max(observations.clauses, axis=1)
             rho = jnp.where(several & jnp.isfinite(greatest), greatest, rho)
-        return Evaluated(evaluated.u, rho, evaluated.counted)
+        return Observations(observations.u, rho, observations.valid)

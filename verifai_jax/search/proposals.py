@@ -2,14 +2,14 @@
 
     proposals = Proposals(search, space.cube, batch=1024, key=key, accepts=space.constraint)
     points = proposals.next(1024)                       # [m, d], m <= 1024
-    proposals.tell(rho, counted, gradient)              # of these points
-    proposals.slopes, proposals.temperature             # what the search wants to know of them
+    proposals.tell(rho, valid, gradient)                # of these points
+    proposals.differentiate, proposals.temperature      # the derivatives that the search wants
 
 A constraint (`where=`) refuses points; only accepted ones are simulated. A search that does not
 learn is asked until there are enough, so that the accepted points are a subsequence of its own,
 whatever the batch. One that learns is asked again for the refused rows only, which leaves each
 row with the distribution it would have, given acceptance; rows that stay refused are told as not
-counted.
+valid.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Diverse, Evaluated, Plan, Search
+from verifai_jax.search import Diverse, Observations, Plan, Search
 from verifai_jax.search.base import CLAUSES
 
 TRIES = 32
@@ -76,9 +76,9 @@ class Proposals:
         return int(Diverse.count(self._state))
 
     @property
-    def slopes(self) -> bool:
-        """Whether the points that `next` gave last are to be simulated with slopes."""
-        return self._plan is not None and bool(self._plan.slopes)
+    def differentiate(self) -> bool:
+        """Whether the search wants the clauses' gradients at the points that `next` gave last."""
+        return self._plan is not None and bool(self._plan.differentiate)
 
     @property
     def temperature(self) -> Any:
@@ -102,25 +102,27 @@ class Proposals:
     def tell(
         self,
         rho: Float[np.ndarray, " m"],
-        counted: Bool[np.ndarray, " m"],
+        valid: Bool[np.ndarray, " m"],
         gradient: Float[np.ndarray, "m d"] | None,
         clauses: Float[np.ndarray, "m clauses"] | None = None,
-        slopes: Float[np.ndarray, "m clauses d"] | None = None,
+        clause_gradients: Float[np.ndarray, "m clauses d"] | None = None,
     ) -> None:
         """Tell the search what came of the points that `next` gave last."""
         if not self.search.learns:
             return
-        told = Evaluated(
+        told = Observations(
             u=self._points,
             rho=self._spread(rho, np.nan),
-            counted=self._spread(counted, False),
+            valid=self._spread(valid, False),
             gradient=None if gradient is None else self._spread(gradient, 0.0),
         )
         if self.search.wants_clauses:
             none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
             told = told._replace(
                 clauses=self._spread(none[:, :, 0] if clauses is None else clauses, 0.0),
-                slopes=self._spread(none if slopes is None else slopes, 0.0),
+                clause_gradients=self._spread(
+                    none if clause_gradients is None else clause_gradients, 0.0
+                ),
             )
         self._state = self._program.tell(self._state, told)
 
@@ -129,18 +131,18 @@ class Proposals:
         gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient)
 
-    def warm(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
+    def warm_start(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
         """Let the search learn from the points of an earlier table, before the first round."""
         if not self.search.learns or not len(u):
             return
-        warm = jax.jit(lambda state, told: self.search.warm(state, self.cube, told))
+        warm = jax.jit(lambda state, told: self.search.warm_start(state, self.cube, told))
         for start in range(0, len(u), self.batch):
             part, values = u[start : start + self.batch], rho[start : start + self.batch]
             missing = self.batch - len(part)
-            told = Evaluated(
+            told = Observations(
                 u=np.pad(part.astype(np.float32), ((0, missing), (0, 0)), constant_values=0.5),  # pyright: ignore[reportArgumentType]
                 rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
-                counted=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
+                valid=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
             )
             self._state = warm(self._state, told)
 
@@ -269,19 +271,19 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
     ask = jax.jit(lambda state: search.ask(state, cube, batch)).lower(state).compile()
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
-    counted: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
-    evaluated = Evaluated(points, rho, counted, points if search.wants_gradient else None)
+    valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
+    observations = Observations(points, rho, valid, points if search.wants_gradient else None)
     plan: Any = None
     if search.wants_clauses:
-        evaluated = evaluated._replace(
+        observations = observations._replace(
             clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
-            slopes=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
+            clause_gradients=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
         )
         plan = jax.jit(lambda state: search.plan(state, cube, batch)).lower(state).compile()
     tell = None
     if search.learns:
         tell = jax.jit(lambda state, told: search.tell(state, cube, told))
-        tell = tell.lower(state, evaluated).compile()
+        tell = tell.lower(state, observations).compile()
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants_gradient:
         temperature = jax.jit(search.temperature).lower(state).compile()

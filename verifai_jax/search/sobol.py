@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search
+from verifai_jax.search.base import Observations, Search
 
 BITS = 32
 MOST_DIMENSIONS = 21201  # direction numbers are known for
@@ -33,7 +33,7 @@ class SobolState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sobol(Search):
+class Sobol(Search[SobolState]):
     """Sobol' points, the first one with index 0; the same for any batch size.
 
     The first `2^k` points, and each `2^k` after them, are the most even. Unscrambled, the first
@@ -84,7 +84,7 @@ class Sobol(Search):
         u = (digits >> 8).astype(jnp.float32) * np.float32(2**-24)
         return u, state._replace(index=state.index + batch)
 
-    def tell(self, state: SobolState, cube: Cube, evaluated: Evaluated) -> SobolState:
+    def tell(self, state: SobolState, cube: Cube, observations: Observations) -> SobolState:
         return state
 
 

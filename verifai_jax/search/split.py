@@ -14,15 +14,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.search.base import Evaluated, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search
 
 
 @dataclass(frozen=True, init=False)
-class Split(Search):
+class Split(Search[tuple[PyTree, ...]]):
     """A search for each part of the space, and one for the rest.
 
     **Arguments:**
@@ -101,11 +101,15 @@ class Split(Search):
             states.append(its)
         return u, tuple(states)
 
-    def tell(self, state: tuple[Any, ...], cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
-        return self._told("tell", state, cube, evaluated)
+    def tell(
+        self, state: tuple[Any, ...], cube: Cube, observations: Observations
+    ) -> tuple[Any, ...]:
+        return self._told("tell", state, cube, observations)
 
-    def warm(self, state: tuple[Any, ...], cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
-        return self._told("warm", state, cube, evaluated)
+    def warm_start(
+        self, state: tuple[Any, ...], cube: Cube, observations: Observations
+    ) -> tuple[Any, ...]:
+        return self._told("warm_start", state, cube, observations)
 
     def temperature(self, state: tuple[Any, ...]) -> Float[Array, ""]:
         """That of the first part that wants gradients."""
@@ -121,15 +125,19 @@ class Split(Search):
                 return search.plan(its, part, batch)
         return super().plan(state, cube, batch)
 
-    def _told(self, verb: str, state: Any, cube: Cube, evaluated: Evaluated) -> tuple[Any, ...]:
+    def _told(
+        self, verb: str, state: Any, cube: Cube, observations: Observations
+    ) -> tuple[Any, ...]:
         states = []
         for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
-            gradient, slopes = evaluated.gradient, evaluated.slopes
-            its_own = Evaluated(evaluated.u[:, places], evaluated.rho, evaluated.counted)
+            gradient, clause_gradients = observations.gradient, observations.clause_gradients
+            its_own = Observations(observations.u[:, places], observations.rho, observations.valid)
             if gradient is not None and search.wants_gradient:
                 its_own = its_own._replace(gradient=gradient[:, places])
-            if slopes is not None and search.wants_clauses:
-                its_own = its_own._replace(clauses=evaluated.clauses, slopes=slopes[:, :, places])
+            if clause_gradients is not None and search.wants_clauses:
+                its_own = its_own._replace(
+                    clauses=observations.clauses, clause_gradients=clause_gradients[:, :, places]
+                )
             states.append(getattr(search, verb)(its, part, its_own))
         return tuple(states)
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search
+from verifai_jax.search.base import Observations, Search
 
 
 class UniformState(NamedTuple):
@@ -17,7 +17,7 @@ class UniformState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Uniform(Search):
+class Uniform(Search[UniformState]):
     """Independent uniform points; point `i` depends on the key and `i` alone, not on the batch."""
 
     learns: ClassVar[bool] = False
@@ -32,7 +32,7 @@ class Uniform(Search):
         index = state.index + jnp.arange(batch, dtype=jnp.uint32)
         return uniform_points(state.key, index, cube.dim), state._replace(index=state.index + batch)
 
-    def tell(self, state: UniformState, cube: Cube, evaluated: Evaluated) -> UniformState:
+    def tell(self, state: UniformState, cube: Cube, observations: Observations) -> UniformState:
         return state
 
 

@@ -75,7 +75,7 @@ def asker_for(
             f"Names: {', '.join(searches.names())}, optuna:tpe"
         )
     if isinstance(search, Portfolio):
-        search = replace(search, slopes=False)
+        search = replace(search, gradients=False)
     if needs_slopes(search):
         raise ValueError(
             f"search {search!r} needs gradients, which trainings do not have; "

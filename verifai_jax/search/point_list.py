@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Evaluated, Search
+from verifai_jax.search.base import Observations, Search
 
 
-class ListedState(NamedTuple):
+class PointListState(NamedTuple):
     index: Int[Array, ""]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Listed(Search):
+class PointList(Search[PointListState]):
     """Given points of the unit cube, one after the other; it ends with the last one.
 
     **Arguments:** `points`: `[n, d]`, in `[0, 1]`.
@@ -45,17 +45,17 @@ class Listed(Search):
     def total(self, cube: Cube) -> int | None:
         return len(self.points)
 
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> ListedState:
-        return ListedState(jnp.int32(0))
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PointListState:
+        return PointListState(jnp.int32(0))
 
     def ask(
-        self, state: ListedState, cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], ListedState]:
+        self, state: PointListState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], PointListState]:
         rows = jnp.minimum(state.index + jnp.arange(batch), len(self.points) - 1)
-        return jnp.asarray(self.points)[rows], ListedState(state.index + batch)
+        return jnp.asarray(self.points)[rows], PointListState(state.index + batch)
 
-    def tell(self, state: ListedState, cube: Cube, evaluated: Evaluated) -> ListedState:
+    def tell(self, state: PointListState, cube: Cube, observations: Observations) -> PointListState:
         return state
 
     def __repr__(self) -> str:
-        return f"Listed({len(self.points)} points)"
+        return f"PointList({len(self.points)} points)"
