@@ -111,7 +111,7 @@ def first_failure(problem, search, batch, seed, budget):
 
 def on_cartpole(options):
     """One line a search on a problem of specs/cartpole.py."""
-    problem = load_target(f"specs/cartpole.py:{options.problem}")
+    problem = load_target(f"specs/cartpole.py:{options.problem}", vj.Problem)
     rate = vj.falsify(problem, "uniform", 200_000, batch=8192, seed=999, progress=False)
     print(f"{problem}\n  failure rate {rate.failure_rate}")
     print(

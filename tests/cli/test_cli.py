@@ -73,7 +73,7 @@ def test_options_of_a_search(call, tmp_path):
         64,
         "--batch",
         32,
-        "--out",
+        "--folder",
         "here",
         "--no-pictures",
     )
@@ -83,9 +83,9 @@ def test_options_of_a_search(call, tmp_path):
 
 def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--batch", 16]
-    call(*start, "--budget", 48, "--only", "b", "--out", "one", "--no-pictures")
+    call(*start, "--budget", 48, "--only", "b", "--folder", "one", "--no-pictures")
     call("falsify", "--resume", "one", "--only", "b", "--budget", 80, "--no-pictures")
-    call(*start, "--budget", 80, "--only", "b", "--out", "two", "--no-pictures")
+    call(*start, "--budget", 80, "--only", "b", "--folder", "two", "--no-pictures")
     one, two = (load(tmp_path / name).table.all for name in ("one", "two"))
     assert one.equals(two)
     assert set(one["a"]) == {0.5}
@@ -97,12 +97,12 @@ def test_resume_goes_on_in_the_same_folder(call, tmp_path):
 
 def test_ends_and_warm_start(call):
     ramp = ["falsify", "specs/ramp.py:ramp", "--batch", 64, "--no-pictures"]
-    output = call(*ramp, "--search", "uniform", "--within", 0.1, "--out", "prior")
+    output = call(*ramp, "--search", "uniform", "--within", 0.1, "--folder", "prior")
     assert "stopped by stop_when" in output
     assert "whenever stopped" in output
-    output = call(*ramp, "--search", "uniform", "--decide", 0.6, "--out", "decided")
+    output = call(*ramp, "--search", "uniform", "--decide", 0.6, "--folder", "decided")
     assert "stopped by stop_when" in output
-    output = call(*ramp, "--warm-start", "prior", "--budget", 64, "--out", "warm")
+    output = call(*ramp, "--warm-start", "prior", "--budget", 64, "--folder", "warm")
     assert "64 simulations" in output
     assert "give one" in call(*ramp, "--within", 0.1, "--decide", 0.1, code=2)
     assert "needs independent samples" in call(*ramp, "--within", 0.1, code=1)
@@ -155,7 +155,7 @@ def test_mistakes_get_one_line(call, arguments, message):
 
 
 def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
-    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures", "--out", "r")
+    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures", "--folder", "r")
     record = json.loads((tmp_path / "r" / "run.json").read_text())
     evil = tmp_path / "r" / "evil.py"
     evil.write_text("raise SystemExit('ran')")
@@ -168,7 +168,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
 
 
 def test_precision_of_a_run(call, tmp_path):
-    where = ("--out", tmp_path / "run", "--no-pictures")
+    where = ("--folder", tmp_path / "run", "--no-pictures")
     call("falsify", "specs/ramp.py:ramp", "--budget", 32, "--precision", "float64", *where)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["precision"], record["backend"]) == ("float64", None)

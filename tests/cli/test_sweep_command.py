@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
-from verifai_jax.core.targets import TargetError, load_study, studies_in
+from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import _sweep as driver
 
 STUDY = """
@@ -57,10 +57,10 @@ def test_sweep_and_what_it_writes(call, tmp_path):
 
 def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
-    whole = call("specs/drift.py:safe", *SMALL, *asked, "--out", "whole")
+    whole = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "whole")
     stopped = _Stopping(after=7)
     monkeypatch.setattr(driver, "Store", stopped)
-    part = call("specs/drift.py:safe", *SMALL, *asked, "--out", "part")
+    part = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "part")
     assert "NOT FINISHED" in part
     assert "go on        verifai-jax sweep --resume part" in part
     monkeypatch.undo()
@@ -130,20 +130,27 @@ def test_errors_in_one_line(call, tmp_path):
 
 def test_only_some_vary(call):
     output = call(
-        "specs/drift.py:safe", *SMALL, "--only", "rate", "--at", "noise=0.05", "--out", "some"
+        "specs/drift.py:safe",
+        *SMALL,
+        "--only",
+        "rate",
+        "--nominal",
+        "noise=0.05",
+        "--folder",
+        "some",
     )
     assert output.count(" 0.05 ") >= 3
     call("--resume", "some", "--no-pictures")
 
 
 def test_another_sweep_in_the_same_folder_is_refused(call):
-    call("specs/drift.py:safe", *SMALL, "--out", "kept")
-    output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--out", "kept", code=1)
+    call("specs/drift.py:safe", *SMALL, "--folder", "kept")
+    output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=1)
     assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the store 0" in output
 
 
 def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
-    call("specs/drift.py:safe", *SMALL, "--out", "kept")
+    call("specs/drift.py:safe", *SMALL, "--folder", "kept")
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     shutil.move(tmp_path / "specs", tmp_path / "kept" / "specs")
@@ -158,11 +165,11 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
 
 
 def test_studies_are_found_as_problems_are(call):
-    assert set(studies_in("specs/drift.py")) == {"safe", "other"}
-    assert load_study("specs/drift.py:safe").description == "drifts that stay"
+    assert set(definitions("specs/drift.py", vj.Study)) == {"safe", "other"}
+    assert load_target("specs/drift.py:safe", vj.Study).description == "drifts that stay"
     Path("specs/empty.py").write_text("x = 1\n")
     with pytest.raises(TargetError, match=r"specs/empty.py defines no Study"):
-        load_study("specs/empty.py")
+        load_target("specs/empty.py", vj.Study)
 
 
 def test_list_names_studies_beside_problems(call):

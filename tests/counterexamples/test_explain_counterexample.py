@@ -155,7 +155,7 @@ def test_the_command(tmp_path):
         " 'always m >= 0', nominal={'x': 0.2, 'y': 0.5})\n"
     )
     target = f"{tmp_path / 'other.py'}:p"
-    run = vj.falsify(load_target(target), "uniform", 64, batch=64, progress=False)
+    run = vj.falsify(load_target(target, vj.Problem), "uniform", 64, batch=64, progress=False)
     run.save(tmp_path / "run")
     row = str(run.table.counterexamples.index[0])
     done = CliRunner().invoke(command, [str(tmp_path / "run"), row, "--problem", target])

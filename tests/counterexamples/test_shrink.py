@@ -281,7 +281,7 @@ def test_the_command(edges, tmp_path):
     from verifai_jax.core.targets import load_target
 
     target = f"{tmp_path / 'mine.py'}:p"
-    run = vj.falsify(load_target(target), "uniform", 64, batch=64, progress=False)
+    run = vj.falsify(load_target(target, vj.Problem), "uniform", 64, batch=64, progress=False)
     run.save(tmp_path / "run")
     done = CliRunner().invoke(
         command, [str(tmp_path / "run"), "--problem", target, "--budget", "200"]

@@ -263,7 +263,7 @@ def test_a_fixed_feature_is_no_parameter():
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "1500"]
     options = ["--no-gradient", "--search", "halton", "--held-out", "100"]
-    options += ["--out", str(tmp_path / "found.csv")]
+    options += ["--table", str(tmp_path / "found.csv")]
     shown = CliRunner().invoke(command, [*arguments, *options])
     assert shown.exit_code == 0, shown.output
     assert "0 of 100 held-out environments fail" in shown.output

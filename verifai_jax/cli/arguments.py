@@ -1,62 +1,173 @@
-"""What commands are asked for, understood in one place: runs, features, pairs."""
+"""Arguments and options that several commands share, and how their text is read."""
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+if TYPE_CHECKING:
+    from verifai_jax.falsification.run import Run
+    from verifai_jax.problem import Problem
 
-def recorded_run(folder: Path, target: str | None) -> Any:
-    """The run in FOLDER, with its problem: the one recorded, or TARGET."""
+Command = TypeVar("Command", bound=Callable[..., object])
+
+RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
+"""The run folder that a command reads."""
+
+ROW = click.argument("row", type=int, required=False)
+"""A row of its table."""
+
+TARGET = click.argument("target")
+"""The problem, as FILE.py:NAME."""
+
+PROBLEM = click.option(
+    "--problem",
+    "target",
+    metavar="FILE.py:NAME",
+    help="Problem of the run  [default: the one it records]",
+)
+"""The problem of a run that does not record one of this project."""
+
+FOLDER = click.option(
+    "--folder",
+    "into",
+    type=click.Path(path_type=Path),
+    help="Folder to write to  [default: the run's]",
+)
+"""Where a command that reads a run writes."""
+
+PICTURES = click.option(
+    "--pictures/--no-pictures", default=True, show_default=True, help="Draw pictures."
+)
+"""Pictures can be left out."""
+
+PROGRESS = click.option(
+    "--progress/--no-progress",
+    default=None,
+    help="Show a progress bar  [default: on a terminal]",
+)
+"""The progress bar can be forced or left out."""
+
+SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed of all chance.")
+"""Seed of a command that cannot be resumed."""
+
+ONLY = click.option(
+    "--only",
+    metavar="NAMES",
+    help="Features to vary, comma-separated; the others stay at their nominal values.",
+)
+"""Features that vary."""
+
+BATCH = click.option("--batch", type=int, help="Simulations per call  [default: chosen]")
+"""Simulations per call of the simulator."""
+
+MAX_SECONDS = click.option(
+    "--max-seconds", type=float, help="Seconds at most, compilation included."
+)
+"""A limit of time."""
+
+PRECISION = click.option(
+    "--precision", type=click.Choice(["float32", "float64"]), help="[default: float32]"
+)
+"""Floating-point numbers of the simulations."""
+
+BACKEND = click.option(
+    "--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]"
+)
+"""Simulator of a system that has several."""
+
+PLOT = click.option(
+    "--plot", type=click.Path(path_type=Path), metavar="PNG", help="Draw the result into a PNG."
+)
+"""File of the one picture of a result."""
+
+SET = click.option(
+    "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
+)
+"""Options of a search that is given by name."""
+
+
+def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
+    """Return one decorator that gives a command several options, the first on top of its help."""
+
+    def decorate(command: Command) -> Command:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return decorate
+
+
+PARAMETER_CHOICE = all_of(
+    click.option("--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."),
+    click.option(
+        "--attack", default="cross_entropy", show_default=True, help="Search that attacks."
+    ),
+    click.option(
+        "--held-out", type=int, default=2000, show_default=True, help="Simulations of the result."
+    ),
+    click.option(
+        "--gradient/--no-gradient",
+        default=None,
+        help="Improve by gradients  [default: where the system has them]",
+    ),
+    SEED,
+    MAX_SECONDS,
+    BACKEND,
+)
+"""Options of `synthesize` and `repair`: keywords of both functions."""
+
+
+def load_problem(target: str, only: str | None = None) -> "Problem":
+    """Load the problem FILE.py:NAME, with only some of its features varied."""
     from verifai_jax.core.targets import load_target
+    from verifai_jax.problem import Problem
+
+    problem = load_target(target, Problem)
+    return problem if only is None else problem.only(*split_names(only))
+
+
+def load_run(folder: Path, target: str | None) -> "Run":
+    """Load the run in a folder, with the problem named, or else the one that the run records."""
     from verifai_jax.falsification.run import load
 
-    return load(folder, load_target(target or recorded_target(folder)))
+    return load(folder, load_problem(target or recorded_target(folder)))
 
 
 def recorded_target(folder: Path) -> str:
-    """The target in the run's record, if it is a file of the user's own project.
-
-    Loading a target runs its file; a run folder that came from elsewhere must not choose one.
-    """
+    """Return the target that a run records, if it is a file of the user's own project."""
+    from verifai_jax.core.targets import target_of_project
     from verifai_jax.falsification.run import RECORD
 
     if not (folder / RECORD).exists():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
     target = json.loads((folder / RECORD).read_text()).get("target")
-    here = Path.cwd().resolve()
-    if isinstance(target, str) and ".py" in target:
-        file = (here / target.rpartition(":")[0]).resolve()
-        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
-            return target
-    raise ValueError(
-        f"{folder} does not say which problem of this project it is of; "
-        "give it: --problem specs/FILE.py:NAME"
-    )
+    remedy = "--problem specs/FILE.py:NAME"
+    return target_of_project(target, folder, kind="problem", remedy=remedy)
 
 
-def only(problem: Any, names: str | None) -> Any:
-    """The problem with these features varied alone, comma-separated; all where none is named."""
-    return problem if names is None else problem.only(*map(str.strip, names.split(",")))
+def split_names(text: str) -> list[str]:
+    """Split names at their commas."""
+    return [name.strip() for name in text.split(",")]
 
 
-def pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Names and values of a repeated option."""
-    found = []
+def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Split each NAME=VALUE of a repeated option; a usage error says which one is none."""
+    pairs = []
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name.strip():
             raise click.UsageError(f"{option} needs NAME=VALUE; got {text!r}")
-        found.append((name.strip(), value.strip()))
-    return found
+        pairs.append((name.strip(), value.strip()))
+    return pairs
 
 
 def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
-    """The same as plain data: a value is JSON, or the text that it is."""
+    """Read each NAME=VALUE of a repeated option, the value as JSON where it is JSON."""
     values: dict[str, Any] = {}
-    for name, value in pairs(option, texts):
+    for name, value in split_pairs(option, texts):
         try:
             values[name] = json.loads(value)
         except json.JSONDecodeError:
@@ -64,36 +175,16 @@ def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
     return values
 
 
-def together(options: Iterable[Callable[..., Any]]) -> Callable[..., Any]:
-    """Options that several commands have, as one decorator."""
-
-    def decorated(command: Any) -> Any:
-        for option in reversed(tuple(options)):
-            command = option(command)
-        return command
-
-    return decorated
+def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
+    """Raise a usage error for an option that was given although `--resume` already fixes it."""
+    for option, value in options.items():
+        if value is not None and value != ():
+            raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
 
 
-CHOOSING = together(
-    (
-        click.option(
-            "--margin", type=float, default=0.0, show_default=True, help="Robustness wanted."
-        ),
-        click.option(
-            "--attack", default="cross_entropy", show_default=True, help="Search that attacks."
-        ),
-        click.option(
-            "--held-out", type=int, default=2000, show_default=True, help="Fresh environments."
-        ),
-        click.option(
-            "--gradient/--no-gradient", default=None, help="[default: where there are gradients]"
-        ),
-        click.option("--seed", type=int, default=0, show_default=True),
-        click.option("--max-seconds", type=float, help="Seconds at most, compilation included."),
-        click.option(
-            "--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]"
-        ),
-    )
-)
-"""How parameters are chosen, by `synthesize` and `repair`: keywords of both."""
+def next_folder(parent: str, name: str) -> Path:
+    """Return the first of parent/NAME-1, parent/NAME-2, ... that does not exist."""
+    number = 1
+    while (folder := Path(parent) / f"{name}-{number}").exists():
+        number += 1
+    return folder

@@ -1,9 +1,4 @@
-"""What this machine offers: versions, devices, cores, compile cache, rendering.
-
->>> print(report())
-verifai_jax 0.1.0
-...
-"""
+"""`verifai-jax doctor`: versions, devices, cores, compile cache and rendering of this machine."""
 
 import importlib.metadata
 import os
@@ -14,11 +9,14 @@ import sys
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import click
+
 from verifai_jax._version import __version__
 from verifai_jax.core.cores import available_cores
-from verifai_jax.core.devices import cache_folder
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
+"""Required packages whose versions are reported."""
+
 EXTRAS = {
     "mujoco": "mujoco",
     "mujoco-mjx": "mujoco",
@@ -26,17 +24,22 @@ EXTRAS = {
     "gymnax": "gymnax",
     "gymnasium": "gymnasium",
 }
-"""Optional package -> the extra of verifai_jax that installs it."""
+"""Optional packages, and the extra of verifai_jax that installs each."""
 
 
 class BadPair(NamedTuple):
-    """Versions that are known not to work together: `[least, below)` of each, None for no bound."""
+    """Versions of two packages that are known not to work together.
+
+    - `package`, `versions`: one package, and its versions `[least, below)`; None is no bound.
+    - `other`, `others`: the other package, likewise.
+    - `problem`: a sentence on what goes wrong, and the remedy.
+    """
 
     package: str
     versions: tuple[str | None, str | None]
     other: str
     others: tuple[str | None, str | None]
-    what: str
+    problem: str
 
 
 BAD_PAIRS = (
@@ -64,10 +67,17 @@ BAD_PAIRS = (
         "jax 0.10",
     ),
 )
+"""Known bad pairs."""
+
+
+@click.command()
+def doctor() -> None:
+    """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
+    click.echo(report())
 
 
 def report() -> str:
-    """Versions, devices and settings, one a line, with advice where something costs speed."""
+    """Write versions, devices and settings, one a line, with advice where speed is lost."""
     import jax
 
     lines = [
@@ -81,7 +91,7 @@ def report() -> str:
     for package, extra in EXTRAS.items():
         missing = f"not installed: pip install 'verifai_jax[{extra}]'"
         lines.append(f"{package:<12}{installed[package] or missing}")
-    lines += [f"  advice: {told}" for told in bad_pairs(installed)]
+    lines += [f"  advice: {problem}" for problem in bad_pairs(installed)]
     devices = jax.devices()
     lines.append(f"devices     {len(devices)} x {devices[0].platform}")
     cores = available_cores()
@@ -98,10 +108,10 @@ def report() -> str:
 
 
 def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
-    """What is known to go wrong between these versions."""
+    """List known problems between installed versions, given by package name."""
     return [
         f"{pair.package} {installed[pair.package]} with {pair.other} {installed[pair.other]}: "
-        f"{pair.what}"
+        f"{pair.problem}"
         for pair in BAD_PAIRS
         if _within(installed.get(pair.package), *pair.versions)
         and _within(installed.get(pair.other), *pair.others)
@@ -128,7 +138,7 @@ def _number(version: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", version)[:3])
 
 
-RENDER = """
+_RENDER = """
 import mujoco
 model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
 with mujoco.Renderer(model, 8, 8) as renderer:
@@ -142,7 +152,7 @@ def _rendering() -> str:
     wanted = os.environ.get("MUJOCO_GL", "egl")
     try:
         done = subprocess.run(
-            [sys.executable, "-c", RENDER],
+            [sys.executable, "-c", _RENDER],
             env={**os.environ, "MUJOCO_GL": wanted},
             capture_output=True,
             text=True,
@@ -160,6 +170,8 @@ def _rendering() -> str:
 
 
 def _cache_state() -> str:
+    from verifai_jax.core.devices import cache_folder
+
     folder = cache_folder()
     if folder is None:
         return "off (VERIFAI_JAX_CACHE); every process compiles anew"

@@ -1,31 +1,31 @@
-"""`verifai-jax explain`: which predicate breaks, when, and which features matter."""
+"""`verifai-jax explain runs/balance-1`: the predicate that breaks, when, and why."""
 
 from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import recorded_run
+from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_run
 
 
 @click.command()
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.argument("row", type=int, required=False)
-@click.option("--problem", "target", help="FILE.py:NAME of the problem [the one recorded].")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder of the picture [the run's].")
-@click.option("--pictures/--no-pictures", default=True)
+@RUN
+@ROW
+@PROBLEM
+@FOLDER
+@PICTURES
 def explain(
-    folder: Path, row: int | None, target: str | None, out: Path | None, pictures: bool
+    folder: Path, row: int | None, target: str | None, into: Path | None, pictures: bool
 ) -> None:
-    """Say why a ROW (by default the worst) of the run in FOLDER fails, and draw it."""
+    """Say why a ROW (by default the worst) of the run in RUN fails, and draw it."""
     import textwrap
 
     from verifai_jax import counterexamples
 
-    run = recorded_run(folder, target)
+    run = load_run(folder, target)
     why = counterexamples.explain(run, row)
     click.echo(textwrap.fill(str(why), 88, break_on_hyphens=False))
     if pictures:
-        path = (out or folder) / f"why-{why.row}.png"
+        path = (into or folder) / f"why-{why.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         why.plot(path)
-        click.echo(f"picture {path}")
+        click.echo(f"  picture      {path}")

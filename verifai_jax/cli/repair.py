@@ -5,48 +5,47 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import CHOOSING, plain_values
+from verifai_jax.cli.arguments import PARAMETER_CHOICE, PLOT, TARGET, load_problem, plain_values
 
 
 @click.command()
-@click.argument("target")
+@TARGET
 @click.option(
     "--parameters", required=True, metavar="NAMES", help="Features to change, comma-separated."
 )
 @click.option(
     "--nominal",
-    "values",
+    "nominal",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Where a parameter starts  [default: the problem's nominal value]",
+    help="Value a parameter starts from  [default: the problem's nominal value]",
 )
 @click.option("--run", "folder", type=click.Path(path_type=Path), help="Run with counterexamples.")
 @click.option("--budget", type=int, default=20_000, show_default=True, help="Simulations at most.")
-@CHOOSING
-@click.option("--out", type=click.Path(path_type=Path), help="PNG file for a picture.")
+@PARAMETER_CHOICE
+@PLOT
 def repair(
     target: str,
     parameters: str,
-    values: tuple[str, ...],
+    nominal: tuple[str, ...],
     folder: Path | None,
     budget: int,
-    out: Path | None,
-    **choosing: Any,
+    plot: Path | None,
+    **keywords: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
-    from verifai_jax.core.targets import load_target
     from verifai_jax.falsification.run import load
     from verifai_jax.synthesis import repair as run_repair
 
-    problem = load_target(target)
-    found = run_repair(
+    problem = load_problem(target)
+    result = run_repair(
         problem if folder is None else load(folder, problem),
         parameters,
         budget,
-        nominal=plain_values("--nominal", values) or None,
-        **choosing,
+        nominal=plain_values("--nominal", nominal) or None,
+        **keywords,
     )
-    click.echo(str(found))
-    if out is not None:
-        found.plot(out)
-        click.echo(f"  picture      {out}")
+    click.echo(str(result))
+    if plot is not None:
+        result.plot(plot)
+        click.echo(f"  picture      {plot}")

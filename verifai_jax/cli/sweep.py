@@ -6,7 +6,15 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import plain_values
+from verifai_jax.cli.arguments import (
+    MAX_SECONDS,
+    PICTURES,
+    SET,
+    next_folder,
+    plain_values,
+    refuse_with_resume,
+    split_names,
+)
 
 _FIXED = (
     "search",
@@ -28,7 +36,7 @@ _SHOWN = 12
 @click.argument("target", required=False)
 @click.option("--configurations", type=int, help="How many, at most  [default: 32]")
 @click.option("--search", help="Of the hyper-parameters: a name, or optuna:tpe  [default: halton]")
-@click.option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
+@SET
 @click.option("--seed", type=int, help="Of the search and the samples  [default: 0]")
 @click.option("--samples", type=int, help="Simulations of a policy at most  [default: 512]")
 @click.option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
@@ -39,13 +47,17 @@ _SHOWN = 12
 @click.option("--halving-by", "by", help="return or safety  [default: return]")
 @click.option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
 @click.option(
-    "--at", "nominal", multiple=True, metavar="NAME=VALUE", help="Where --only holds the others."
+    "--nominal", multiple=True, metavar="NAME=VALUE", help="Where --only holds the others."
 )
-@click.option("--max-seconds", type=float, help="Seconds at most, compilation included.")
+@MAX_SECONDS
 @click.option("--store", type=click.Path(path_type=Path), help="Remembers work [in the folder].")
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to go on with.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder [sweeps/NAME-1, -2, ...].")
-@click.option("--pictures/--no-pictures", default=True, help="Draw a picture into the folder.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Folder to write  [default: sweeps/NAME-1, -2, ...]",
+)
+@PICTURES
 def sweep(
     target: str | None,
     configurations: int | None,
@@ -54,34 +66,38 @@ def sweep(
     max_seconds: float | None,
     store: Path | None,
     resume: Path | None,
-    out: Path | None,
+    folder: Path | None,
     pictures: bool,
     **asked: Any,
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify what they learn."""
-    from verifai_jax.core.targets import load_study
+    from verifai_jax.core.targets import load_target, target_of_project
     from verifai_jax.sweeps._sweep import sweep as run_sweep
+    from verifai_jax.sweeps.study import Study
 
     if resume is not None:
-        fixed = {f"--{name.replace('_', '-')}": asked[name] for name in _FIXED}
-        fixed |= {"--set": options or None, "--at": nominal or None, "--out": out}
-        for option, value in fixed.items():
-            if value is not None:
-                option = {"--reduction": "--halving", "--by": "--halving-by"}.get(option, option)
-                raise click.UsageError(f"{option} is fixed in the sweep that --resume goes on with")
-        out, store = resume, resume if store is None else store
+        renamed = {"reduction": "halving", "by": "halving-by"}
+        fixed = {f"--{renamed.get(name, name)}": asked[name] for name in _FIXED}
+        refuse_with_resume(
+            {**fixed, "--set": options, "--nominal": nominal, "--folder": folder}, "sweep"
+        )
+        folder, store = resume, resume if store is None else store
         before = _before(store)
-        target = target or _own(before["target"], resume)
+        target = target or target_of_project(
+            before["target"],
+            resume,
+            kind="study",
+            remedy="specs/FILE.py:NAME --resume ...",
+        )
         asked, configurations = before["asked"], configurations or before["configurations"]
         options, nominal = tuple(before["options"]), tuple(before["nominal"])
     if target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/mountain_car.py:NAME.")
     configurations = 32 if configurations is None else configurations
-    study = load_study(target)
+    study = load_target(target, Study)
     if asked["only"] is not None:
-        names = [name.strip() for name in asked["only"].split(",")]
-        study = study.only(*names, nominal=plain_values("--at", nominal))
-    folder = out or _next_folder(study.name)
+        study = study.only(*split_names(asked["only"]), nominal=plain_values("--nominal", nominal))
+    folder = folder or next_folder("sweeps", study.name)
     how = _understood(asked, options)
     memory = folder if store is None else store
     # What a later --resume needs to know.
@@ -152,22 +168,6 @@ def _before(store: Path) -> dict[str, Any]:
     return note
 
 
-def _own(target: str, folder: Path) -> str:
-    """The target if it is a file of the user's own project.
-
-    Loading a target runs its file; a folder that came from elsewhere must not choose one.
-    """
-    here = Path.cwd().resolve()
-    if ".py" in target:
-        file = (here / target.rpartition(":")[0]).resolve()
-        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
-            return target
-    raise ValueError(
-        f"{folder} does not say which study of this project it is of; "
-        "give it: specs/FILE.py:NAME --resume ..."
-    )
-
-
 def _told(found: Any) -> str:
     """The first rows, the ones to choose first, as text."""
     from verifai_jax.sweeps.ranking import chosen_first
@@ -183,10 +183,3 @@ def _told(found: Any) -> str:
     text = some.to_string(float_format=lambda value: f"{value:.4g}", max_colwidth=40)
     left = len(table) - len(some)
     return text if not left else f"{text}\n  and {left} more in the table"
-
-
-def _next_folder(name: str) -> Path:
-    number = 1
-    while (folder := Path("sweeps") / f"{name}-{number}").exists():
-        number += 1
-    return folder

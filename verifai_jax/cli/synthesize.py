@@ -5,35 +5,39 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import CHOOSING
+from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
 
 
 @click.command()
-@click.argument("target")
+@TARGET
 @click.option(
     "--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]"
 )
 @click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
-@CHOOSING
-@click.option("--out", type=click.Path(path_type=Path), help="CSV file for the candidates.")
+@PARAMETER_CHOICE
+@click.option(
+    "--table",
+    type=click.Path(path_type=Path),
+    metavar="CSV",
+    help="Write the candidates into a CSV file.",
+)
 def synthesize(
     target: str,
     parameters: str | None,
     budget: int,
-    out: Path | None,
-    **choosing: Any,
+    table: Path | None,
+    **keywords: Any,
 ) -> None:
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
-    from verifai_jax.core.targets import load_target
     from verifai_jax.synthesis import synthesize as run_synthesize
 
-    found = run_synthesize(
-        load_target(target),
+    result = run_synthesize(
+        load_problem(target),
         parameters,
         budget,
-        **choosing,
+        **keywords,
     )
-    click.echo(str(found))
-    if out is not None:
-        found.candidates.to_csv(out, index=False)
-        click.echo(f"  candidates   {out}")
+    click.echo(str(result))
+    if table is not None:
+        result.candidates.to_csv(table, index=False)
+        click.echo(f"  candidates   {table}")

@@ -1,6 +1,10 @@
-"""Problems and studies by the file or module that defines them: `specs/cartpole.py:balance`.
+"""Objects named by the Python file or module that defines them.
 
-A target runs the Python file it names, as a test runner does; it is never read from a file.
+    load_target("specs/cartpole.py:balance", Problem)
+    definitions("specs/cartpole.py", Problem, Study)     # {"balance": Problem(...), ...}
+
+Loading a target runs the Python file that it names, as a test runner does. `target_of_project`
+keeps a folder that came from elsewhere from choosing which file is run.
 """
 
 import importlib
@@ -8,87 +12,105 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Protocol, TypeVar
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.problem.problem import Problem
 
-if TYPE_CHECKING:
-    from verifai_jax.sweeps.study import Study
+
+class Named(Protocol):
+    """An object that a target can name."""
+
+    @property
+    def name(self) -> str:
+        """Name of the object, after the colon of a target."""
+        ...
+
+
+Kind = TypeVar("Kind", bound=Named)
 
 
 class TargetError(ValueError):
-    """A target that names no problem."""
+    """A target that cannot be loaded, or that is not a file of the user's own project."""
 
 
-def problems_in(place: str) -> dict[str, Problem]:
-    """Problems of a file (`specs/cartpole.py`) or module (`specs.cartpole`), by name.
+def definitions(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
+    """Return the objects of some classes that a file or module defines.
 
-    **Raises:** `TargetError` where there is no such file or module, or it does not import.
+    **Arguments:**
+
+    - `place`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
+    - `kinds`: classes to look for.
+
+    **Returns:** the objects by their names, in the order of their definition.
+
+    **Raises:** `TargetError` where there is no such file or module, or it defines no such object.
     """
-    return _defined(place, Problem, "Problem")
+    objects = {
+        value.name: value for value in vars(_import(place)).values() if isinstance(value, kinds)
+    }
+    if not objects:
+        nouns = " and no ".join(kind.__name__ for kind in kinds)
+        raise TargetError(f"{place} defines no {nouns}")
+    return objects
 
 
-def studies_in(place: str) -> "dict[str, Study]":
-    """Studies of a file or module, by name.
+def load_target(target: str, kind: type[Kind]) -> Kind:
+    """Load the object that a target names.
 
-    **Raises:** as `problems_in`.
+    **Arguments:**
+
+    - `target`: `FILE.py:NAME` or `MODULE:NAME`; the name may be left out where the file defines
+      one object of this kind.
+    - `kind`: class of the object.
+
+    **Returns:** the object.
+
+    **Raises:** `TargetError` where there is no such file or module, or no single object to take;
+    `UnknownNameError` for a name that the file does not define, with those that it does.
     """
-    from verifai_jax.sweeps.study import Study
-
-    return _defined(place, Study, "Study")
-
-
-def defined_in(place: str) -> "dict[str, Problem | Study]":
-    """Problems and studies of a file or module, by name.
-
-    **Raises:** as `problems_in`, where there is neither.
-    """
-    from verifai_jax.sweeps.study import Study
-
-    return _defined(place, (Problem, Study), "Problem and no Study")
-
-
-def load_target(target: str) -> Problem:
-    """The problem named by `FILE.py:NAME` or `MODULE:NAME`; NAME may be left out if it is alone.
-
-    **Raises:** `TargetError` or `UnknownNameError`, listing what there is.
-    """
-    return _named(target, problems_in, "problem")
-
-
-def load_study(target: str) -> "Study":
-    """The study named by `FILE.py:NAME` or `MODULE:NAME`; NAME may be left out if it is alone.
-
-    **Raises:** as `load_target`.
-    """
-    return _named(target, studies_in, "study")
-
-
-def _defined(place: str, kind: Any, called: str) -> dict[str, Any]:
-    module = _import(place)
-    found = {p.name: p for p in vars(module).values() if isinstance(p, kind)}
-    if not found:
-        raise TargetError(f"{place} defines no {called}")
-    return found
-
-
-def _named(target: str, defined: Any, called: str) -> Any:
     place, colon, name = target.rpartition(":")
     if not colon:
         place, name = target, ""
-    found = defined(place)
-    if not name:
-        if len(found) == 1:
-            return next(iter(found.values()))
-        plural = "studies" if called == "study" else f"{called}s"
-        raise TargetError(
-            f"{place} has {len(found)} {plural}; name one: "
-            + ", ".join(f"{place}:{known}" for known in found)
-        )
-    if name not in found:
-        raise unknown_name(f"{called} in {place}", name, found)
-    return found[name]
+    objects = definitions(place, kind)
+    noun = kind.__name__.lower()
+    if name in objects:
+        return objects[name]
+    if name:
+        raise unknown_name(f"{noun} in {place}", name, objects)
+    if len(objects) == 1:
+        return next(iter(objects.values()))
+    plural = noun.removesuffix("y") + "ies" if noun.endswith("y") else f"{noun}s"
+    raise TargetError(
+        f"{place} has {len(objects)} {plural}; name one: "
+        + ", ".join(f"{place}:{known}" for known in objects)
+    )
+
+
+def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -> str:
+    """Return a recorded target if it names a file of the user's own project.
+
+    Loading a target runs its file, so a folder that came from elsewhere must not choose one: the
+    file has to lie below the current folder and outside the folder that names it.
+
+    **Arguments:**
+
+    - `target`: the target that the folder records, of any type.
+    - `folder`: folder that records it.
+    - `kind`: noun of the object, such as `"problem"`, for the message.
+    - `remedy`: words on how to name the target by hand, for the message.
+
+    **Returns:** the target.
+
+    **Raises:** `TargetError` for any other target.
+    """
+    here = Path.cwd().resolve()
+    if isinstance(target, str) and ".py" in target:
+        file = (here / target.rpartition(":")[0]).resolve()
+        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
+            return target
+    raise TargetError(
+        f"{folder} does not say which {kind} of this project it is of; give it: {remedy}"
+    )
 
 
 def _import(place: str) -> ModuleType:
@@ -107,9 +129,9 @@ def _import(place: str) -> ModuleType:
                 ) from error
             raise
     if path.is_dir():
-        raise TargetError(f"{place} is a folder; give a file in it: {_listing(path)}")
+        raise TargetError(f"{place} is a folder; give a file in it: {_python_files(path)}")
     if not path.exists():
-        raise TargetError(f"no file {place}; {path.parent}/ has {_listing(path.parent)}")
+        raise TargetError(f"no file {place}; {path.parent}/ has {_python_files(path.parent)}")
     name = f"_target_{path.resolve().stem}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -120,6 +142,6 @@ def _import(place: str) -> ModuleType:
     return module
 
 
-def _listing(folder: Path) -> str:
+def _python_files(folder: Path) -> str:
     files = sorted(p.name for p in folder.glob("*.py") if p.name != "__init__.py")
     return ", ".join(files) or "no Python file"

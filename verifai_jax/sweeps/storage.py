@@ -12,17 +12,16 @@ The study is code, which no file names to be run: `load_sweep(path, study)` gets
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.targets import load_target
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.sweeps.record import Curve, SweepRecord
 from verifai_jax.sweeps.result import Sweep
-
-if TYPE_CHECKING:
-    from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.study import Study
 
 RECORD = "sweep.json"
 TABLE = "table.parquet"
@@ -72,7 +71,7 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     return folder
 
 
-def load_sweep(path: str | Path, study: "Study | str | None" = None) -> Sweep:
+def load_sweep(path: str | Path, study: Study | str | None = None) -> Sweep:
     """Read a sweep back from the folder that `Sweep.save` wrote.
 
     - `study`: or its name, such as `"specs/cartpole.py:safe_training"`; needed for `.problem(i)`
@@ -95,9 +94,7 @@ def load_sweep(path: str | Path, study: "Study | str | None" = None) -> Sweep:
         found = data.get("format") if isinstance(data, dict) else None
         raise SweepFileError(f"{folder / RECORD} has format {found!r}; this version reads {FORMAT}")
     if isinstance(study, str):
-        from verifai_jax.core.targets import load_study
-
-        study = load_study(study)
+        study = load_target(study, Study)
     if study is not None:
         _check_same(folder, data, study)
     try:
@@ -112,7 +109,7 @@ def load_sweep(path: str | Path, study: "Study | str | None" = None) -> Sweep:
     return Sweep(record, study, None if study is not None else space, folder, failing, used)
 
 
-def _check_same(folder: Path, data: Mapping[str, Any], study: "Study") -> None:
+def _check_same(folder: Path, data: Mapping[str, Any], study: Study) -> None:
     for what, recorded, given in (
         ("name", data["study"], study.name),
         ("hyper-parameters", list(data["hyperparameters"]), list(study.space.columns)),

@@ -1,0 +1,18 @@
+"""`verifai-jax analyze runs/balance-1`: the report on a run's table."""
+
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_run
+
+
+@click.command()
+@RUN
+@PROBLEM
+@FOLDER
+def analyze(folder: Path, target: str | None, into: Path | None) -> None:
+    """Report rules, importance, kinds of failures and coverage of the run in RUN."""
+    analysis = load_run(folder, target).analyze()
+    click.echo(str(analysis))
+    click.echo(f"  written      {analysis.save((into or folder) / 'analysis')}")

@@ -1,0 +1,51 @@
+"""`verifai-jax replay runs/balance-1 417`: one simulation of a run, again."""
+
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_run
+
+
+@click.command()
+@RUN
+@ROW
+@PROBLEM
+@click.option(
+    "--precision",
+    type=click.Choice(["float32", "float64"]),
+    help="[default: float64, and that of the run for a system that draws random numbers]",
+)
+@FOLDER
+@PICTURES
+def replay(
+    folder: Path,
+    row: int | None,
+    target: str | None,
+    precision: str | None,
+    into: Path | None,
+    pictures: bool,
+) -> None:
+    """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
+    from verifai_jax.plotting import draw_replay
+
+    run = load_run(folder, target)
+    number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
+    if precision is None:
+        assert run.problem is not None
+        precision = run.precision if run.problem.draws() else "float64"
+    again = run.replay(number, precision)
+    stored = run.table.all.iloc[number]
+    click.echo(f"{run.name}, row {number}, {precision}")
+    for name in run.table.features:
+        value = stored[name]
+        number_like = isinstance(value, (int, float)) or hasattr(value, "dtype")
+        click.echo(f"  {name:<12} {value:.6g}" if number_like else f"  {name:<12} {value}")
+    for name, rho in again.rho.items():
+        click.echo(f"  {run.formulas[name]}")
+        click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")
+    verdict = "violated" if again.violated else "satisfied"
+    click.echo(f"  status {again.status.name.lower()}; {verdict}")
+    if pictures:
+        for path in draw_replay(again, into or folder):
+            click.echo(f"  picture      {path}")
