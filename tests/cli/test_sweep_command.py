@@ -9,6 +9,7 @@ from drifting import quick_certificates
 
 from verifai_jax.cli.main import main
 from verifai_jax.core.targets import TargetError, definitions, load_target
+from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
 
 STUDY = """
@@ -165,11 +166,11 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
 
 
 def test_studies_are_found_as_problems_are(call):
-    assert set(definitions("specs/drift.py", vj.Study)) == {"safe", "other"}
-    assert load_target("specs/drift.py:safe", vj.Study).description == "drifts that stay"
+    assert set(definitions("specs/drift.py", Study)) == {"safe", "other"}
+    assert load_target("specs/drift.py:safe", Study).description == "drifts that stay"
     Path("specs/empty.py").write_text("x = 1\n")
     with pytest.raises(TargetError, match=r"specs/empty.py defines no Study"):
-        load_target("specs/empty.py", vj.Study)
+        load_target("specs/empty.py", Study)
 
 
 def test_list_names_studies_beside_problems(call):
