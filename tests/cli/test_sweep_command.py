@@ -177,4 +177,4 @@ def test_list_names_studies_beside_problems(call):
     listed = CliRunner().invoke(main, ["list"])
     assert listed.exit_code == 0, listed.output
     assert "specs/drift.py:safe  drifts that stay" in listed.output
-    assert "a study of trainings, for sweep, over rate, noise" in listed.output
+    assert "a study of training runs, for sweep, over rate, noise" in listed.output
