@@ -4,17 +4,17 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import chi2, norm
 
-from verifai_jax.estimation.normal_space import Judge
+from verifai_jax.estimation.normal_space import LimitState
 
 
-def judged(robustness, dim, budget, **options):
-    """A judge of a closed form; nothing is simulated."""
+def closed_form(robustness, dim, budget, **options):
+    """A limit_state of a closed form; nothing is simulated."""
 
     def evaluate(u):
         rho = robustness(u)
         return rho, rho < 0, np.isfinite(rho)
 
-    return Judge(evaluate, dim, budget, batch=100_000, **options)
+    return LimitState(evaluate, dim, budget, batch=100_000, **options)
 
 
 def normal(u):

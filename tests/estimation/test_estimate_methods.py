@@ -2,27 +2,29 @@
 
 import numpy as np
 import pytest
-from closed_forms import CASES, half_space, judged, normal
+from closed_forms import CASES, closed_form, half_space, normal
 
 from verifai_jax.estimation._estimate import _one_thread
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
     Plan,
-    automatic,
-    by_counting,
-    by_splitting,
     chains_for,
+    estimate_automatically,
+    estimate_by_monte_carlo,
+    estimate_by_splitting,
 )
 
 
-def answered(robustness, dim, budget, seed=0, method=automatic, share=SHARE_OF_LEVEL, **options):
-    judge = judged(robustness, dim, budget, **options)
+def answered(
+    robustness, dim, budget, seed=0, method=estimate_automatically, share=SHARE_OF_LEVEL, **options
+):
+    limit_state = closed_form(robustness, dim, budget, **options)
     plan = Plan(0.95, chains_for(budget, share), np.zeros(dim, bool))
     with _one_thread():
-        answer = method(judge, np.random.default_rng(seed), plan)
-    assert judge.simulations <= budget
-    return answer, judge
+        answer = method(limit_state, np.random.default_rng(seed), plan)
+    assert limit_state.simulations <= budget
+    return answer, limit_state
 
 
 @pytest.mark.parametrize(
@@ -62,15 +64,15 @@ def test_intervals_cover_and_estimates_are_within_a_factor(name, dim, p, budget)
 
 
 def test_frequent_failures_are_counted_in_fresh_samples():
-    answer, judge = answered(half_space(3, 0.05), 3, 20_000)
+    answer, limit_state = answered(half_space(3, 0.05), 3, 20_000)
     assert answer.method == "monte_carlo"
-    assert answer.prior.simulations < judge.simulations == 20_000
+    assert answer.prior.simulations < limit_state.simulations == 20_000
     assert answer.low < 0.05 < answer.high
 
 
 def test_splitting_alone_gives_the_order_of_magnitude_from_several_runs():
     answer, _ = answered(
-        half_space(5, 1e-5), 5, 50_000, method=by_splitting, share=SHARE_OF_REPLICATE
+        half_space(5, 1e-5), 5, 50_000, method=estimate_by_splitting, share=SHARE_OF_REPLICATE
     )
     assert answer.method == "splitting"
     assert answer.diagnostics["runs"] >= 3
@@ -79,9 +81,9 @@ def test_splitting_alone_gives_the_order_of_magnitude_from_several_runs():
 
 
 def test_what_cannot_fail_gets_a_bound_and_no_estimate():
-    answer, judge = answered(lambda u: 1.0 + u[:, 0], 2, 5_000)
+    answer, limit_state = answered(lambda u: 1.0 + u[:, 0], 2, 5_000)
     assert answer.probability is None
-    assert judge.failures == 0
+    assert limit_state.failures == 0
     assert any("no failure" in note for note in answer.notes)
     assert answer.high == pytest.approx(1 - 0.05 ** (1 / answer.prior.simulations), rel=1e-6)
 
@@ -103,10 +105,12 @@ def test_discrete_coordinates_are_cells_of_the_cube():
 
 def test_a_constraint_makes_the_prior_conditional():
     # Given that the first coordinate lies in its upper quarter, failing is four times as probable.
-    answer, judge = answered(half_space_first(1e-5), 2, 30_000, accepts=lambda u: u[:, 0] > 0.75)
+    answer, limit_state = answered(
+        half_space_first(1e-5), 2, 30_000, constraint=lambda u: u[:, 0] > 0.75
+    )
     assert answer.probability == pytest.approx(4e-5, rel=0.1)
     assert answer.low < 4e-5 < answer.high
-    assert judge.simulations > 25_000  # What is refused is not simulated.
+    assert limit_state.simulations > 25_000  # What is refused is not simulated.
 
 
 def half_space_first(p):
@@ -119,8 +123,8 @@ def test_simulations_without_verdict_widen_the_upper_end():
     def robustness(u):
         return np.where(u[:, 1] < 0.02, np.nan, 0.05 - u[:, 0] + 0.8)
 
-    answer, judge = answered(robustness, 2, 20_000, method=by_counting)
-    assert judge.no_verdict > 300
+    answer, limit_state = answered(robustness, 2, 20_000, method=estimate_by_monte_carlo)
+    assert limit_state.no_verdict > 300
     assert answer.probability == pytest.approx(0.15 * 0.98, rel=0.05)
     assert answer.high > 0.15 * 0.98 + 0.02
 
@@ -141,11 +145,11 @@ def test_interruption_keeps_what_is_finished():
         rho = robustness(u)
         return rho, rho < 0, np.ones(len(u), bool)
 
-    from verifai_jax.estimation.normal_space import Judge
+    from verifai_jax.estimation.normal_space import LimitState
 
-    judge = Judge(evaluate, 2, 50_000, batch=1000)
+    limit_state = LimitState(evaluate, 2, 50_000, batch=1000)
     plan = Plan(0.95, 32, np.zeros(2, bool))
-    answer = by_counting(judge, np.random.default_rng(0), plan)
-    assert judge.ended == "interrupted"
+    answer = estimate_by_monte_carlo(limit_state, np.random.default_rng(0), plan)
+    assert limit_state.ended == "interrupted"
     assert answer.prior.simulations == 3000
     assert answer.low < 0.01 < answer.high

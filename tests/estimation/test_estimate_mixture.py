@@ -5,7 +5,7 @@ import pytest
 
 from verifai_jax.estimation import fitting, mixture
 from verifai_jax.estimation.components import Prior
-from verifai_jax.estimation.splitting import split
+from verifai_jax.estimation.splitting import run_splitting
 
 
 @pytest.fixture(scope="module")
@@ -18,13 +18,13 @@ def failures():
 
 def components(failures):
     z, weight = failures
-    steps = fitting.smooth(z, weight)
+    steps = fitting.fit_marginals(z, weight)
     return {
-        "gaussian": fitting.gaussian(z, weight),
+        "gaussian": fitting.fit_gaussian(z, weight),
         "smooth": steps,
-        "copula": fitting.copula(z, weight, steps),
-        "alike": fitting.alike(z, weight),
-        "shell": fitting.shell(z, weight),
+        "copula": fitting.fit_copula(z, weight, steps),
+        "alike": fitting.fit_common_marginal(z, weight),
+        "shell": fitting.fit_shell(z, weight),
     }
 
 
@@ -50,8 +50,8 @@ def test_fitted_mixture_covers_a_mode_that_only_one_chain_has_found():
     random = np.random.default_rng(0)
     many = random.standard_normal((400, 2)) * 0.3 + [4, 0]
     few = random.standard_normal((8, 2)) * 0.3 + [0, -4]
-    family = np.append(np.arange(400), np.full(8, 400))
-    made = mixture.fitted(np.concatenate([many, few]), np.ones(408), family, random)
+    chain_ids = np.append(np.arange(400), np.full(8, 400))
+    made = mixture.fit_mixture(np.concatenate([many, few]), np.ones(408), chain_ids, random)
     assert made.shares.sum() == pytest.approx(1)
     assert made.shares[0] == pytest.approx(0.1)
     assert np.median(made.ratio(few)) > 1.0
@@ -60,19 +60,19 @@ def test_fitted_mixture_covers_a_mode_that_only_one_chain_has_found():
 def test_shares_minimise_the_second_moment():
     table = np.array([[4.0, 1.0], [1.0, 3.0]])
     weight = np.array([0.5, 0.5])
-    share = mixture.stacked(table, weight, 0.1)
+    share = mixture.optimal_shares(table, weight, 0.1)
     grid = np.linspace(0, 1, 2001)
     values = [weight @ (1 / (0.1 + 0.9 * table @ [s, 1 - s])) for s in grid]
     assert share[0] == pytest.approx(grid[int(np.argmin(values))], abs=0.01)
 
 
 def test_levels_lead_down_and_their_product_is_about_right():
-    from closed_forms import half_space, judged
+    from closed_forms import closed_form, half_space
 
-    judge = judged(half_space(2, 1e-4), 2, 100_000)
-    climb = split(judge, np.random.default_rng(0), 4000, 400)
-    assert climb.stopped is None
-    assert climb.levels[-1] == -np.inf
-    assert np.all(np.diff(climb.levels) < 0)
-    assert climb.estimate == pytest.approx(1e-4, rel=0.6)
-    assert all(0.2 < rate < 0.8 for rate in climb.accepted)
+    limit_state = closed_form(half_space(2, 1e-4), 2, 100_000)
+    run = run_splitting(limit_state, np.random.default_rng(0), 4000, 400)
+    assert run.stopped is None
+    assert run.levels[-1] == -np.inf
+    assert np.all(np.diff(run.levels) < 0)
+    assert run.estimate == pytest.approx(1e-4, rel=0.6)
+    assert all(0.2 < rate < 0.8 for rate in run.accepted)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom, genpareto
 
 from verifai_jax.estimation import simulations_until, upper_bound
-from verifai_jax.estimation.intervals import skewed_interval, tail_index, weighted
+from verifai_jax.estimation.intervals import skewed_interval, tail_index, weighted_mean
 from verifai_jax.statistics.binomial import simulations_without_failure
 
 
@@ -57,7 +57,7 @@ def test_tail_index_is_that_of_the_generalised_pareto_distribution():
 
 
 def test_equal_weights_are_worth_their_number():
-    told = weighted(np.append(np.full(50, 0.5), np.zeros(950)))
+    told = weighted_mean(np.append(np.full(50, 0.5), np.zeros(950)))
     assert told.effective == pytest.approx(50)
     assert told.mean == pytest.approx(0.025)
     assert told.tail == -np.inf

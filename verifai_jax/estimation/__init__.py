@@ -1,7 +1,7 @@
 """Failure probabilities: Monte Carlo, importance sampling and multilevel splitting.
 
-found = vj.estimate(problem)                        # chooses by itself
-found = vj.estimate(problem, method="monte_carlo")
+result = vj.estimate(problem)                        # chooses the method itself
+result = vj.estimate(problem, method="monte_carlo")
 simulations_until(1e-6, failures=0, simulations=50_000)
 """
 

@@ -1,14 +1,14 @@
-"""The probability that a simulation fails, with an interval; by the method that suits it.
+"""The probability that a simulation fails, with an interval.
 
-found = vj.estimate(problem, budget=50_000)
-found = vj.estimate(problem, method="splitting", p0=1e-6)
-found.probability, found.interval, found.upper_bound
+result = vj.estimate(problem, budget=50_000)
+result = vj.estimate(problem, method="splitting", p0=1e-6)
+result.probability, result.interval, result.upper_bound
 """
 
 import math
 import time
-from contextlib import nullcontext
-from typing import Any
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 
@@ -16,24 +16,25 @@ from verifai_jax._version import __version__
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import Progress
-from verifai_jax.estimation.double_precision import Simulated
+from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
     Answer,
     Plan,
-    automatic,
-    by_counting,
-    by_importance,
-    by_splitting,
+    bound_from_pilot,
     chains_for,
-    cut_off,
+    estimate_automatically,
+    estimate_by_importance_sampling,
+    estimate_by_monte_carlo,
+    estimate_by_splitting,
 )
-from verifai_jax.estimation.normal_space import Judge
+from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.problem.problem import Problem
+from verifai_jax.statistics.binomial import clopper_pearson
 
 
 @suggests_options
@@ -51,30 +52,36 @@ def estimate(
     max_seconds: float | None = None,
     progress: bool | None = None,
 ) -> Estimate:
-    """The probability, under the prior of the feature space, that a simulation breaks a formula.
+    """Estimate the probability, under the prior of the features, that a simulation fails.
+
+    A failure is a simulation that breaks a formula of the problem.
 
     The prior is uniform on the unit cube, that is, the distributions of the features, given that
     the constraint holds; a system's own randomness counts as well.
 
     **Arguments:**
 
-    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; chosen by what the first samples
-      show when left out.
-    - `budget`: simulations at most, pilot and fitting included.
+    - `problem`: the system with its feature space and formulas.
+    - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; the first samples choose when left
+      out.
+    - `budget`: simulations at most, pilot and fit included.
     - `batch`: simulations at once; by default as many as the method asks for at a time.
     - `seed`: the same seed gives the same estimate on the same machine.
-    - `confidence`: of the interval and of the bound.
-    - `p0`: a probability that it should be below; the result says whether that is shown, and how
-      many simulations without a failure would show it.
-    - `precision`, `backend`, `progress`: as in `falsify`.
-    - `max_seconds`: wall-clock seconds after which the estimate is made from what there is.
+    - `confidence`: of the interval and of the bound, between 0 and 1.
+    - `p0`: a wanted upper limit of the probability, between 0 and 1; the result says whether it is
+      shown, and how many further simulations without a failure would show it.
+    - `precision`, `backend`: as in `falsify`.
+    - `max_seconds`: wall-clock seconds after which finished simulations give the estimate.
+    - `progress`: True draws a progress bar, False none; None draws one on a terminal and in a
+      notebook.
 
-    Ctrl-C ends it and gives what can be said from what is finished. A simulation without a verdict
-    (not finite, raised, out of time) is counted, is no failure in the estimate, and is one at the
-    upper ends of the interval and of the bound.
+    **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
+    from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
+    is no failure in the estimate, and counts as one at the upper ends of interval and bound.
 
-    **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
-    problem whose parts do not fit or a constraint that refuses every sample.
+    **Raises:** before anything compiles, `TypeError` for something that is no `Problem`, and
+    `ValueError` for options out of range, unknown names, a problem whose parts do not fit, or a
+    constraint that refuses every sample.
     """
     started = time.perf_counter()
     if not isinstance(problem, Problem):
@@ -92,34 +99,34 @@ def estimate(
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
-    simulated = Simulated(choice.problem, batch, precision, seed)
+    simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed)
     simulated.compile()
     with Progress(problem.name, budget, progress) as bar, _one_thread():
-        judge = Judge(
+        limit_state = LimitState(
             simulated,
             problem.space.dim,
             int(budget),
             batch,
-            accepts=None if problem.space.where is None else _accepting(problem),
+            constraint=None if problem.space.where is None else _constraint(problem),
             deadline=None if max_seconds is None else started + max_seconds,
-            told=bar.update,
+            report=bar.update,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:
-            answer = _METHODS[method](judge, np.random.default_rng(seed), plan)
+            answer = _METHODS[method](limit_state, np.random.default_rng(seed), plan)
         except KeyboardInterrupt:
-            # Between simulations, while a proposal is fitted: the first level still counts.
-            judge.ended = "interrupted"
-            answer = cut_off(judge, plan)
+            # Interrupted while a proposal is fitted: the pilot samples still count.
+            limit_state.ended = "interrupted"
+            answer = bound_from_pilot(limit_state, plan)
     seconds = time.perf_counter() - started
-    return _result(problem, choice.backend, answer, judge, plan, seed, precision, p0, seconds)
+    return _result(problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds)
 
 
 _METHODS = {
-    None: automatic,
-    "monte_carlo": by_counting,
-    "importance": by_importance,
-    "splitting": by_splitting,
+    None: estimate_automatically,
+    "monte_carlo": estimate_by_monte_carlo,
+    "importance": estimate_by_importance_sampling,
+    "splitting": estimate_by_splitting,
 }
 
 
@@ -127,7 +134,7 @@ def _result(
     problem: Problem,
     backend: str | None,
     answer: Answer,
-    judge: Judge,
+    limit_state: LimitState,
     plan: Plan,
     seed: int,
     precision: str,
@@ -138,27 +145,25 @@ def _result(
     bound = answer.prior.upper_bound(plan.confidence)
     high = answer.high
     if answer.prior.no_verdict and answer.method in ("importance", "splitting"):
-        # What the weighted samples do not see of simulations without a verdict.
-        from verifai_jax.statistics.binomial import clopper_pearson
-
+        # The weighted samples near the failures say nothing of missing verdicts elsewhere.
         none = clopper_pearson(answer.prior.no_verdict, answer.prior.simulations, plan.confidence)
         high = min(1.0, high + none.high)
-    elif judge.no_verdict and answer.method in ("importance", "splitting"):
+    elif limit_state.no_verdict and answer.method in ("importance", "splitting"):
         notes.append(
-            f"{judge.no_verdict:,} simulations near the failures gave no verdict; should they be "
-            "failures, the probability is higher"
+            f"{limit_state.no_verdict:,} simulations near the failures gave no verdict; if they "
+            "are failures, the probability is higher"
         )
-    if judge.no_verdict == judge.simulations > 0:
+    if limit_state.no_verdict == limit_state.simulations > 0:
         notes.append(
-            "no simulation gave a verdict at all; falsify(problem, 'uniform', 10).table.all has "
-            "their status and what they raised"
+            "no simulation gave a verdict; falsify(problem, 'uniform', 10).table.all shows their "
+            "status and their exceptions"
         )
-    if judge.ended:
-        notes.append(f"ended early: {judge.ended}")
+    if limit_state.ended:
+        notes.append(f"ended early: {limit_state.ended}")
     if answer.method in ("importance", "splitting"):
         notes.append(
-            "a part of the failures that no search has come near is not in the interval, only in "
-            "the guaranteed bound"
+            "the interval does not account for failures far from all that splitting reached; the "
+            "guaranteed bound does"
         )
     return Estimate(
         name=problem.name,
@@ -167,10 +172,10 @@ def _result(
         high=high if answer.probability is not None else bound,
         confidence=plan.confidence,
         method=answer.method,
-        simulations=judge.simulations,
-        budget=judge.budget,
-        failures=judge.failures,
-        no_verdict=judge.no_verdict,
+        simulations=limit_state.simulations,
+        budget=limit_state.budget,
+        failures=limit_state.failures,
+        no_verdict=limit_state.no_verdict,
         upper_bound=bound,
         prior_simulations=answer.prior.simulations,
         prior_failures=answer.prior.failures,
@@ -189,19 +194,22 @@ def _result(
     )
 
 
-def _accepting(problem: Problem) -> Any:
+def _constraint(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
     accepts = problem.space.accepts_points
-    return lambda u: accepts(np.asarray(u, np.float32))
+    return lambda u: np.asarray(accepts(np.asarray(u, np.float32)))
 
 
-def _check_share(name: str, value: Any) -> None:
+def _check_share(name: str, value: float) -> None:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     if not (number and 0 < value < 1 and math.isfinite(value)):
         raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
 
 
-def _one_thread() -> Any:
-    """Small matrices take ten times as long on threads that other work keeps waiting."""
+def _one_thread() -> AbstractContextManager[object]:
+    """Limit linear algebra to one thread.
+
+    Small matrices take ten times as long on threads that other work keeps waiting.
+    """
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:

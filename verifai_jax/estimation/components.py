@@ -5,28 +5,30 @@ z = component.sample(rng, 1000)
 component.log_ratio(z)                          # its density over the prior's, logarithmic
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 
+@runtime_checkable
 class Component(Protocol):
-    """A density over normal space."""
+    """A density over standard normal space, relative to the prior."""
 
     def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
-        """Independent points."""
+        """Draw independent points."""
         ...
 
     def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Logarithm of this density over the standard normal one."""
+        """Return the logarithm of this density over the standard normal one."""
         ...
 
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior itself: the defensive part."""
+    """The prior itself: the defensive part of a mixture."""
 
     dim: int
 
@@ -39,7 +41,12 @@ class Prior:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A normal density: `mean [d]`, and axes `[d, d]` (columns) with their standard deviations."""
+    """A normal density.
+
+    - `mean`: its centre.
+    - `axes`: principal axes, one a column.
+    - `stds`: standard deviations along the axes.
+    """
 
     mean: Float[np.ndarray, " d"]
     axes: Float[np.ndarray, "d d"]
@@ -60,12 +67,13 @@ class Marginals:
     """Independent coordinates, each the prior times a step function of the coordinate.
 
     - `edges`: for each coordinate, borders of the steps in normal space, from -inf to inf.
-    - `log_steps`: for each, the logarithm of the density over the prior's; `masses` of the steps.
+    - `log_steps`: for each coordinate, logarithms of the density over the prior's.
+    - `masses`: for each coordinate, probabilities of the steps.
     """
 
-    edges: tuple[Float[np.ndarray, " k"], ...]
-    log_steps: tuple[Float[np.ndarray, " k"], ...]
-    masses: tuple[Float[np.ndarray, " k"], ...]
+    edges: tuple[Float[np.ndarray, " _"], ...]
+    log_steps: tuple[Float[np.ndarray, " _"], ...]
+    masses: tuple[Float[np.ndarray, " _"], ...]
 
     def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
         z = rng.standard_normal((n, len(self.edges)))
@@ -85,9 +93,11 @@ class Marginals:
 
 @dataclass(frozen=True)
 class Copula:
-    """Coordinates with these marginals, dependent as those of a normal vector.
+    """Coordinates with given marginals, dependent as those of a normal vector.
 
-    - `axes`, `stds`: of its correlation matrix: eigenvectors `[d, d]` and roots of eigenvalues.
+    - `marginals`: densities of the coordinates.
+    - `axes`: eigenvectors of the correlation matrix, one a column.
+    - `stds`: square roots of its eigenvalues.
     """
 
     marginals: Marginals
@@ -119,7 +129,7 @@ class Copula:
 
 
 def rank_scores(marginals: Marginals, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Each coordinate as the standard normal number of the same rank."""
+    """Map each coordinate to the standard normal number of the same rank."""
     from scipy.special import ndtr, ndtri
 
     v = z.copy()
@@ -135,9 +145,10 @@ def rank_scores(marginals: Marginals, z: Float[np.ndarray, "n d"]) -> Float[np.n
 
 @dataclass(frozen=True)
 class Shell:
-    """Every direction alike; the distance from the origin is the prior's times a step function.
+    """A density alike in every direction, with the prior's distance times a step function.
 
-    - `edges`: borders of the steps, in normal scores of the distance.
+    - `dim`: number of coordinates.
+    - `steps`: the step function over normal scores of the distance from the origin.
     """
 
     dim: int
@@ -160,7 +171,7 @@ class Shell:
 
 
 def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """The distance from the origin as a standard normal number: its quantile among the prior's."""
+    """Map the distance from the origin to the standard normal number of the same rank."""
     from scipy.special import gammainc, gammaincc, ndtri
 
     half, square = z.shape[1] / 2, np.sum(z * z, axis=1) / 2
@@ -180,8 +191,10 @@ def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarr
     return np.where(mirrored, -z, z)
 
 
-def ratios(components: Any, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n k"]:
-    """Logarithm of each component's density over the prior's; cut where it would overflow."""
+def log_ratios(
+    components: Sequence[Component], z: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "n k"]:
+    """Return logarithms of each component's density over the prior's, cut where they overflow."""
     if not len(z):
         return np.zeros((0, len(components)))
     columns = [np.clip(component.log_ratio(z), -700, 700) for component in components]

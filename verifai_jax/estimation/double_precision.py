@@ -1,6 +1,6 @@
-"""A problem as the methods see it: points of the unit cube in double precision, and verdicts.
+"""Evaluation of points of the unit cube whose features are computed in double precision.
 
-    evaluate = Simulated(problem, batch=448, precision="float32", seed=0)
+    evaluate = DoublePrecisionEvaluator(problem, batch=448, precision="float32", seed=0)
     rho, failing, proper = evaluate(u)              # u [n, d], float64
 
 Rare failures lie near the ends of the coordinates, where single precision has no numbers: next to 1
@@ -21,13 +21,13 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
 EXACT = 2**24
-"""Integers up to here are float32 numbers."""
+"""Greatest integer up to which all integers are float32 numbers."""
 BEYOND = (2.0**-27, 2.0**-32)
-"""Probabilities between which a distribution that has an outermost value has only that."""
+"""Two probabilities at which a distribution with an outermost value has the same value."""
 
 
-class Held(FeatureSpace):
-    """The features of a space as plain float32 numbers `[size]`, computed already."""
+class FlattenedFeatures(FeatureSpace):
+    """A space whose points are the features themselves, as plain numbers `[size]`."""
 
     def __init__(self, space: FeatureSpace, precision: str) -> None:
         self.root, self.where = space.root, None
@@ -51,11 +51,18 @@ class Held(FeatureSpace):
         return jax.tree.unflatten(self._tree, leaves)
 
 
-class Simulated:
-    """See the module's docstring.
+class DoublePrecisionEvaluator:
+    """An evaluator of points in double precision; see the module's docstring.
 
-    `clamped` says for each coordinate whether its domain ends in one outermost value, beyond which
-    no simulation sees.
+    `clamped` is True at coordinates `[d]` whose domain ends in one outermost value, which hides
+    everything beyond it from a simulation.
+
+    **Arguments:**
+
+    - `problem`: a checked one, on the backend that it is to run on.
+    - `batch`: simulations at once.
+    - `precision`: of the simulations, `"float32"` or `"float64"`.
+    - `seed`: of the random keys of simulations; as in `falsify`.
     """
 
     def __init__(self, problem: Problem, batch: int, precision: str, seed: int) -> None:
@@ -63,7 +70,7 @@ class Simulated:
         self._held = max(space.levels, default=0) <= EXACT
         if self._held:
             if ("held", precision) not in problem.engines:
-                held = Held(space, precision)
+                held = FlattenedFeatures(space, precision)
                 problem.engines["held", precision] = _with_space(problem, held)
             problem = problem.engines["held", precision]
         self._evaluator = Evaluator(problem, batch, precision=precision, seed=seed)
@@ -79,11 +86,11 @@ class Simulated:
             padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
             with in_precision("float64"):
                 points = np.asarray(self._numbers(padded))[: len(u)]
-        judged = self._evaluator(points)
-        return judged.rho, judged.failing, judged.proper
+        closed_form = self._evaluator(points)
+        return closed_form.rho, closed_form.failing, closed_form.proper
 
     def compile(self) -> None:
-        """Compile now."""
+        """Compile the program of a batch now."""
         self._evaluator.engine.compile()
 
     def _clamped(self, space: FeatureSpace) -> Bool[np.ndarray, " d"]:

@@ -1,9 +1,13 @@
 """Components fitted to weighted failures, each in its own way.
 
-    gaussian(z, weight); smooth(z, weight); copula(z, weight, steps); shell(z, weight)
+    fit_gaussian(z, weight)
+    marginals = fit_marginals(z, weight)
+    fit_copula(z, weight, marginals)
+    fit_shell(z, weight)
 
-The weights are of sum one. `worth` says how much less the points are worth than as many independent
-ones: what is believed of them beyond the prior is what so few can show.
+Points are `z [n, d]`, their weights `[n]` sum to one. `worth` is the number of independent points
+that one point stands for (states of a chain are alike, so less than one): a component departs from
+the prior only as far as that many points can show.
 """
 
 import numpy as np
@@ -14,36 +18,36 @@ from verifai_jax.estimation.components import (
     Gaussian,
     Marginals,
     Shell,
+    log_ratios,
     radial_score,
     rank_scores,
-    ratios,
 )
 
 SWEEPS = 12
-"""Of expectation maximisation, at most."""
+"""Iterations of expectation maximisation, at most."""
 KERNELS = 400
-"""Points that a kernel density is made from, at most,"""
+"""Points that a kernel density is made from, at most."""
 MANY = 16
-"""coordinates beyond which flat ones are looked for first,"""
+"""Coordinates beyond which flat ones are skipped before kernels are fitted."""
 CELLS = 48
-"""and steps that it is kept in."""
+"""Steps of the function that a kernel density is stored in."""
 
 
-def size_of(weight: Float[np.ndarray, " n"]) -> float:
-    """How many equally weighted points these are worth."""
+def effective_size(weight: Float[np.ndarray, " n"]) -> float:
+    """Return the number of equally weighted points that these weights are worth."""
     return float(weight.sum() ** 2 / np.sum(weight * weight)) if len(weight) else 0.0
 
 
-def gaussian(
+def fit_gaussian(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Gaussian:
-    """Mean and covariance, of which only what exceeds the noise of so few points is believed.
+    """Fit a Gaussian; its covariance departs from the prior's only beyond sampling noise.
 
     Eigenvalues within the range that those of white noise have (Marchenko and Pastur, 1967) are
     replaced by their mean.
     """
     d = z.shape[1]
-    size = max(size_of(weight) * worth, 1.0)
+    size = max(effective_size(weight) * worth, 1.0)
     mean = weight @ z
     centred = z - mean
     values, axes = np.linalg.eigh((centred * weight[:, None]).T @ centred)
@@ -67,14 +71,18 @@ def gaussian(
     return Gaussian(mean, axes, np.sqrt(np.clip(values, 1e-8, 25.0)))
 
 
-def mixture_of_gaussians(
+def fit_gaussian_mixture(
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
     modes: int,
     rng: np.random.Generator,
     worth: float = 1.0,
 ) -> tuple[list[float], list[Gaussian], Float[np.ndarray, "n modes"]]:
-    """Expectation maximisation from spread-out centres, with the covariances of `gaussian`."""
+    """Fit a mixture of Gaussians by expectation maximisation from spread-out centres.
+
+    **Returns:** shares, components, and memberships `[n, modes]` times weight; covariances are
+    those of `fit_gaussian`.
+    """
     n = len(z)
     centre = z[rng.choice(n, p=weight)]
     distance = np.sum((z - centre) ** 2, axis=1)
@@ -87,15 +95,15 @@ def mixture_of_gaussians(
         distance = np.minimum(distance, np.sum((z - centres[-1]) ** 2, axis=1))
     gaps = np.stack([np.sum((z - c) ** 2, axis=1) for c in centres], axis=1)
     member = np.eye(len(centres))[gaps.argmin(axis=1)] * weight[:, None]
-    shares, found = [1.0], []
+    shares, components = [1.0], []
     for sweep in range(SWEEPS if modes > 1 else 1):
-        kept = member.sum(axis=0) > 1e-9
-        member = member[:, kept]
+        keep = member.sum(axis=0) > 1e-9
+        member = member[:, keep]
         shares = list(member.sum(axis=0) / member.sum())
-        found = [gaussian(z, column / column.sum(), worth) for column in member.T]
+        components = [fit_gaussian(z, column / column.sum(), worth) for column in member.T]
         if modes == 1 or sweep == SWEEPS - 1:
             break
-        logs = ratios(found, z) + np.log(shares)
+        logs = log_ratios(components, z) + np.log(shares)
         logs -= logs.max(axis=1, keepdims=True)
         new = np.exp(logs)
         new *= (weight / new.sum(axis=1))[:, None]
@@ -103,14 +111,14 @@ def mixture_of_gaussians(
         member = new
         if moved < 0.01:
             break
-    return shares, found, member
+    return shares, components, member
 
 
 _INNER = np.array([1e-6, 1e-5, 1e-4, 5e-4, 1e-3, 2e-3, 5e-3, 0.01, 0.02, 0.04, 0.07])
 
 
 def _borders() -> list[Float[np.ndarray, " k"]]:
-    """Borders of steps to choose from, as probabilities: even ones, and ones fine at both ends."""
+    """Return borders of steps to choose from, as probabilities: even ones, and fine ends."""
     even = [np.linspace(0, 1, k + 1) for k in (2, 4, 8, 16, 32)]
     middle = np.linspace(0.1, 0.9, 9)
     tails = np.concatenate([[0], _INNER, middle, 1 - _INNER[::-1], [1]])
@@ -124,42 +132,45 @@ _FINEST = np.unique(np.concatenate(_BORDERS))
 _AMONG = [np.searchsorted(_FINEST, border) for border in _BORDERS]
 
 
-def copula(
+def fit_copula(
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
     steps: Marginals,
     worth: float = 1.0,
 ) -> Copula | None:
-    """These marginals with the correlations that are no noise; None where there are none."""
-    d, size = z.shape[1], size_of(weight) * worth
+    """Join marginals by the correlations beyond sampling noise; None where there are none."""
+    d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
     centred = v - weight @ v
     cross = (centred * weight[:, None]).T @ centred
     spread = np.sqrt(np.maximum(np.diag(cross), 1e-12))
     correlation = cross / np.outer(spread, spread)
     noise = 2.5 / np.sqrt(size)
-    kept = np.where(np.abs(correlation) > noise, correlation * (1 - 1 / max(size, 2)), 0.0)
-    np.fill_diagonal(kept, 1.0)
-    if np.count_nonzero(kept) == d:
+    keep = np.where(np.abs(correlation) > noise, correlation * (1 - 1 / max(size, 2)), 0.0)
+    np.fill_diagonal(keep, 1.0)
+    if np.count_nonzero(keep) == d:
         return None
-    values, axes = np.linalg.eigh(kept)
+    values, axes = np.linalg.eigh(keep)
     values = np.clip(values, 0.02, None)
     return Copula(steps, axes, np.sqrt(values))
 
 
-def smooth(
+def fit_marginals(
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
     wider: float = 1.0,
     worth: float = 1.0,
 ) -> Marginals:
-    """The density of each coordinate by kernels, reflected at the ends, in fine steps.
+    """Fit the density of each coordinate by kernels, reflected at the ends, in fine steps.
 
-    - `wider`: than Silverman's rule (Density estimation, 1986, equation 3.31) has the kernels.
+    **Arguments:**
+
+    - `wider`: width of the kernels over that of Silverman's rule (Density estimation, 1986,
+      equation 3.31).
     """
     from scipy.special import ndtr, ndtri
 
-    size = size_of(weight) * worth
+    size = effective_size(weight) * worth
     if len(z) > KERNELS:
         # Equally many points in each part of the weight: the same density with less work.
         places = (np.arange(KERNELS) + 0.5) / KERNELS
@@ -197,21 +208,21 @@ def smooth(
     return Marginals(tuple(edges), tuple(logs), tuple(masses))
 
 
-def alike(
+def fit_common_marginal(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Marginals:
-    """One step function for all coordinates, from all of them together."""
+    """Fit one step function for all coordinates, from all of them together."""
     from scipy.special import ndtr
 
     d = z.shape[1]
-    found = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, size_of(weight) * worth * d)
-    return Marginals(*((part,) * d for part in found))
+    steps = _steps(ndtr(z).ravel(), np.repeat(weight, d) / d, effective_size(weight) * worth * d)
+    return Marginals(*((part,) * d for part in steps))
 
 
 def _steps(
     u: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Borders, logarithmic heights and masses, with the borders that Akaike's criterion prefers."""
+    """Return borders, logarithmic heights and masses; Akaike's criterion chooses the borders."""
     from scipy.special import ndtri
 
     best = 0.0
@@ -233,14 +244,14 @@ def _steps(
     return chosen
 
 
-def shell(
+def fit_shell(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Shell:
-    """Shells of the distances that these points have, in steps narrow in probability."""
+    """Fit shells to the distances of the points from the origin, in steps narrow in probability."""
     from scipy.special import ndtr
 
     score = radial_score(z)
-    size = size_of(weight) * worth
+    size = effective_size(weight) * worth
     order = np.argsort(score)
     total = np.cumsum(weight[order])
     steps = int(np.clip(size // 20, 2, 12))
@@ -252,7 +263,7 @@ def shell(
     width = np.where(below > 0, ndtr(-below) - ndtr(-above), ndtr(above) - ndtr(below))
     width = np.maximum(width, 1e-300)
     mass = (np.bincount(place, weight, len(width)) * size + 0.5) / (size + 0.5 * len(width))
-    # Outside of all that was seen the prior's own density is enough.
+    # Outside of all points the prior's own density is enough.
     mass[0], mass[-1] = min(mass[0], width[0]), min(mass[-1], max(width[-1], 0.01))
     mass = mass / mass.sum()
     steps_of = Marginals((edges,), (np.log(mass / width),), (mass,))

@@ -1,4 +1,4 @@
-"""Intervals and bounds: of prior samples, of weighted samples, and of splitting.
+"""Intervals and bounds of prior samples, of weighted samples, and of splitting.
 
 upper_bound(0, 2000)                            # 0.0015: what no failure in 2000 says
 simulations_until(1e-4, failures=0, simulations=2000)
@@ -11,11 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 
-class Weighted(NamedTuple):
-    """The mean of weighted samples, its relative error and what is known of their tail.
+class WeightedMean(NamedTuple):
+    """The mean of weighted samples, its relative error, and their tail.
 
+    - `mean`: their arithmetic mean.
     - `cv`: relative standard error of the mean.
-    - `skewness`: of the samples; `effective`: as many samples of equal weight.
+    - `skewness`: skewness of the samples.
+    - `effective`: number of equally weighted samples that they are worth.
     - `largest`: share of the largest sample in the sum.
     - `tail`: index of the generalised Pareto distribution of the largest ones (k-hat); the variance
       is infinite from 0.5 on, and the mean beyond 0.7 not to be relied on.
@@ -30,9 +32,17 @@ class Weighted(NamedTuple):
 
 
 def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
-    """One-sided Clopper-Pearson bound: the largest rate that so few failures do not exclude.
+    """Return the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
 
-    Source: Clopper and Pearson, Biometrika 26 (1934). Without a failure about `3 / simulations`.
+    Without a failure it is about `3 / simulations` at 95 %. Source: Clopper and Pearson, Biometrika
+    26 (1934).
+
+    **Arguments:**
+
+    - `failures`, `simulations`: counts of independent samples of the prior.
+    - `confidence`: probability that the bound holds, between 0 and 1.
+
+    **Returns:** a failure probability between 0 and 1; 1 without simulations.
     """
     from scipy.special import betaincinv
 
@@ -41,22 +51,15 @@ def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> fl
     return float(betaincinv(failures + 1, simulations - failures, confidence))
 
 
-def normal_quantile(confidence: float) -> float:
-    """How many standard deviations a two-sided interval of this confidence has."""
-    from scipy.special import ndtri
-
-    return float(ndtri((1 + confidence) / 2))
-
-
-def weighted(x: Float[np.ndarray, " n"]) -> Weighted:
-    """The mean of independent `x >= 0`, weights of failures and zero elsewhere, and its tail."""
+def weighted_mean(x: Float[np.ndarray, " n"]) -> WeightedMean:
+    """Return the mean and tail of independent `x >= 0`: weights at failures, zero elsewhere."""
     n, total = len(x), float(x.sum())
     if n < 2 or total <= 0:
-        return Weighted(0.0, math.inf, 0.0, 0.0, 1.0, math.inf)
+        return WeightedMean(0.0, math.inf, 0.0, 0.0, 1.0, math.inf)
     mean, std = total / n, float(x.std(ddof=1))
     skewness = float(np.mean((x - mean) ** 3)) / std**3 if std > 0 else 0.0
     effective = total**2 / float(np.sum(x * x))
-    return Weighted(
+    return WeightedMean(
         mean,
         std / math.sqrt(n) / mean,
         skewness,
@@ -67,17 +70,17 @@ def weighted(x: Float[np.ndarray, " n"]) -> Weighted:
 
 
 def skewed_interval(x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
-    """An interval of the mean of skewed samples: Student's, with the skewness transformed away.
+    """Return Student's interval of the mean of skewed samples, with the skewness removed.
 
     Source: Hall, On the removal of skewness by transformation, Journal of the Royal Statistical
     Society B 54 (1992), equation 2.3 (the cubic one, which is monotone).
     """
-    found, n = weighted(x), len(x)
-    if not math.isfinite(found.cv):
+    mean, n = weighted_mean(x), len(x)
+    if not math.isfinite(mean.cv):
         return 0.0, math.inf
     # Few effective samples: as wide as Student's interval of so many.
-    quantile = student(confidence, max(found.effective - 1, 2.0))
-    g = found.skewness / math.sqrt(n)
+    quantile = student_quantile(confidence, max(mean.effective - 1, 2.0))
+    g = mean.skewness / math.sqrt(n)
 
     def transformed(t: float) -> float:
         if abs(g) < 1e-6:
@@ -85,27 +88,27 @@ def skewed_interval(x: Float[np.ndarray, " n"], confidence: float) -> tuple[floa
         inner = 1 + g * (t - g / 6)
         return 3 / g * (math.copysign(abs(inner) ** (1 / 3), inner) - 1)
 
-    low = found.mean * (1 - found.cv * transformed(quantile))
-    high = found.mean * (1 - found.cv * transformed(-quantile))
+    low = mean.mean * (1 - mean.cv * transformed(quantile))
+    high = mean.mean * (1 - mean.cv * transformed(-quantile))
     # Below zero nothing is possible; there the logarithm is symmetric.
-    return max(low, found.mean * math.exp(-quantile * found.cv * 1.5), 0.0), high
+    return max(low, mean.mean * math.exp(-quantile * mean.cv * 1.5), 0.0), high
 
 
 def log_interval(mean: float, cv: float, confidence: float, freedom: float) -> tuple[float, float]:
-    """An interval symmetric in the logarithm: of a product of fractions."""
-    factor = math.exp(student(confidence, freedom) * math.sqrt(math.log1p(cv * cv)))
+    """Return an interval symmetric in the logarithm, for a product of fractions."""
+    factor = math.exp(student_quantile(confidence, freedom) * math.sqrt(math.log1p(cv * cv)))
     return mean / factor, mean * factor
 
 
-def student(confidence: float, freedom: float) -> float:
-    """Quantile of Student's distribution for a two-sided interval."""
+def student_quantile(confidence: float, freedom: float) -> float:
+    """Return the quantile of Student's distribution for a two-sided interval."""
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, (1 + confidence) / 2))
 
 
 def tail_index(weights: Float[np.ndarray, " n"]) -> float:
-    """Shape of the generalised Pareto distribution fitted to the largest weights, k-hat.
+    """Fit a generalised Pareto distribution to the largest weights; return its shape, k-hat.
 
     Sources: Vehtari, Simpson, Gelman, Yao and Gabry, Pareto smoothed importance sampling, JMLR 25
     (2024); the fit is that of Zhang and Stephens, Technometrics 51 (2009).
@@ -135,10 +138,15 @@ def tail_index(weights: Float[np.ndarray, " n"]) -> float:
 def simulations_until(
     rate: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
 ) -> int:
-    """How many more simulations of the prior show that the failure rate is below `rate`.
+    """Count further simulations that show a failure rate below `rate` if none of them fails.
 
-    If none of them fails: the least `n` for which `upper_bound(failures, simulations + n)` is at
-    most `rate`.
+    **Arguments:**
+
+    - `rate`: failure probability to be shown, between 0 and 1.
+    - `failures`, `simulations`: independent samples of the prior that are there already.
+    - `confidence`: of the bound, between 0 and 1.
+
+    **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `rate`.
 
     **Raises:** `ValueError` unless `0 < rate < 1`.
     """

@@ -1,6 +1,6 @@
-"""Which method answers, within a budget: Monte Carlo first, then splitting, then its proposal.
+"""The methods within a budget: Monte Carlo first, then splitting, then importance sampling.
 
-    answer = automatic(judge, rng, plan)
+    answer = estimate_automatically(limit_state, rng, plan)
     answer.probability, answer.low, answer.high, answer.method
 
 A first level of prior samples decides. Failures that are frequent enough are counted in fresh
@@ -19,8 +19,13 @@ from jaxtyping import Bool
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.monte_carlo import Counts
-from verifai_jax.estimation.normal_space import Ended, Judge
-from verifai_jax.estimation.splitting import Climb, explore, split
+from verifai_jax.estimation.normal_space import Ended, LimitState
+from verifai_jax.estimation.splitting import (
+    FirstLevel,
+    SplittingRun,
+    explore_failures,
+    run_splitting,
+)
 
 COUNTED = 0.06
 """Relative error at which counting the failures of the prior is good enough."""
@@ -29,22 +34,24 @@ LEAST_EFFECTIVE = 60
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
 SHARE_OF_LEVEL = 0.09
-"""Of the budget, for each level of the splitting that makes the proposal,"""
+"""Share of the budget for each level of the splitting that makes the proposal."""
 SHARE_OF_REPLICATE = 0.02
-"""and of those that are the estimate themselves: several, which tell how much they differ."""
+"""Share of the budget for each level of splitting runs that are the estimate themselves."""
 EXPLORED = 0.1
-"""Of what is left then, for more failures before the proposal is fitted."""
+"""Share of the simulations left for more failures before the proposal is fitted."""
 CHAIN = 10
-"""States of a chain: as many levels are a tenth as probable as the one before."""
+"""States of a chain: each level is about a tenth as probable as the previous one."""
 UNDERSTATED = 1.6
-"""Chains of one level start from those of the one before, so that their errors add up to more."""
+"""Factor on the relative error of a run: chains start from those of the previous level."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What an answer is to be like.
+    """Requirements of an answer.
 
-    - `chains`: of a level; `clamped`: coordinates with an outermost value.
+    - `confidence`: of the interval and the bound.
+    - `chains`: splitting chains of a level.
+    - `clamped`: True at coordinates whose domain ends in an outermost value.
     """
 
     confidence: float
@@ -54,9 +61,16 @@ class Plan:
 
 @dataclass
 class Answer:
-    """What a method says; `probability` is None where it says nothing.
+    """An answer of a method; fields are those of `Estimate`.
 
-    `prior` are the independent samples of the prior that the bound stands on.
+    - `prior`: counts of the independent samples of the prior that the bound rests on.
+    - `probability`: the estimate; None where none is claimed.
+    - `low`, `high`: ends of the interval.
+    - `method`: the method that gave the estimate.
+    - `effective`, `relative_error`: precision of the estimate.
+    - `diagnostics`: further numbers of the method.
+    - `notes`: surprises, in words.
+    - `drawn`: data of the pictures.
     """
 
     prior: Counts
@@ -72,16 +86,18 @@ class Answer:
 
 
 def chains_for(budget: int, share: float) -> int:
-    """Chains of a level that takes this share of the budget, in multiples of 32."""
+    """Return the chains of a level that takes this share of the budget, in multiples of 32."""
     return 32 * max(1, round(budget * share / CHAIN / 32))
 
 
-def by_counting(judge: Judge, rng: np.random.Generator, plan: Plan) -> Answer:
-    """Monte Carlo with all that is left."""
-    return _counted(monte_carlo.sample(judge, rng, judge.left), plan)
+def estimate_by_monte_carlo(
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan
+) -> Answer:
+    """Estimate by Monte Carlo with all simulations that are left."""
+    return _monte_carlo_answer(monte_carlo.sample_prior(limit_state, rng, limit_state.left), plan)
 
 
-def _counted(counts: Counts, plan: Plan) -> Answer:
+def _monte_carlo_answer(counts: Counts, plan: Plan) -> Answer:
     answer = Answer(counts)
     if counts.failures:
         answer.probability = counts.failures / counts.simulations
@@ -100,184 +116,197 @@ def _counted(counts: Counts, plan: Plan) -> Answer:
     return answer
 
 
-def automatic(judge: Judge, rng: np.random.Generator, plan: Plan) -> Answer:
-    """The method that suits what the first samples show."""
-    first = _first_level(judge, rng, plan)
+def estimate_automatically(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
+    """Estimate by the method that suits the first samples."""
+    first = _first_level(limit_state, rng, plan)
     if first is None:
-        return cut_off(judge, plan)
+        return bound_from_pilot(limit_state, plan)
     counts = _counts(first)
-    expected = counts.failures / counts.simulations * judge.left
+    expected = counts.failures / counts.simulations * limit_state.left
     if counts.failures >= 10 and expected >= COUNTED**-2:
         # The choice was made by the first samples, so only fresh ones count.
-        answer = by_counting(judge, rng, plan)
+        answer = estimate_by_monte_carlo(limit_state, rng, plan)
         if answer.prior.simulations:
             return answer
-        return _counted(counts, plan)
-    return by_importance(judge, rng, plan, first)
+        return _monte_carlo_answer(counts, plan)
+    return estimate_by_importance_sampling(limit_state, rng, plan, first)
 
 
-def by_importance(judge: Judge, rng: np.random.Generator, plan: Plan, first: Any = None) -> Answer:
-    """Splitting for a proposal, importance sampling for the estimate."""
-    first = _first_level(judge, rng, plan) if first is None else first
+def estimate_by_importance_sampling(
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, first: FirstLevel | None = None
+) -> Answer:
+    """Estimate by importance sampling; splitting makes the proposal."""
+    first = _first_level(limit_state, rng, plan) if first is None else first
     if first is None:
-        return cut_off(judge, plan)
+        return bound_from_pilot(limit_state, plan)
     counts = _counts(first)
-    climb = split(judge, rng, len(first[0]), plan.chains, first)
-    if climb.stopped is not None:
-        return _not_reached(judge, rng, plan, climb, counts)
+    run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first)
+    if run.stopped is not None:
+        return _bound_only(limit_state, rng, plan, run, counts)
     try:
-        steps = max(2, round(EXPLORED * judge.left / plan.chains))
-        points, family = explore(judge, rng, climb, plan.chains, steps)
-        made = importance.fit(judge, rng, points, family, judge.left)
-        promised = made.effective * judge.left
+        steps = max(2, round(EXPLORED * limit_state.left / plan.chains))
+        points, chain_ids = explore_failures(limit_state, rng, run, plan.chains, steps)
+        fitted = importance.fit_proposal(limit_state, rng, points, chain_ids, limit_state.left)
+        promised = fitted.effective * limit_state.left
         if promised < LEAST_EFFECTIVE:
-            answer = _replicated(judge, rng, plan, [climb], counts)
+            answer = _splitting_answer(limit_state, rng, plan, [run], counts)
             answer.notes.append(
                 "no proposal fits the failures well enough for importance sampling (it promises "
-                f"{promised:.0f} effective failures, tail index {made.tail:.2f}), so the estimate "
-                "is that of multilevel splitting"
+                f"{promised:.0f} effective failures, tail index {fitted.tail:.2f}), so the "
+                "estimate is that of multilevel splitting"
             )
             return answer
-        found = importance.sample(judge, rng, made.proposal, judge.left, plan.clamped)
+        samples = importance.sample_proposal(
+            limit_state, rng, fitted.proposal, limit_state.left, plan.clamped
+        )
     except Ended:
-        return _replicated(judge, rng, plan, [climb], counts)
-    if not found.x.any():
-        return _replicated(judge, rng, plan, [climb], counts)
-    return _weighed(found, climb, counts, plan)
+        return _splitting_answer(limit_state, rng, plan, [run], counts)
+    if not samples.x.any():
+        return _splitting_answer(limit_state, rng, plan, [run], counts)
+    return _importance_answer(samples, run, counts, plan)
 
 
-def _weighed(found: importance.Sampled, climb: Climb, counts: Counts, plan: Plan) -> Answer:
-    told = found.told
-    low, high = found.interval(plan.confidence)
-    failing, drawn = found.by_prior
-    answer = Answer(counts, told.mean, low, high, "importance", told.effective, told.cv)
+def _importance_answer(
+    samples: importance.ImportanceSamples, run: SplittingRun, counts: Counts, plan: Plan
+) -> Answer:
+    mean = samples.mean
+    low, high = samples.interval(plan.confidence)
+    failing, drawn = samples.defensive_counts
+    answer = Answer(counts, mean.mean, low, high, "importance", mean.effective, mean.cv)
     answer.diagnostics = {
-        "tail_index": told.tail,
-        "largest_share": told.largest,
-        "failing_share": float(found.failing.mean()),
-        "components": len(found.proposal.shares),
-        "defensive_share": float(found.proposal.shares[0]),
+        "tail_index": mean.tail,
+        "largest_share": mean.largest,
+        "failing_share": float(samples.failing.mean()),
+        "components": len(samples.proposal.shares),
+        "defensive_share": float(samples.proposal.shares[0]),
         "failures_by_prior": failing,
         "samples_by_prior": drawn,
-        "splitting": climb.estimate,
-        "unresolved": found.unresolved,
-        "acceptance": found.acceptance[0],
-        "levels": list(climb.levels),
-        "fractions": list(climb.fractions),
+        "splitting": run.estimate,
+        "unresolved": samples.unresolved,
+        "acceptance": samples.acceptance[0],
+        "levels": list(run.levels),
+        "fractions": list(run.fractions),
     }
-    answer.drawn = {"weights": np.sort(found.x[found.failing])[::-1] / found.x.sum()}
-    apart = abs(np.log(told.mean / climb.estimate))
-    if apart > 3.5 * np.hypot(UNDERSTATED * climb.cv, told.cv):
-        other = log_interval(climb.estimate, UNDERSTATED * climb.cv, plan.confidence, 10)
+    answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
+    apart = abs(np.log(mean.mean / run.estimate))
+    if apart > 3.5 * np.hypot(UNDERSTATED * run.cv, mean.cv):
+        other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
         answer.low, answer.high = min(low, other[0]), max(high, other[1])
         answer.notes.append(
-            f"splitting gave {climb.estimate:.2g}, which does not agree; the interval is made to "
+            f"splitting gave {run.estimate:.2g}, which does not agree; the interval is made to "
             "hold both. More simulations would tell"
         )
-    if told.tail > WORST_TAIL:
+    if mean.tail > WORST_TAIL:
         answer.notes.append(
-            f"the weights have a heavy tail (index {told.tail:.2f}): the interval may be too narrow"
+            f"the weights have a heavy tail (index {mean.tail:.2f}): the interval may be too narrow"
         )
-    if found.unresolved > 0.01:
+    if samples.unresolved > 0.01:
         answer.notes.append(
             f"failures lie where single precision or a distribution's outermost value hides up to "
-            f"{100 * found.unresolved:.0f} % of them; the interval is wider by that"
+            f"{100 * samples.unresolved:.0f} % of them; the interval is wider by that"
         )
     return answer
 
 
-def by_splitting(judge: Judge, rng: np.random.Generator, plan: Plan) -> Answer:
-    """Independent splitting runs, as many as the budget holds."""
-    climb = split(judge, rng, CHAIN * plan.chains, plan.chains)
-    counts = Counts(*climb.first)
-    if climb.stopped is not None:
-        return _not_reached(judge, rng, plan, climb, counts)
-    return _replicated(judge, rng, plan, [climb], counts)
+def estimate_by_splitting(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
+    """Estimate by independent splitting runs, as many as the budget allows."""
+    run = run_splitting(limit_state, rng, CHAIN * plan.chains, plan.chains)
+    counts = Counts(*run.first)
+    if run.stopped is not None:
+        return _bound_only(limit_state, rng, plan, run, counts)
+    return _splitting_answer(limit_state, rng, plan, [run], counts)
 
 
-def _replicated(
-    judge: Judge, rng: np.random.Generator, plan: Plan, climbs: list[Climb], counts: Counts
+def _splitting_answer(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    plan: Plan,
+    runs: list[SplittingRun],
+    counts: Counts,
 ) -> Answer:
-    """The mean of these runs and of as many more as the budget holds."""
-    size = climbs[0].first[0]
-    cost = size + (len(climbs[0].fractions) - 1) * (size - size // CHAIN)
+    """Answer by the mean of these runs and of as many more as the budget allows."""
+    size = runs[0].first[0]
+    cost = size + (len(runs[0].fractions) - 1) * (size - size // CHAIN)
     # Half as large, where that gives two instead of one.
-    while judge.left < 2.2 * cost and size >= 20 * CHAIN and len(climbs) == 1:
+    while limit_state.left < 2.2 * cost and size >= 20 * CHAIN and len(runs) == 1:
         size, cost = size // 2 // CHAIN * CHAIN, cost / 2
-    while judge.left > 1.1 * cost:
-        climb = split(judge, rng, size, size // CHAIN)
-        counts = counts + Counts(*climb.first)
-        if climb.stopped is not None:
-            if climb.stopped == "stuck":
+    while limit_state.left > 1.1 * cost:
+        run = run_splitting(limit_state, rng, size, size // CHAIN)
+        counts = counts + Counts(*run.first)
+        if run.stopped is not None:
+            if run.stopped == "stuck":
                 continue
             break
-        climbs.append(climb)
-    worth = np.array([climb.first[0] for climb in climbs], float)
+        runs.append(run)
+    worth = np.array([run.first[0] for run in runs], float)
     worth /= worth.sum()
-    values = np.array([climb.estimate for climb in climbs])
+    values = np.array([run.estimate for run in runs])
     mean = float(worth @ values)
-    inner = UNDERSTATED * np.array([climb.cv for climb in climbs])
+    inner = UNDERSTATED * np.array([run.cv for run in runs])
     by_chains = float(np.sqrt(np.sum((worth * inner) ** 2)))
-    runs = len(climbs)
+    count = len(runs)
     cv, freedom = by_chains, 8.0
-    if runs > 1:
-        variance = float(np.sum(worth**2 * (values - mean) ** 2)) * runs / (runs - 1)
-        cv, freedom = max(cv, float(np.sqrt(variance)) / mean), runs + 3.0
+    if count > 1:
+        variance = float(np.sum(worth**2 * (values - mean) ** 2)) * count / (count - 1)
+        cv, freedom = max(cv, float(np.sqrt(variance)) / mean), count + 3.0
     low, high = log_interval(mean, cv, plan.confidence, freedom)
     answer = Answer(counts, mean, low, min(high, 1.0), "splitting", float("nan"), cv)
     answer.diagnostics = {
-        "runs": runs,
+        "runs": count,
         "estimates": [float(value) for value in values],
-        "levels": list(climbs[0].levels),
-        "fractions": list(climbs[0].fractions),
-        "accepted": list(climbs[0].accepted),
+        "levels": list(runs[0].levels),
+        "fractions": list(runs[0].fractions),
+        "accepted": list(runs[0].accepted),
     }
-    if runs == 1:
+    if count == 1:
         answer.notes.append("one splitting run only: its interval rests on its own chains")
     return answer
 
 
-def _not_reached(
-    judge: Judge, rng: np.random.Generator, plan: Plan, climb: Climb, counts: Counts
+def _bound_only(
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun, counts: Counts
 ) -> Answer:
-    """What is left goes to the prior; the bound is what remains."""
-    reached = float(np.prod(climb.fractions)) if climb.fractions else 1.0
-    level = climb.levels[-1] if climb.levels else np.inf
+    """Answer by a bound alone: the simulations that are left sample the prior."""
+    reached = float(np.prod(run.fractions)) if run.fractions else 1.0
+    level = run.levels[-1] if run.levels else np.inf
     why = {
         "stuck": "the search found no failure: the robustness gets no lower than "
-        f"{judge.least:.4g}, or has no slope to follow",
+        f"{limit_state.least:.4g}, or has no slope to follow",
         "budget": f"the budget ended at robustness {level:.4g}, which is reached with probability "
         f"{reached:.1e}; failing is rarer, or impossible",
-    }.get(climb.stopped or "", f"ended ({climb.stopped}) at robustness {level:.4g}")
-    counts = counts + monte_carlo.sample(judge, rng, judge.left)
-    answer = _counted(counts, plan)
-    answer.diagnostics = {"levels": list(climb.levels), "fractions": list(climb.fractions)}
-    if judge.failures == 0:
+    }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:.4g}")
+    counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
+    answer = _monte_carlo_answer(counts, plan)
+    answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}
+    if limit_state.failures == 0:
         answer.notes.insert(0, why)
     elif answer.probability is None:
         answer.notes.insert(
-            0, f"{why}; {judge.failures:,} failures were found on the way, so it can fail"
+            0, f"{why}; {limit_state.failures:,} failures were met on the way, so it can fail"
         )
     return answer
 
 
-def cut_off(judge: Judge, plan: Plan) -> Answer:
-    """What the samples of the prior say that were finished before an early end."""
-    answer = _counted(Counts(*judge.first), plan)
-    answer.notes.insert(0, f"ended early ({judge.ended})")
+def bound_from_pilot(limit_state: LimitState, plan: Plan) -> Answer:
+    """Answer by the pilot samples of the prior that were finished before an early end."""
+    answer = _monte_carlo_answer(Counts(*limit_state.pilot), plan)
+    answer.notes.insert(0, f"ended early ({limit_state.ended})")
     return answer
 
 
-def _first_level(judge: Judge, rng: np.random.Generator, plan: Plan) -> Any:
+def _first_level(
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan
+) -> FirstLevel | None:
+    """Simulate the first level, samples of the prior; None where time ends before it does."""
     try:
-        z = judge.prior(rng, min(CHAIN * plan.chains, judge.left))
-        seen = judge(z)
+        z = limit_state.sample_prior(rng, min(CHAIN * plan.chains, limit_state.left))
+        scores = limit_state(z)
     except Ended:
-        judge.first = (judge.simulations, judge.failures, judge.no_verdict)
+        limit_state.pilot = (limit_state.simulations, limit_state.failures, limit_state.no_verdict)
         return None
-    judge.first = (len(z), int(seen.failing.sum()), int((~seen.proper).sum()))
-    return (z, *seen)
+    limit_state.pilot = (len(z), int(scores.failing.sum()), int((~scores.proper).sum()))
+    return z, scores.score, scores.failing, scores.proper
 
 
-def _counts(first: Any) -> Counts:
+def _counts(first: FirstLevel) -> Counts:
     return Counts(len(first[0]), int(first[2].sum()), int((~first[3]).sum()))

@@ -1,6 +1,6 @@
 """Proposals for importance sampling: mixtures fitted to failures, in standard normal space.
 
-    proposal = fitted(points, weight, family, rng)
+    proposal = fit_mixture(points, weight, chain_ids, rng)
     z, _ = proposal.sample(rng, 1000)
     ratio = proposal.ratio(z)                       # proposal density over prior density
 
@@ -15,53 +15,61 @@ JASA 95 (2000), for the defensive share.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.estimation.components import Gaussian, Prior, ratios
+from verifai_jax.estimation.components import Component, Gaussian, Prior, log_ratios
 from verifai_jax.estimation.fitting import (
-    alike,
-    copula,
-    mixture_of_gaussians,
-    shell,
-    size_of,
-    smooth,
+    effective_size,
+    fit_common_marginal,
+    fit_copula,
+    fit_gaussian_mixture,
+    fit_marginals,
+    fit_shell,
 )
 
 MODES = (1, 2, 4, 8)
-"""Clusters that are tried."""
+"""Numbers of clusters to try."""
 MOST_POINTS = 1500
-"""Failures that a half of the candidates is fitted to at most: more change the fit little."""
+"""Failures that one half of the components is fitted to, at most: more change the fit little."""
 TOGETHER = 0.3
-"""Of the shares, by all points; the rest by those that a component was not fitted to."""
+"""Part of the shares that all points decide; points not fitted to decide the rest."""
 LEAST_SHARE = 1e-3
-"""Below which a component is dropped."""
+"""Share below which a component is dropped."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Components and their shares; the first is the prior."""
+    """A mixture of components; the first is the prior.
 
-    components: tuple[Any, ...]
+    - `components`: the densities.
+    - `shares`: their probabilities, of sum one.
+    """
+
+    components: tuple[Component, ...]
     shares: Float[np.ndarray, " k"]
 
     def sample(
         self, rng: np.random.Generator, n: int
     ) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
-        """Points in random order and the component of each; counts as near the shares as can be."""
+        """Draw points in random order; return them and the component of each.
+
+        Counts of the components are as near their shares as possible.
+        """
         # Systematic: the counts are off by less than one, and right on average.
         borders = np.floor(n * np.append(0, np.cumsum(self.shares)) + rng.random())
         borders[0], borders[-1] = 0, n
         counts = np.diff(np.clip(borders, 0, n)).astype(int)
-        z = np.concatenate([c.sample(rng, k) for c, k in zip(self.components, counts, strict=True)])
+        z = np.concatenate(
+            [c.sample(rng, k) for c, k in zip(self.components, counts.tolist(), strict=True)]
+        )
         origin = np.repeat(np.arange(len(counts)), counts)
         order = rng.permutation(n)
         return z[order], origin[order]
 
-    def joined(self, other: "Mixture", share: float) -> "Mixture":
-        """A mixture of both, with this share of the other."""
+    def join(self, other: "Mixture", share: float) -> "Mixture":
+        """Mix this mixture with a `share` of the other."""
         shares = np.concatenate(
             [
                 [(1 - share) * self.shares[0] + share * other.shares[0]],
@@ -70,67 +78,75 @@ class Mixture:
             ]
         )
         components = (*self.components, *other.components[1:])
-        kept = np.append(True, shares[1:] >= LEAST_SHARE)
-        shares[1:] *= (1 - shares[0]) / max(shares[1:][kept[1:]].sum(), 1e-12)
+        keep = np.append(True, shares[1:] >= LEAST_SHARE)
+        shares[1:] *= (1 - shares[0]) / max(shares[1:][keep[1:]].sum(), 1e-12)
         return Mixture(
-            tuple(c for c, keep in zip(components, kept, strict=True) if keep), shares[kept]
+            tuple(c for c, use in zip(components, keep, strict=True) if use), shares[keep]
         )
 
     def ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Proposal density over the prior's."""
-        return np.exp(ratios(self.components, z)) @ self.shares
+        """Return the proposal density over the prior's."""
+        return np.exp(log_ratios(self.components, z)) @ self.shares
 
 
-def fitted(
+def fit_mixture(
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
-    family: Int[np.ndarray, " n"],
+    chain_ids: Int[np.ndarray, " n"],
     rng: np.random.Generator,
     defensive: float = 0.1,
 ) -> Mixture:
-    """The mixture for these failures.
+    """Fit a mixture to weighted failures.
 
     **Arguments:**
 
-    - `weight`: how much of the failures' distribution each stands for.
-    - `family`: points of one chain have the same number: they are not split between the halves.
-    - `defensive`: share of the prior at least.
+    - `z`: failures `[n, d]` in normal space.
+    - `weight`: parts `[n]` of the failures' distribution that they stand for.
+    - `chain_ids`: the chain `[n]` of each; points of one chain stay in one half.
+    - `defensive`: least share of the prior.
     """
     d = z.shape[1]
     weight = weight / weight.sum()
-    half = (rng.permutation(int(family.max()) + 1) % 2)[family].astype(bool)
-    if min(size_of(weight[half]), size_of(weight[~half])) < 4:
+    half = (rng.permutation(int(chain_ids.max()) + 1) % 2)[chain_ids].astype(bool)
+    if min(effective_size(weight[half]), effective_size(weight[~half])) < 4:
         half = rng.random(len(z)) < 0.5
     # States of one chain are alike: a chain is worth two points rather than all of its states.
-    of_families = size_of(np.bincount(family, weight))
-    alike_points = min(1.0, 2 * of_families / size_of(weight))
-    found: list[Any] = []
+    of_chains = effective_size(np.bincount(chain_ids, weight))
+    alike_points = min(1.0, 2 * of_chains / effective_size(weight))
+    components: list[Component] = []
     crossed: list[float] = []
     for fit in (half, ~half):
         test = ~fit
         if not fit.any() or not test.any():
             continue
-        made = candidates(*_thinned(z[fit], weight[fit], rng), rng, alike_points)
-        table = np.exp(ratios(made, z[test]))
-        crossed += list(stacked(table, weight[test] / weight[test].sum(), defensive))
-        found += made
-    # A mode that only one half has seen gets nothing from the other: so a part of the shares is
+        made = fit_components(*_thin(z[fit], weight[fit], rng), rng, alike_points)
+        table = np.exp(log_ratios(made, z[test]))
+        crossed += list(optimal_shares(table, weight[test] / weight[test].sum(), defensive))
+        components += made
+    # A mode that only one half has scores gets nothing from the other: so a part of the shares is
     # what all points together say.
-    together = stacked(np.exp(ratios(found, z)), weight, defensive)
+    together = optimal_shares(np.exp(log_ratios(components, z)), weight, defensive)
     share = np.array(crossed) / 2 * (1 - TOGETHER) + together * TOGETHER
-    kept = np.flatnonzero(share >= LEAST_SHARE)
-    shares = share[kept] / share[kept].sum() * (1 - defensive)
-    return Mixture((Prior(d), *(found[i] for i in kept)), np.append(defensive, shares))
+    keep = np.flatnonzero(share >= LEAST_SHARE)
+    shares = share[keep] / share[keep].sum() * (1 - defensive)
+    return Mixture((Prior(d), *(components[i] for i in keep)), np.append(defensive, shares))
 
 
-def stacked(
+def optimal_shares(
     table: Float[np.ndarray, "n k"], weight: Float[np.ndarray, " n"], defensive: float
 ) -> Float[np.ndarray, " k"]:
-    """Shares, of sum one, of components that minimise the mean of prior over proposal density.
+    """Minimise the mean of prior over proposal density by the shares of the components.
 
-    - `table`: densities over the prior's, at failures; the defensive part (1) is not among them.
+    The multiplicative steps have the minima as fixed points.
 
-    By multiplicative steps, whose fixed points are the minima.
+    **Arguments:**
+
+    - `table`: densities of the components over the prior's, at failures; without the defensive
+      part, which is 1.
+    - `weight`: weights of the failures, of sum one.
+    - `defensive`: share of the defensive part.
+
+    **Returns:** shares of the components, of sum one.
     """
     k = table.shape[1]
     share = np.full(k, 1 / k)
@@ -146,45 +162,45 @@ def stacked(
     return share
 
 
-def candidates(
+def fit_components(
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
     rng: np.random.Generator,
     worth: float = 1.0,
-) -> list[Any]:
-    """Components of all kinds, fitted to these points, each of which is worth so much."""
+) -> list[Component]:
+    """Fit components of all kinds to points, each of which is worth `worth` independent ones."""
     d = z.shape[1]
-    found: list[Any] = []
-    size = size_of(weight) * worth
+    components: list[Component] = []
+    size = effective_size(weight) * worth
     if d > 1:
-        found += [shell(z, weight, worth), alike(z, weight, worth)]
+        components += [fit_shell(z, weight, worth), fit_common_marginal(z, weight, worth)]
     for modes in MODES:
         if modes > 1 and size < 6 * modes:
             break
-        shares, gaussians, memberships = mixture_of_gaussians(z, weight, modes, rng, worth)
+        shares, gaussians, memberships = fit_gaussian_mixture(z, weight, modes, rng, worth)
         for share, gaussian, member in zip(shares, gaussians, memberships.T, strict=True):
             if share * size < 3:
                 continue
-            found.append(gaussian)
-            found.append(Gaussian(gaussian.mean, gaussian.axes, 1.3 * gaussian.stds))
-            found.append(Gaussian(gaussian.mean, np.eye(d), np.ones(d)))
+            components.append(gaussian)
+            components.append(Gaussian(gaussian.mean, gaussian.axes, 1.3 * gaussian.stds))
+            components.append(Gaussian(gaussian.mean, np.eye(d), np.ones(d)))
             if modes <= 2:
                 own = member / member.sum()
                 for wider in (1.0, 2.0):
-                    steps = smooth(z, own, wider, worth)
-                    linked = copula(z, own, steps, worth)
-                    found.append(steps if linked is None else linked)
-    return found
+                    steps = fit_marginals(z, own, wider, worth)
+                    linked = fit_copula(z, own, steps, worth)
+                    components.append(steps if linked is None else linked)
+    return components
 
 
-def _thinned(
+def _thin(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"]]:
-    """Not too many of weighted points, of weight one in all."""
+    """Thin out weighted points, and scale their weights to sum one."""
     if len(z) > MOST_POINTS:
         # The heaviest stay as they are: they are what a proposal must not miss.
         chance = np.minimum(1.0, MOST_POINTS * weight / weight.sum())
         chance = np.maximum(chance, 0.02)
-        kept = rng.random(len(z)) < chance
-        z, weight = z[kept], (weight / chance)[kept]
+        keep = rng.random(len(z)) < chance
+        z, weight = z[keep], (weight / chance)[keep]
     return z, weight / weight.sum()

@@ -1,6 +1,6 @@
 """Monte Carlo: independent samples of the prior, and the exact interval of their failures.
 
-counts = sample(judge, rng, 10_000)
+counts = sample_prior(limit_state, rng, 10_000)
 counts.failures, counts.simulations, counts.interval(0.95)
 """
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from verifai_jax.estimation.intervals import upper_bound
-from verifai_jax.estimation.normal_space import Ended, Judge
+from verifai_jax.estimation.normal_space import Ended, LimitState
 from verifai_jax.statistics.binomial import clopper_pearson
 
 AT_ONCE = 8
@@ -18,7 +18,12 @@ AT_ONCE = 8
 
 @dataclass(frozen=True)
 class Counts:
-    """What came of independent samples of the prior."""
+    """Counts of independent samples of the prior.
+
+    - `simulations`: number of samples.
+    - `failures`: samples that break a formula.
+    - `no_verdict`: samples without a verdict.
+    """
 
     simulations: int
     failures: int
@@ -32,7 +37,10 @@ class Counts:
         )
 
     def interval(self, confidence: float) -> tuple[float, float]:
-        """Clopper-Pearson; what has no verdict is no failure at the lower end, one at the upper."""
+        """Return the Clopper-Pearson interval of the failure probability.
+
+        A sample without a verdict is no failure at the lower end, and one at the upper end.
+        """
         if not self.simulations:
             return 0.0, 1.0
         low = clopper_pearson(self.failures, self.simulations, confidence).low
@@ -40,20 +48,22 @@ class Counts:
         return low, clopper_pearson(worst, self.simulations, confidence).high
 
     def upper_bound(self, confidence: float) -> float:
-        """One-sided, with what has no verdict counted as failing."""
+        """Return the one-sided bound; a sample without a verdict counts as failing."""
         return upper_bound(self.failures + self.no_verdict, self.simulations, confidence)
 
 
-def sample(judge: Judge, rng: np.random.Generator, simulations: int) -> Counts:
-    """So many samples of the prior; fewer where time ends."""
+def sample_prior(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Counts:
+    """Simulate independent samples of the prior; fewer than asked for where time ends."""
     total = Counts(0, 0, 0)
-    size = judge.batch * AT_ONCE
+    size = limit_state.batch * AT_ONCE
     try:
         while total.simulations < simulations:
-            z = judge.prior(rng, min(size, simulations - total.simulations))
-            for start in range(0, len(z), judge.batch):
-                seen = judge(z[start : start + judge.batch])
-                part = Counts(len(seen.score), int(seen.failing.sum()), int((~seen.proper).sum()))
+            z = limit_state.sample_prior(rng, min(size, simulations - total.simulations))
+            for start in range(0, len(z), limit_state.batch):
+                scores = limit_state(z[start : start + limit_state.batch])
+                part = Counts(
+                    len(scores.score), int(scores.failing.sum()), int((~scores.proper).sum())
+                )
                 total = total + part
     except Ended:
         pass

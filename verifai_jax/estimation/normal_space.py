@@ -1,31 +1,40 @@
-"""What the methods ask of a problem: verdicts of points in standard normal space, and the prior.
+"""The limit state of a problem in standard normal space: scores of points, and the prior.
 
-    judge = Judge(evaluate, dim, budget=50_000, batch=256)
-    z = judge.prior(rng, 1000)                  # accepted by the constraint, not simulated yet
-    seen = judge(z)                             # seen.score, seen.failing, seen.proper; counted
+    limit_state = LimitState(evaluate, dim, budget=50_000, batch=256)
+    z = limit_state.sample_prior(rng, 1000)     # accepted by the constraint, not simulated yet
+    scores = limit_state(z)                     # scores.score, scores.failing, scores.proper
 
-Points are `z [n, d]`, of which `u = Phi(z)` lies in the unit cube: the prior, uniform there, is
-standard normal here, conditional on the constraint. The methods are pure functions over a judge, so
-that they are tested on closed forms without a simulation.
+Points are `z [n, d]`, and `u = Phi(z)` lies in the unit cube: the prior, uniform there, is standard
+normal here, conditional on the constraint. The methods are pure functions over a limit state, so
+they are tested on closed forms without a simulation.
 """
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
+
+Evaluate: TypeAlias = Callable[
+    [Float[np.ndarray, "n d"]],
+    tuple[Shaped[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]],
+]
+"""From points `u [n, d]` of the unit cube to robustness, violation, and a proper verdict, `[n]`."""
 
 MOST_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
+_CONSTRAINT_BATCH = 4096
+"""Points of one call of the constraint, so that one shape compiles."""
 
 
-class Seen(NamedTuple):
-    """Verdicts of points, one row each.
+class Scores(NamedTuple):
+    """Scores of points, one row each.
 
-    - `score`: what the splitting lowers: minus infinity for a failure, infinite without a verdict,
-      else the robustness, which is not negative.
-    - `failing`, `proper`: whether it fails; whether it has a verdict.
+    - `score`: the number that splitting lowers: minus infinity for a failure, infinity without a
+      verdict, else the robustness, which is not negative.
+    - `failing`: True where the simulation ended properly and breaks a formula.
+    - `proper`: True where the simulation has a verdict.
     """
 
     score: Float[np.ndarray, " n"]
@@ -34,41 +43,38 @@ class Seen(NamedTuple):
 
 
 class Ended(Exception):
-    """Time is over, or the user has interrupted; what is finished counts."""
+    """Time is over, or the user has interrupted; finished simulations count."""
 
 
-class Judge:
-    """Simulates points of normal space within a budget.
+class LimitState:
+    """Scores of points of standard normal space, within a budget of simulations.
 
     **Arguments:**
 
-    - `evaluate`: `u [n, d] -> (rho, failing, proper)`, each `[n]`.
-    - `dim`: unit coordinates.
+    - `evaluate`: from points `u [n, d]` of the unit cube to `(rho, failing, proper)`, each `[n]`.
+    - `dim`: number of unit coordinates.
     - `budget`: simulations in all; a method has to plan with `left`.
     - `batch`: points that are simulated together.
-    - `accepts`: the constraint, of points `u`; none when left out.
+    - `constraint`: from points `u [n, d]` to the accepted ones `[n]`; none when left out.
     - `deadline`: on the clock of `time.perf_counter`, after which `Ended` is raised.
-    - `told`: is told of the simulations done and the failures seen after each batch.
+    - `report`: called after each batch with simulations, failures and the least robustness so far.
     """
 
     def __init__(
         self,
-        evaluate: Callable[[Any], tuple[Any, Any, Any]],
+        evaluate: Evaluate,
         dim: int,
         budget: int,
         batch: int = 256,
-        accepts: Callable[[Any], Any] | None = None,
+        constraint: Callable[[Float[np.ndarray, "n d"]], Bool[np.ndarray, " n"]] | None = None,
         deadline: float | None = None,
-        told: Callable[[int, int, float], None] | None = None,
+        report: Callable[[int, int, float], None] | None = None,
     ) -> None:
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
-        self.accepts_unit, self.deadline, self.told = accepts, deadline, told
+        self.constraint, self.deadline, self.report = constraint, deadline, report
         self.simulations = self.failures = self.no_verdict = 0
-        self.first: tuple[int, int, int] = (
-            0,
-            0,
-            0,
-        )  # Simulations, failures and no verdicts of a pilot of the prior.
+        self.pilot: tuple[int, int, int] = (0, 0, 0)
+        """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.least = np.inf
         self.ended: str | None = None
 
@@ -78,57 +84,62 @@ class Judge:
         return 0 if self.ended else self.budget - self.simulations
 
     def accepts(self, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Which points the constraint accepts; nothing is simulated."""
-        if self.accepts_unit is None or not len(z):
+        """Check the constraint at points of normal space; nothing is simulated."""
+        if self.constraint is None or not len(z):
             return np.ones(len(z), bool)
-        size = 4096  # One shape, whatever is asked.
+        size = _CONSTRAINT_BATCH
         parts = []
         for start in range(0, len(z), size):
-            part = unit(z[start : start + size])
+            part = to_unit_cube(z[start : start + size])
             padded = np.pad(part, ((0, size - len(part)), (0, 0)), mode="edge")
-            parts.append(np.asarray(self.accepts_unit(padded))[: len(part)])
+            parts.append(np.asarray(self.constraint(padded))[: len(part)])
         return np.concatenate(parts)
 
-    def prior(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
-        """`n` independent points of the prior, given that the constraint accepts them."""
-        if self.accepts_unit is None:
+    def sample_prior(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
+        """Draw `n` independent points of the prior, given that the constraint accepts them.
+
+        **Raises:** `ValueError` where the constraint refuses almost every point.
+        """
+        if self.constraint is None:
             return rng.standard_normal((n, self.dim))
-        found, have, drawn = [], 0, 0
-        while have < n:
-            z = rng.standard_normal((4096, self.dim))
-            z = z[self.accepts(z)][: n - have]
-            found.append(z)
-            have, drawn = have + len(z), drawn + 4096
-            if drawn > MOST_DRAWN and have < n * drawn / (100 * MOST_DRAWN):
+        accepted, count, drawn = [], 0, 0
+        while count < n:
+            z = rng.standard_normal((_CONSTRAINT_BATCH, self.dim))
+            z = z[self.accepts(z)][: n - count]
+            accepted.append(z)
+            count, drawn = count + len(z), drawn + _CONSTRAINT_BATCH
+            if drawn > MOST_DRAWN and count < n * drawn / (100 * MOST_DRAWN):
                 raise ValueError("where accepts too little of the space to sample it")
-        return np.concatenate(found) if found else np.zeros((0, self.dim))
+        return np.concatenate(accepted) if accepted else np.zeros((0, self.dim))
 
     def acceptance(self, rng: np.random.Generator, n: int = 200_000) -> tuple[float, float]:
-        """The share of the prior that the constraint accepts, and its relative error."""
-        if self.accepts_unit is None:
+        """Return the share of the prior that the constraint accepts, and its relative error."""
+        if self.constraint is None:
             return 1.0, 0.0
         share = float(np.mean(self.accepts(rng.standard_normal((n, self.dim)))))
         return share, float(np.sqrt((1 - share) / (share * n))) if share else np.inf
 
-    def __call__(self, z: Float[np.ndarray, "n d"]) -> Seen:
-        """Simulate these points; an end in between raises `Ended`, the batch before it counted."""
+    def __call__(self, z: Float[np.ndarray, "n d"]) -> Scores:
+        """Simulate points of normal space.
+
+        **Raises:** `Ended` where time is over or the user interrupts; batches before it count.
+        """
         parts = []
         for start in range(0, len(z), self.batch):
             if self.ended or (self.deadline is not None and time.perf_counter() > self.deadline):
                 self.ended = self.ended or "max_seconds"
                 raise Ended
             try:
-                seen = self._batch(z[start : start + self.batch])
+                parts.append(self._score(z[start : start + self.batch]))
             except KeyboardInterrupt:
                 self.ended = "interrupted"
                 raise Ended from None
-            parts.append(seen)
         if not parts:
-            return Seen(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
-        return Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+            return Scores(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
+        return Scores(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
-    def _batch(self, z: Float[np.ndarray, "n d"]) -> Seen:
-        rho, failing, proper = (np.asarray(part) for part in self.evaluate(unit(z)))
+    def _score(self, z: Float[np.ndarray, "n d"]) -> Scores:
+        rho, failing, proper = (np.asarray(part) for part in self.evaluate(to_unit_cube(z)))
         known = proper & np.isfinite(rho)
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
         score[failing] = -np.inf
@@ -137,13 +148,16 @@ class Judge:
         self.no_verdict += int((~proper).sum())
         if known.any():
             self.least = min(self.least, float(rho[known].min()))
-        if self.told is not None:
-            self.told(self.simulations, self.failures, self.least)
-        return Seen(score, failing, proper)
+        if self.report is not None:
+            self.report(self.simulations, self.failures, self.least)
+        return Scores(score, failing, proper)
 
 
-def unit(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """The points of the unit cube, in double precision: single has no probabilities near one."""
+def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """Map points of normal space to the unit cube, in double precision.
+
+    Single precision has no probabilities near one.
+    """
     from scipy.special import ndtr
 
     return ndtr(z)

@@ -1,16 +1,22 @@
-"""The result of an estimate: what is known of the failure probability, and how surely.
+"""The result of an estimate: the failure probability with an interval and a bound.
 
-found = vj.estimate(problem)
-found.probability, found.interval, found.upper_bound
-found.simulations_until(1e-6)
-print(found); found.plot()
+result = vj.estimate(problem)
+result.probability, result.interval, result.upper_bound
+result.simulations_until(1e-6)
+print(result)
+result.plot("estimate.png")
 """
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import verifai_jax.estimation.intervals as bounds
+import verifai_jax.estimation.intervals as intervals
+from verifai_jax.core.lazy import late
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 METHODS = {
     "monte_carlo": "Monte Carlo",
@@ -21,21 +27,29 @@ METHODS = {
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What `estimate` returns.
+    """A failure probability, as `estimate` returns it.
 
-    - `probability`: of failing, under the prior of the feature space; None where none is claimed.
+    - `name`: name of the problem.
+    - `probability`: of a failure, under the prior of the feature space; None where none is claimed.
     - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
-    - `upper_bound`: guaranteed at `confidence` by independent samples of the prior alone, whatever
-      a search may have missed: `prior_failures` of `prior_simulations` failed, and
-      `prior_no_verdict` had no verdict, which counts as failing.
+    - `confidence`: of the interval and of the bound.
     - `method`: `"monte_carlo"`, `"importance"` or `"splitting"`; None without an estimate.
-    - `simulations`: in all; `failures` and `no_verdict` of them. A value with gradient counts 2.
-    - `no_verdict_probability`: of a simulation without a verdict, among the prior's samples.
-    - `effective`: weighted samples are worth so many failures, NaN where that has no meaning.
+    - `simulations`: number of all simulations; one with its gradient counts 2.
+    - `budget`: simulations that were allowed.
+    - `failures`, `no_verdict`: simulations among them that failed, and without a verdict.
+    - `upper_bound`: guaranteed at `confidence` by independent samples of the prior alone, whatever
+      a search may have missed.
+    - `prior_simulations`, `prior_failures`, `prior_no_verdict`: the samples of the prior that the
+      bound rests on; one without a verdict counts as a failure there.
+    - `effective`: independent failures that the weighted samples are worth; NaN where that has no
+      meaning.
     - `relative_error`: one standard error over the estimate.
-    - `diagnostics`: what else the method knows of itself.
-    - `notes`: what would surprise.
-    - `seed`, `version`, `precision`, `backend`: with the problem enough to get the same again.
+    - `diagnostics`: further numbers of the method, by name.
+    - `notes`: surprises, in words.
+    - `p0`: the wanted upper limit of the probability, if one was given.
+    - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
+    - `seconds`: wall-clock time.
+    - `drawn`: data of the pictures.
     """
 
     name: str
@@ -71,17 +85,23 @@ class Estimate:
 
     @property
     def no_verdict_probability(self) -> float:
-        """Share of the prior's samples without a verdict."""
+        """Share of the samples of the prior that have no verdict."""
         return self.prior_no_verdict / max(self.prior_simulations, 1)
 
     def simulations_until(self, p0: float, confidence: float | None = None) -> int:
-        """How many more samples of the prior, none failing, show that the probability is below.
+        """Count further samples of the prior that show a probability below `p0` if none fails.
 
-        After those that `upper_bound` stands on; 0 if they show it already.
+        **Arguments:**
+
+        - `p0`: failure probability to be shown, between 0 and 1.
+        - `confidence`: of the bound; that of the estimate when left out.
+
+        **Returns:** the number of samples beside those that `upper_bound` rests on; 0 if these
+        show it already.
 
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
-        return bounds.simulations_until(
+        return intervals.simulations_until(
             p0,
             self.prior_failures + self.prior_no_verdict,
             self.prior_simulations,
@@ -120,13 +140,14 @@ class Estimate:
                 "neither safe nor failing: the upper ends count them as failing"
             )
         if self.p0 is not None:
-            lines.append(f"  p < {self.p0:g}    {self._decided(self.p0)}")
+            lines.append(f"  p < {self.p0:g}    {self._conclusion(self.p0)}")
         lines += [f"  note         {note}" for note in self.notes]
         return "\n".join(lines)
 
     __repr__ = __str__
 
-    def _decided(self, p0: float) -> str:
+    def _conclusion(self, p0: float) -> str:
+        """Write whether a probability below `p0` is shown, refuted or open."""
         if self.upper_bound <= p0:
             return "shown, by samples of the prior alone"
         more = self.simulations_until(p0)
@@ -137,11 +158,13 @@ class Estimate:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"
 
-    def plot(self, path: Any = None) -> Any:
-        """The interval, the levels of the splitting and the weights, as far as there are any."""
-        from verifai_jax.plotting.estimate import draw
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Draw the interval, the splitting levels and the weights, as far as there are any.
 
-        figure = draw(self)
-        if path is not None:
-            figure.savefig(path)
-        return figure
+        **Arguments:**
+
+        - `path`: file that the picture is written to, if given.
+
+        **Returns:** the Matplotlib figure.
+        """
+        return late("verifai_jax.plotting.estimate", "plot_estimate")(self, path)

@@ -1,37 +1,49 @@
-"""Pictures of an estimate: how the levels led to the failures, and how even the weights are."""
+"""The picture of an estimate: its interval, the splitting levels, and the importance weights."""
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
+from verifai_jax.estimation.result import Estimate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, tidy
 
-if TYPE_CHECKING:
-    from verifai_jax.estimation.result import Estimate
 
+def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
+    """Draw the interval, the splitting levels and the weights of an estimate.
 
-def draw(found: "Estimate") -> Any:
-    """The figure: the interval, the levels and the weights, as far as there are any."""
-    levels = found.diagnostics.get("levels") or []
-    weights = found.drawn.get("weights")
+    **Arguments:**
+
+    - `estimate`: the estimate; levels and weights are drawn where it has any.
+    - `path`: file that the picture is written to, if given.
+
+    **Returns:** the figure.
+    """
+    levels = estimate.diagnostics.get("levels") or []
+    weights = estimate.drawn.get("weights")
     panels = 1 + bool(levels) + (weights is not None and len(weights) > 0)
     figure = new_figure(figsize=(4.2 * panels, 3.4))
     axes = list(np.atleast_1d(figure.subplots(1, panels)))
-    _interval(axes.pop(0), found)
+    _draw_interval(axes.pop(0), estimate)
     if levels:
-        _levels(axes.pop(0), levels, found.diagnostics["fractions"])
+        _draw_levels(axes.pop(0), levels, estimate.diagnostics["fractions"])
     if axes:
         assert weights is not None
-        _weights(axes.pop(0), weights)
+        _draw_weights(axes.pop(0), weights)
+    if path is not None:
+        figure.savefig(path)
     return figure
 
 
-def _interval(axes: Any, found: "Estimate") -> None:
-    sure = f"{100 * found.confidence:g} %"
-    rows: list[Any] = [("bound by the prior alone", None, 0.0, found.upper_bound, BOUND)]
-    if found.probability is not None:
-        rows.append(("estimate", found.probability, found.low, found.high, FAILING))
-    least = min([found.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
+def _draw_interval(axes: Axes, estimate: Estimate) -> None:
+    sure = f"{100 * estimate.confidence:g} %"
+    rows: list[Any] = [("bound by the prior alone", None, 0.0, estimate.upper_bound, BOUND)]
+    if estimate.probability is not None:
+        rows.append(("estimate", estimate.probability, estimate.low, estimate.high, FAILING))
+    least = min([estimate.upper_bound, *(low for *_, low, _, _ in rows if low > 0)]) / 5
     for place, (_, value, low, high, color) in enumerate(rows):
         axes.plot([max(low, least), high], [place, place], color=color, linewidth=4, alpha=0.6)
         if value is not None:
@@ -39,14 +51,14 @@ def _interval(axes: Any, found: "Estimate") -> None:
         else:
             axes.plot(high, place, "|", color=color, markersize=14)
     axes.set_xscale("log")
-    axes.set_xlim(least, min(1.5, found.upper_bound * 4))
+    axes.set_xlim(least, min(1.5, estimate.upper_bound * 4))
     axes.set_yticks(range(len(rows)), [row[0] for row in rows])
     axes.set_ylim(-0.8, len(rows) - 0.2)
     axes.set_xlabel(f"failure probability ({sure})")
     tidy(axes)
 
 
-def _levels(axes: Any, levels: list[float], fractions: list[float]) -> None:
+def _draw_levels(axes: Axes, levels: list[float], fractions: list[float]) -> None:
     reached = np.cumprod(fractions)
     shown = [max(level, 0.0) for level in levels]
     axes.plot([*shown], reached, "o-", color=SAFE)
@@ -63,7 +75,7 @@ def _levels(axes: Any, levels: list[float], fractions: list[float]) -> None:
     tidy(axes)
 
 
-def _weights(axes: Any, weights: np.ndarray) -> None:
+def _draw_weights(axes: Axes, weights: Float[np.ndarray, " n"]) -> None:
     axes.plot(np.arange(1, len(weights) + 1), 100 * np.cumsum(weights), color=FAILING)
     even = np.array([1, len(weights)])
     axes.plot(even, 100 * even / len(weights), color=BOUND, linestyle="--", linewidth=1)
