@@ -244,7 +244,7 @@ def test_arrays_must_be_real():
 
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "2500"]
-    options = ["--no-gradient", "--search", "halton", "--held-out", "100"]
+    options = ["--no-gradient", "--attack", "halton", "--held-out", "100"]
     options += ["--plot", str(tmp_path / "rounds.png")]
     shown = CliRunner().invoke(command, [*arguments, *options, "--nominal", "k=0.6"])
     assert shown.exit_code == 0, shown.output

@@ -262,7 +262,7 @@ def test_a_fixed_feature_is_no_parameter():
 
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "1500"]
-    options = ["--no-gradient", "--search", "halton", "--held-out", "100"]
+    options = ["--no-gradient", "--attack", "halton", "--held-out", "100"]
     options += ["--table", str(tmp_path / "found.csv")]
     shown = CliRunner().invoke(command, [*arguments, *options])
     assert shown.exit_code == 0, shown.output
