@@ -76,6 +76,7 @@ if TYPE_CHECKING:
     from verifai_jax.synthesis import Synthesis as Synthesis
     from verifai_jax.synthesis import repair as repair
     from verifai_jax.synthesis import synthesize as synthesize
+    from verifai_jax.systems.base import System as System
     from verifai_jax.systems.blackbox import blackbox as blackbox
     from verifai_jax.systems.blackbox import stacked as stacked
     from verifai_jax.systems.environments import brax as brax
@@ -178,6 +179,7 @@ _NAMES = {
         "repair",
         "synthesize",
     ),
+    "systems.base": ("System",),
     "systems.blackbox": (
         "blackbox",
         "stacked",

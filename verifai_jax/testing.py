@@ -19,6 +19,7 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl.clauses import ABSENT, CLAUSES
 from verifai_jax.search import Observations, Search
+from verifai_jax.systems.base import as_system
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 
@@ -189,27 +190,24 @@ def check_system(
     features = jax.jit(jax.vmap(space.unflatten))(points)
     keys = jax.random.split(jax.random.key(seed), samples)
     each = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], features) for i in range(samples)]
-    if callable(check := getattr(system, "check", None)):
-        check(jax.eval_shape(space.unflatten, jnp.zeros(space.dim)))
-    on_host = bool(getattr(system, "black_box", False))
+    system, forms = as_system(system), jax.eval_shape(space.unflatten, jnp.zeros(space.dim))
+    system.check(forms)
     alone = [system(f, key) for f, key in zip(each, keys, strict=True)]
     for trace in alone:
         _check_trace(trace)
     for trace, f, key in zip(alone, each, keys, strict=True):
         _agree(trace, system(f, key), 0.0, "a system must give the same trace for the same key")
-    if not on_host:
+    if not system.black_box:
         batch: Any = jax.jit(jax.vmap(system))(features, keys)
         _agree_all(alone, batch, tolerance, "compiled under vmap, and called alone")
-        if callable(getattr(system, "fold", None)):
+        if system.can_fold:
             _check_fold(system, features, keys, alone, tolerance)
-    together: Any = getattr(system, "simulate_batch", None)
-    if together is not None and on_host:
-        batch = together(jax.tree.map(np.asarray, features), keys)
+    if system.can_simulate_batch and system.black_box:
+        batch = system.simulate_batch(jax.tree.map(np.asarray, features), keys)
         _agree_all(alone, batch, tolerance, "in a batch, and called alone")
-    one_by_one: Any = getattr(system, "simulate_each", None)
-    if one_by_one is not None:
+    if system.can_simulate_each:
         seeds = [int(seed) for seed in jax.vmap(jax.random.bits)(keys)]
-        found = list(one_by_one([plain_leaves(f) for f in each], seeds))
+        found = list(system.simulate_each([plain_leaves(f) for f in each], seeds))
         numbers = sorted(i for i, _ in found)
         assert numbers == list(range(samples)), (
             f"simulate_each must give each of {samples} indices once; got {numbers}"
@@ -218,9 +216,8 @@ def check_system(
             message = f"simulation {i} failed only in a batch: {outcome.message}"
             assert outcome.trace is not None, message
             _agree(alone[i], outcome.trace, tolerance, "one by one, and called alone")
-    abstract: Any = getattr(system, "abstract", None)
-    if abstract is not None:
-        told = abstract(jax.eval_shape(space.unflatten, jnp.zeros(space.dim)))
+    told = system.abstract(forms)
+    if told is not None:
         shapes = {name: tuple(signal.shape) for name, signal in told.signals.items()}
         given = {name: np.shape(signal) for name, signal in alone[0].signals.items()}
         assert shapes == given, f"abstract must tell the signals' shapes {given}; got {shapes}"

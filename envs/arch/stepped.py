@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
+from verifai_jax.systems.base import System
 from verifai_jax.systems.horizon import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor
 
@@ -26,7 +27,7 @@ Scalar = Float[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
-class Stepped:
+class Stepped(System):
     """A system `(features, key) -> Trace` with a sample at time 0 and after each of `steps`.
 
     **Arguments:**
@@ -48,7 +49,7 @@ class Stepped:
     initial: Callable[[Features], Any]
     advance: Callable[[Int[Array, ""], Any, Features], Any]
     signals: Callable[[Int[Array, ""], Any, Features], dict[str, Any]]
-    dt: float
+    dt: float = field()
     steps: int
     nominal: Features = field(default_factory=dict)
     finer: Callable[[int], "Stepped"] | None = None

@@ -14,7 +14,7 @@ from verifai_jax.evaluation.journal import JOURNAL, Journal, Judged
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.search import Uniform
-from verifai_jax.systems.outcome import Outcome
+from verifai_jax.systems.base import Outcome
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
 SPEC = "always x <= 0.9"

@@ -11,7 +11,7 @@ import pytest
 import verifai_jax as vj
 from envs import cartpole
 from verifai_jax.core.trace import Trace
-from verifai_jax.systems.outcome import Outcome
+from verifai_jax.systems.base import Outcome
 from verifai_jax.testing import check_system
 
 SPACE = vj.FeatureSpace({"x0": vj.Box(-1, 1), "theta0": vj.Box(-0.3, 0.3)})

@@ -3,53 +3,67 @@
 problem = with_key_of(run, row)                     # the same problem where no key is used
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Int, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import Carry, Features, Outcome, Seed, System
 
-AS_IT_IS = ("check", "reverse_hint", "forward_up_to", "lanes", "abstract", "dt", "duration")
 
-
-class Keyed:
+class Keyed(System):
     """A system that ignores the key that it is given and uses its own.
 
     It offers what the system offers: `fold`, `simulate_batch`, `simulate_each`, ...
     """
 
-    def __init__(self, system: Any, key: Key[Array, ""]) -> None:
+    def __init__(self, system: System, key: Key[Array, ""]) -> None:
         self.system, self.key = system, key
-        self.black_box = bool(getattr(system, "black_box", False))
-        for name in AS_IT_IS:
-            if hasattr(system, name):
-                setattr(self, name, getattr(system, name))
-        # As attributes of the instance, since what is offered is asked by their presence.
-        for name, method in (
-            ("fold", self._fold),
-            ("simulate_batch", self._batch),
-            ("simulate_each", self._each),
-        ):
-            if getattr(system, name, None) is not None:
-                setattr(self, name, method)
+        self.black_box, self.lanes, self.dt = system.black_box, system.lanes, system.dt
+        self.forward_up_to, self.reverse_hint = system.forward_up_to, system.reverse_hint
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         return self.system(features, self.key)
 
-    def _fold(self, features: Any, key: Any, carry: Any, update: Any) -> Any:
+    def check(self, features: Features) -> None:
+        self.system.check(features)
+
+    def abstract(self, features: Features) -> Trace | None:
+        return self.system.abstract(features)
+
+    @property
+    def can_fold(self) -> bool:
+        return self.system.can_fold
+
+    def fold(
+        self,
+        features: Features,
+        key: Seed,
+        carry: Carry,
+        update: Callable[[Carry, dict[str, Array]], Carry],
+    ) -> tuple[Carry, Int[Array, ""]]:
         return self.system.fold(features, self.key, carry, update)
 
-    def _batch(self, features: Any, keys: Any) -> Trace:
+    @property
+    def can_simulate_batch(self) -> bool:
+        return self.system.can_simulate_batch
+
+    def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         return self.system.simulate_batch(features, self.key[None].repeat(len(keys)))
 
-    def _each(self, features: Any, seeds: Any) -> Iterator[Any]:
+    @property
+    def can_simulate_each(self) -> bool:
+        return self.system.can_simulate_each
+
+    def simulate_each(
+        self, features: Sequence[Features], seeds: Sequence[int]
+    ) -> Iterator[tuple[int, Outcome]]:
         seed = int(np.asarray(jax.random.bits(self.key)))
         return self.system.simulate_each(features, [seed] * len(seeds))
 

@@ -49,8 +49,7 @@ def resolved(
     **Raises:** `UnknownNameError` for a backend that the system lacks; `ValueError` for one whose
     system has none to choose from.
     """
-    system: Any = problem.system
-    candidates: tuple[str, ...] = getattr(system, "backends", ())
+    system, candidates = problem.system, problem.system.backends
     if not candidates:
         if wanted is not None:
             raise ValueError(
@@ -84,7 +83,7 @@ def _fastest(
         known[kinds[0]] = _measured(HostEngine(host, precision), host, batch)
     speed = known[kinds[0]]
     if kinds[1] not in known:
-        likely = getattr(problem.system, "likely", None) == traced
+        likely = problem.system.likely == traced
         if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
             seconds = f"{budget / speed:.1f} s for all simulations"
             return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")

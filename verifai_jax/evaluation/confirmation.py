@@ -343,7 +343,7 @@ def _and(names: Sequence[str]) -> str:
 def _other(problem: Problem, simulator: Any) -> Problem:
     """The problem with another system."""
     if isinstance(simulator, str):
-        if not getattr(problem.system, "backends", ()):
+        if not problem.system.backends:
             raise ValueError(
                 f"the system of problem {problem.name!r} has no backends; simulator must be a "
                 f"system or a Problem, got {simulator!r}"

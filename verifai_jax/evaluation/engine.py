@@ -24,14 +24,12 @@ from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.evaluation.differentiation import FORWARD_UP_TO, Derivative, reverse_refused
+from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.packing import Packing
 from verifai_jax.evaluation.streaming_monitor import carried_monitor, with_status
 from verifai_jax.mtl import hard, robustness, satisfied, smooth
 from verifai_jax.mtl.clauses import ABSENT, CLAUSES, Goals, goals_of
 from verifai_jax.problem.problem import Problem
-
-CHUNK = 512  # Lanes worked on together: about 1 MB of a 200-sample trace with two signals.
 
 
 class Evaluation(NamedTuple):
@@ -123,13 +121,13 @@ class Engine:
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
         per_device = -(-batch // len(self.devices))
-        self.together = getattr(problem.system, "lanes", CHUNK)
+        self.together = problem.system.lanes
         self.chunks = -(-per_device // self.together)
         self.lanes = -(-per_device // self.chunks)
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
-        limit = getattr(problem.system, "forward_up_to", FORWARD_UP_TO)
+        limit = problem.system.forward_up_to
         self._derivative = Derivative(problem.space.dim, limit)
         self._packing: dict[str, Packing] = {}
         self._executables: dict[str, Any] = {}
@@ -215,7 +213,7 @@ class Engine:
             if not (self.gradient and self._derivative.reverse and reverse_refused(error)):
                 raise
         self._derivative = self._derivative.by("forward")
-        hint = getattr(self.problem.system, "reverse_hint", "")
+        hint = self.problem.system.reverse_hint
         self.notes = (f"{self._derivative.told()}{f': {hint}' if hint else ''}",)
         return trace()
 

@@ -19,8 +19,8 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.engine import Evaluation, judge, verdict
 from verifai_jax.evaluation.journal import Journal, Judged
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
-from verifai_jax.systems.outcome import Batched, Each, Outcome
 
 BLOCK = 32  # Traces judged together,
 PATIENCE = 0.5  # or as many as there are after so many seconds, so that they are safe on disk.
@@ -61,7 +61,7 @@ class HostEngine:
         features, keys, seeds = self._prepare(_power_of_two(u), key, np.int32(first))
         features = jax.tree.map(lambda leaf: np.asarray(leaf)[:n], features)
         rows = _Rows(n, len(self.problem.formulas), self.precision)
-        if isinstance(self.problem.system, Batched):
+        if self.problem.system.can_simulate_batch:
             self._together(features, keys[:n], rows)
         else:
             self._one_by_one(features, np.asarray(seeds)[:n], u, first, rows)
@@ -74,7 +74,6 @@ class HostEngine:
 
     def _together(self, features: Any, keys: Key[Array, " n"], rows: "_Rows") -> None:
         system, n = self.problem.system, len(rows.messages)
-        assert isinstance(system, Batched)
         try:
             trace = _checked(system.simulate_batch(features, keys), n)
             rows.rho[:], rows.status[:], rows.holds[:] = self._judged(trace, n)
@@ -122,7 +121,7 @@ class HostEngine:
 
     def _outcomes(self, features: list[Any], seeds: list[int]) -> Iterator[tuple[int, Outcome]]:
         system = self.problem.system
-        if isinstance(system, Each):
+        if system.can_simulate_each:
             if features:
                 yield from system.simulate_each(features, seeds)
             return

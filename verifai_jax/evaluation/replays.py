@@ -29,7 +29,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import judge, verdict
 from verifai_jax.evaluation.host_engine import HostEngine, _Rows
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.outcome import Batched
+from verifai_jax.systems.base import System
 
 FEW = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
@@ -56,11 +56,10 @@ class Replayed(NamedTuple):
 class Refiner:
     """A system at its own step and at finer ones; each is made once."""
 
-    def __init__(self, system: Any) -> None:
+    def __init__(self, system: System) -> None:
         self.system = system
-        refine = getattr(system, "refined", None)
-        self.refine: Callable[[Any], Any] | None = refine if callable(refine) else None
-        self.traced = self.refine is not None and bool(getattr(system, "traced_factor", False))
+        self.refine: Callable[[Any], Any] | None = system.refined if system.can_refine else None
+        self.traced = system.can_refine and system.traced_factor
         self._made: dict[int, Any] = {1: system}
 
     def __call__(self, factor: int) -> Any:
@@ -224,7 +223,7 @@ class HostReplays:
         with in_precision(self.precision):
             keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
             # What a run does once it has made features of its points.
-            if isinstance(engine.problem.system, Batched):
+            if engine.problem.system.can_simulate_batch:
                 engine._together(features, keys, rows)
             else:
                 seeds = np.asarray(jax.vmap(jax.random.bits)(keys))

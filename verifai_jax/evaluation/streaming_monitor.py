@@ -26,8 +26,8 @@ Judge = Callable[[Any, Any], tuple[Float[Array, " formulas"], Int[Array, ""]]]
 
 def carried_monitor(problem: Problem) -> Judge | None:
     """The function `(features, key) -> robustness, status`; None where it does not pay."""
-    system: Any = problem.system
-    if not callable(getattr(system, "fold", None)) or problem.end != "hold":
+    system = problem.system
+    if not system.can_fold or system.dt is None or problem.end != "hold":
         return None
     try:
         monitors = [online(formula, system.dt) for formula in problem.formulas.values()]

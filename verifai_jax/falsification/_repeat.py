@@ -168,9 +168,9 @@ def repeat(
 
 def _traced(problem: Problem, backend: str | None) -> Problem | None:
     """The problem on a backend that JAX can trace."""
-    names = (backend,) if backend is not None else getattr(problem.system, "backends", ())
+    names = (backend,) if backend is not None else problem.system.backends
     for candidate in (problem, *map(problem.on_backend, names)):
-        if not candidate.black_box and getattr(candidate.system, "backend", backend) != "auto":
+        if not candidate.black_box and (candidate.system.backend or backend) != "auto":
             return candidate
     return None
 

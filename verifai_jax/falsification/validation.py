@@ -15,6 +15,7 @@ from verifai_jax.problem.dependence import informative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.binomial import StoppingRule
+from verifai_jax.systems.base import System
 
 
 @contextmanager
@@ -71,16 +72,16 @@ def check_search(problem: Any, search: Any) -> Search:
         search = searches.named(search)
     if not isinstance(search, Search):
         raise TypeError(f"search must be a name or a search like CrossEntropy(); got {search!r}")
-    if not getattr(problem.system, "backends", ()):
+    if not problem.system.backends:
         check_gradient(problem, search)
     problem.space.check_where()
     search.check(problem.space.cube)
     return search
 
 
-def _why_not_traced(system: Any) -> str:
+def _why_not_traced(system: System) -> str:
     """What a system with several backends says of those that JAX could trace."""
-    if "mjx" in getattr(system, "backends", ("mjx",)) or not hasattr(system, "why_not"):
+    if not system.backends or "mjx" in system.backends:
         return ""
     return f". It does not run on mjx: {system.why_not('mjx')}"
 

@@ -25,6 +25,7 @@ from jaxtyping import Float, UInt8
 from verifai_jax.core.errors import require, unknown_name
 from verifai_jax.core.waveform import bound
 from verifai_jax.plotting.replay import decisive_instant
+from verifai_jax.systems.mujoco.system import MuJoCo
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Replay
@@ -66,8 +67,7 @@ class Motion:
 
 def can_draw(system: Any) -> bool:
     """Whether a system is a MuJoCo model, which can be drawn by itself."""
-    loop = getattr(system, "loop", None)
-    return hasattr(loop, "compiled") and hasattr(loop, "bindings")
+    return isinstance(system, MuJoCo)
 
 
 def record(replay: "Replay") -> Motion:

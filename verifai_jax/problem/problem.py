@@ -9,18 +9,17 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from verifai_jax.core.trace import Trace
-from verifai_jax.features import FeatureSpace
+from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.problem.rulebook import Rulebook
-
-System = Callable[..., Trace]
+from verifai_jax.systems.base import System, as_system
 
 
 class ProblemError(ValueError):
@@ -35,8 +34,8 @@ class Problem:
 
     - `name`: how the command line and the report call it.
     - `space`: a `FeatureSpace`, or a dictionary of domains.
-    - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a
-      `blackbox`.
+    - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a `System`;
+      stored as a `System`.
     - `spec`: a formula (text or `Formula`), or several by name; the overall robustness of a
       simulation is the least of them.
     - `nominal`: features of an ordinary day; must lie in the space.
@@ -67,6 +66,21 @@ class Problem:
     rulebook: Rulebook | None = field(init=False, repr=False, default=None)
     engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
 
+    if TYPE_CHECKING:
+        # For type checkers: a dictionary and a function are stored as a space and a system.
+        def __init__(
+            self,
+            name: str,
+            space: FeatureSpace | Mapping[str, Domain],
+            system: System | Callable[..., Trace],
+            spec: Formula | str | Mapping[str, Formula | str],
+            nominal: Mapping[str, Any] | None = None,
+            description: str = "",
+            end: End = "hold",
+            draw: Callable[..., None] | None = None,
+            priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise ProblemError(f"a problem needs a name; got {self.name!r}")
@@ -80,6 +94,7 @@ class Problem:
             raise ProblemError(
                 f"system must be a function (features, key) -> Trace; got {self.system!r}"
             )
+        object.__setattr__(self, "system", as_system(self.system))
         spec = self.spec if isinstance(self.spec, Mapping) else {"spec": self.spec}
         if not spec:
             raise ProblemError("spec has no formula; give a formula or a dictionary of them")
@@ -98,7 +113,7 @@ class Problem:
     @property
     def black_box(self) -> bool:
         """Whether the system runs on the host, out of JAX's sight."""
-        return bool(getattr(self.system, "black_box", False))
+        return self.system.black_box
 
     def draws(self) -> bool:
         """Whether the system uses its random key; abstract evaluation, nothing compiles.
@@ -121,8 +136,8 @@ class Problem:
 
         **Raises:** what the system's `with_backend` does, for one that it lacks.
         """
-        system: Any = self.system
-        if not getattr(system, "backends", ()) or system.backend == backend:
+        system = self.system
+        if not system.backends or system.backend == backend:
             return self
         made = self.engines.setdefault("backends", {})
         if backend not in made:
@@ -152,22 +167,16 @@ class Problem:
         not produce.
         """
         features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        if callable(fits := getattr(self.system, "check", None)):
-            fits(features)
-        abstract: Any = getattr(self.system, "abstract", None)
-        if self.black_box and abstract is None:
-            return
+        self.system.check(features)
         try:
-            if abstract is not None:
-                trace = abstract(features)
-            else:
-                trace = jax.eval_shape(self.system, features, key)
+            trace = self.system.abstract(features)
         except Exception as error:
             raise ProblemError(
                 f"the system of problem {self.name!r} raised {type(error).__name__} when JAX "
                 f"traced it with features {list(features)}: {error}"
             ) from error
+        if trace is None and self.black_box:
+            return
         if not isinstance(trace, Trace):
             raise ProblemError(
                 f"the system of problem {self.name!r} must return a Trace; "

@@ -377,7 +377,7 @@ def feature_loop(
             f"the system of problem {problem.name!r} is a black box, which has no gradient; leave "
             "gradient out, and parameters are chosen by cross-entropy"
         )
-    several = bool(getattr(problem.system, "backends", ()))
+    several = bool(problem.system.backends)
     # With every name known, before a backend is measured.
     FeatureParameters(problem, parameters, batch=batch, gradient=False)
     problem.space.check_where()

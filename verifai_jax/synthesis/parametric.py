@@ -29,6 +29,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import robustness, smooth
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import as_system
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -236,8 +237,8 @@ class ArrayParameters:
     def _check(self) -> None:
         features = jax.eval_shape(self.problem.space.unflatten, jnp.zeros(self.problem.space.dim))
         key = jax.eval_shape(lambda: jax.random.key(0))
-        if getattr(self.system_of(self._restore(jnp.asarray(self.start, jnp.float32))),
-                   "black_box", False):  # fmt: skip
+        start = self._restore(jnp.asarray(self.start, jnp.float32))
+        if as_system(self.system_of(start)).black_box:
             raise ValueError(
                 "arrays of parameters are repaired by gradients, which a black box has not; make "
                 "the parameters features of the space, and name them"

@@ -61,7 +61,7 @@ def test_a_trace_that_is_not_as_declared(declared, match):
     assert system({}).length == 5
     form = system.abstract({})
     assert {name: leaf.shape for name, leaf in form.signals.items()} == {"x": (5,), "v": (5, 2)}
-    assert blackbox(simulate).abstract is None
+    assert blackbox(simulate).abstract({}) is None
 
 
 def test_a_period_is_not_sample_times():

@@ -14,9 +14,9 @@ import pytest
 from verifai_jax.core import targets
 from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
+from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.blackbox import blackbox, workers
 from verifai_jax.systems.blackbox._blackbox import only
-from verifai_jax.systems.outcome import Outcome
 
 ROOT = Path(__file__).parents[3]
 

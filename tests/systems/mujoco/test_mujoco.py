@@ -264,7 +264,7 @@ def test_backends_and_what_the_engine_asks():
     assert system.with_backend("native").black_box
     assert not system.with_backend("mjx").black_box
     assert system.with_backend("native").with_backend("auto").backend == "auto"
-    assert system.reverse_hint is None
+    assert system.reverse_hint == ""
     with pytest.raises(UnknownNameError, match="unknown backend 'nativ'; did you mean 'native'"):
         system.with_backend("nativ")
     abstract = system.abstract(jax.tree.map(lambda leaf: leaf[0], rows()))

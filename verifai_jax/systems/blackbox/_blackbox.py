@@ -20,8 +20,8 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.base import FunctionSystem, Outcome, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
-from verifai_jax.systems.outcome import Outcome
 
 Names = Sequence[str] | Mapping[str, int]
 
@@ -66,14 +66,13 @@ class Declared:
         signals = () if self.signals is None else self.signals
         return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
 
-    @property
-    def abstract(self) -> Callable[[Any], Trace] | None:
-        """A function of the features that gives a trace's form; None unless all is declared."""
+    def abstract(self) -> Trace | None:
+        """Return the form of a trace; None unless all is declared."""
         if self.signals is None or self.dt is None or self.length is None:
             return None
         shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
         signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
-        return lambda features: Trace(signals, dt=self.dt)
+        return Trace(signals, dt=self.dt)
 
     def accept(self, trace: Any) -> Trace:
         """What a simulator returned, its signals as NumPy arrays, if it is as declared.
@@ -141,7 +140,7 @@ class Simulation:
 
 
 @dataclass(frozen=True, eq=False)
-class BlackBox:
+class BlackBox(System):
     """A host-side system; made by `blackbox`. Simulated row by row, never traced by JAX."""
 
     black_box: ClassVar[bool] = True
@@ -154,27 +153,26 @@ class BlackBox:
         """
         return self.simulation(plain_leaves(features), seed_of(key))
 
-    @property
-    def abstract(self) -> Callable[[Any], Trace] | None:
-        """The form of the traces, if it is declared; see `Problem.check`."""
-        return self.simulation.declared.abstract
+    def abstract(self, features: Any) -> Trace | None:
+        """Return the form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract()
+
+    def check(self, features: Any) -> None:
+        """Refuse features that do not fit, if the simulator has a `check` of its own."""
+        as_system(self.simulation.function).check(features)
 
     @property
-    def check(self) -> Callable[[Any], None] | None:
-        """A function that refuses features which do not fit, if the simulator has one."""
-        return getattr(self.simulation.function, "check", None)
+    def can_refine(self) -> bool:
+        """True for a simulator that has a `refined(factor)` of its own."""
+        return as_system(self.simulation.function).can_refine
 
-    @property
-    def refined(self) -> Callable[[int], "BlackBox"] | None:
-        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
-        finer = getattr(self.simulation.function, "refined", None)
-        if not callable(finer):
-            return None
-        return lambda factor: BlackBox(replace(self.simulation, function=finer(factor)))  # pyright: ignore[reportArgumentType]
+    def refined(self, factor: int) -> "BlackBox":
+        """Return the same simulator with a `factor` times smaller step, if it has one."""
+        return BlackBox(replace(self.simulation, function=_finer(self.simulation.function, factor)))
 
 
 @dataclass(frozen=True, eq=False)
-class PooledBlackBox:
+class PooledBlackBox(System):
     """A host-side system that runs in processes of its own; made by `blackbox(..., workers=n)`."""
 
     black_box: ClassVar[bool] = True
@@ -194,15 +192,13 @@ class PooledBlackBox:
         """Each index exactly once, as its simulation ends; see `simulations.Each`."""
         return self.pool.outcomes(features, seeds)
 
-    @property
-    def abstract(self) -> Callable[[Any], Trace] | None:
-        """The form of the traces, if it is declared; see `Problem.check`."""
-        return self.simulation.declared.abstract
+    def abstract(self, features: Any) -> Trace | None:
+        """Return the form of the traces, if it is declared; see `Problem.check`."""
+        return self.simulation.declared.abstract()
 
-    @property
-    def check(self) -> Callable[[Any], None] | None:
-        """A function that refuses features which do not fit, if the simulator has one."""
-        return getattr(self.simulation.function, "check", None)
+    def check(self, features: Any) -> None:
+        """Refuse features that do not fit, if the simulator has a `check` of its own."""
+        as_system(self.simulation.function).check(features)
 
     def close(self) -> None:
         """End the workers. The next simulation starts new ones."""
@@ -210,7 +206,7 @@ class PooledBlackBox:
 
 
 @dataclass(frozen=True, eq=False)
-class VectorisedBlackBox:
+class VectorisedBlackBox(System):
     """A host-side system of many simulations at a time; made by `blackbox(vectorised=True)`."""
 
     black_box: ClassVar[bool] = True
@@ -225,12 +221,13 @@ class VectorisedBlackBox:
         return jax.tree.map(lambda leaf: leaf[0], trace)
 
     @property
-    def refined(self) -> Callable[[int], "VectorisedBlackBox"] | None:
-        """`refined(factor)` with a `factor` times smaller step, if the simulator has one."""
-        finer = getattr(self.function, "refined", None)
-        if not callable(finer):
-            return None
-        return lambda factor: replace(self, function=finer(factor))  # pyright: ignore[reportArgumentType]
+    def can_refine(self) -> bool:
+        """True for a simulator that has a `refined(factor)` of its own."""
+        return as_system(self.function).can_refine
+
+    def refined(self, factor: int) -> "VectorisedBlackBox":
+        """Return the same simulator with a `factor` times smaller step, if it has one."""
+        return replace(self, function=_finer(self.function, factor))
 
     def simulate_batch(self, features: Any, keys: Key[Array, " n"]) -> Trace:
         """A trace whose leaves are `[n, ...]`; see `simulations.Batched`."""
@@ -239,10 +236,9 @@ class VectorisedBlackBox:
             seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
         return self._simulate(features, seeds, len(keys))
 
-    @property
-    def abstract(self) -> Callable[[Any], Trace] | None:
-        """The form of one trace, if it is declared; see `Problem.check`."""
-        return self.declared.abstract
+    def abstract(self, features: Any) -> Trace | None:
+        """Return the form of one trace, if it is declared; see `Problem.check`."""
+        return self.declared.abstract()
 
     def _simulate(self, features: Any, seeds: np.ndarray, n: int) -> Trace:
         trace = self.function(features, seeds) if self.seeded else self.function(features)
@@ -391,6 +387,11 @@ def _plain(leaf: Any) -> Any:
     if not isinstance(leaf, jax.Array | np.ndarray | np.generic):
         return leaf
     return np.asarray(leaf).item() if np.ndim(leaf) == 0 else np.asarray(leaf)
+
+
+def _finer(function: Callable[..., Trace], factor: int) -> Callable[..., Trace]:
+    finer = as_system(function).refined(factor)
+    return finer.function if isinstance(finer, FunctionSystem) else finer
 
 
 def _is_number(value: Any) -> bool:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.systems.outcome import Outcome
+from verifai_jax.systems.base import Outcome
 
 log = logging.getLogger("verifai_jax.workers")
 

@@ -12,7 +12,7 @@ import importlib.metadata
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from jaxtyping import Array, Int
@@ -25,6 +25,7 @@ from verifai_jax.core.errors import (
 )
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
+from verifai_jax.systems.base import System
 from verifai_jax.systems.environments.brax_parts import (
     Place,
     check_read,
@@ -59,7 +60,7 @@ BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 
 @dataclass(frozen=True, eq=False)
-class Brax:
+class Brax(System):
     """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are."""
 
     env: Any
@@ -67,7 +68,7 @@ class Brax:
     policy: Any
     policy_memory: Any
     steps: int
-    dt: float
+    dt: float = field()
     features: Mapping[str, Place]
     configure: Callable[..., Any] | None
     initial: Mapping[str, Place] | Callable[..., Any] | None

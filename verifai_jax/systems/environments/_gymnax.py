@@ -10,7 +10,7 @@ The result is a pure function `(features, key) -> Trace` of one episode, which i
 import importlib.metadata
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -26,6 +26,7 @@ from verifai_jax.core.errors import (
 )
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
+from verifai_jax.systems.base import System
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -56,7 +57,7 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Gymnax:
+class Gymnax(System):
     """A closed loop `(features, key) -> Trace`; made by `gymnax`, which says what its parts are."""
 
     env: Any
@@ -64,7 +65,7 @@ class Gymnax:
     policy: Any
     policy_memory: Any
     steps: int
-    dt: float
+    dt: float = field()
     features: Mapping[str, str]
     configure: Callable[..., Any] | None
     initial: Mapping[str, str] | Callable[..., Any] | None
@@ -251,10 +252,10 @@ def gymnax(
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
     check_names(f"parameter of {env.name}", bindings.values(), fields)
     clocks = [name for name in ("dt", "tau") if name in fields]
-    for name, field in bindings.items():
-        if field in clocks and dt is None:
+    for name, parameter in bindings.items():
+        if parameter in clocks and dt is None:
             raise ValueError(
-                f"feature {name!r} cannot set {field!r}: all samples of a trace are one fixed "
+                f"feature {name!r} cannot set {parameter!r}: all samples of a trace are one fixed "
                 "period apart; give dt=... if it is not the environment's time step"
             )
     if dt is None:

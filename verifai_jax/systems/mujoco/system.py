@@ -20,6 +20,7 @@ import numpy as np
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
+from verifai_jax.systems.base import System
 from verifai_jax.systems.mujoco.bindings import Bound, bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
 from verifai_jax.systems.mujoco.mjx_rollout import constrained, reverse_hint, rollout, why_not
@@ -31,7 +32,7 @@ BACKENDS = ("native", "mjx")
 
 
 @dataclass(frozen=True, eq=False)
-class MuJoCo:
+class MuJoCo(System):
     """A closed loop `(features, key) -> Trace`; made by `mujoco`, which says what its parts are.
 
     - `backend`: `"native"`, `"mjx"`, or `"auto"` until a run chooses.
@@ -106,9 +107,9 @@ class MuJoCo:
         return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
 
     @cached_property
-    def reverse_hint(self) -> str | None:
+    def reverse_hint(self) -> str:
         """What makes reverse mode work, where it does not."""
-        return reverse_hint(self.loop.compiled)
+        return reverse_hint(self.loop.compiled) or ""
 
     def check(self, features: Any) -> None:
         """Refuse features that the system does not fit; nothing compiles.

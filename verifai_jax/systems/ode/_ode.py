@@ -10,7 +10,7 @@ forward and reverse.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import jax
@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
+from verifai_jax.systems.base import System
 from verifai_jax.systems.horizon import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor, integrator
 from verifai_jax.systems.structure import (
@@ -34,7 +35,7 @@ Time = Float[Array, ""]
 
 
 @dataclass(frozen=True, eq=False)
-class Ode:
+class Ode(System):
     """A closed loop `(features, key) -> Trace`; made by `ode`, which says what its parts are.
 
     - `substeps`: integration steps between two samples; more than one in a `refined` loop.
@@ -45,7 +46,7 @@ class Ode:
     initial: Callable[..., Any]
     controller: Callable[..., Any] | None
     controller_memory: Any
-    dt: float
+    dt: float = field()
     steps: int
     steps_per_control: int
     method: str

@@ -15,13 +15,13 @@ import queue
 import socket
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Self
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Trace
+from verifai_jax.systems.base import Outcome, System
 from verifai_jax.systems.blackbox._blackbox import Declared, Names, only, plain_leaves, seed_of
-from verifai_jax.systems.outcome import Outcome
 from verifai_jax.systems.remote import wire
 from verifai_jax.systems.remote.connection import Batch, Rules
 from verifai_jax.systems.remote.server import Server
@@ -32,7 +32,7 @@ MOST_BYTES = 16 << 20
 BOTH = ("127.0.0.1", "::1")
 
 
-class Remote:
+class Remote(System):
     """A host-side system whose simulations other programs do; made by `remote`.
 
     The port is opened when it is first needed, so a module that defines one does nothing yet.
@@ -63,10 +63,9 @@ class Remote:
         """Who is connected now."""
         return [client.name for client in tuple(self._open().clients) if client.here]
 
-    @property
-    def abstract(self) -> Callable[[Any], Trace] | None:
-        """The form of the traces, if it is declared; see `Problem.check`."""
-        return self.rules.declared.abstract
+    def abstract(self, features: Any) -> Trace | None:
+        """Return the form of the traces, if it is declared; see `Problem.check`."""
+        return self.rules.declared.abstract()
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate once.

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from verifai_jax.core.trace import Status
-from verifai_jax.systems.outcome import Outcome
+from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.remote import connection, wire
 from verifai_jax.systems.remote.connection import Batch, Client, Point, Rules, keep_alive
 
