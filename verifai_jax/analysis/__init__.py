@@ -27,3 +27,37 @@ from verifai_jax.analysis.sensitivity.gradients import gradient_sensitivity as g
 from verifai_jax.analysis.sensitivity.morris import morris as morris
 from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity as Sensitivity
 from verifai_jax.analysis.sensitivity.sobol import sobol_indices as sobol_indices
+
+__all__ = [
+    "Analysis",
+    "Clusters",
+    "Column",
+    "Components",
+    "Coverage",
+    "Diverse",
+    "Importance",
+    "Neighbours",
+    "Recurrent",
+    "Rule",
+    "Rules",
+    "Samples",
+    "Sensitivity",
+    "analyze",
+    "clusters",
+    "coverage",
+    "diverse",
+    "gradient_sensitivity",
+    "importance",
+    "k_closest",
+    "morris",
+    "nearest",
+    "pca",
+    "random_rows",
+    "recurrent",
+    "rules",
+    "sobol_indices",
+]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

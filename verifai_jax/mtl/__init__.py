@@ -42,3 +42,52 @@ from verifai_jax.mtl.semantics import boolean as boolean
 from verifai_jax.mtl.semantics import hard as hard
 from verifai_jax.mtl.semantics import smooth as smooth
 from verifai_jax.mtl.smoothing_error import Certificate as Certificate
+
+__all__ = [
+    "Certificate",
+    "End",
+    "Explanation",
+    "Expression",
+    "FALSE",
+    "Formula",
+    "FormulaSyntaxError",
+    "HorizonError",
+    "IntervalError",
+    "Online",
+    "Semantics",
+    "TRUE",
+    "always",
+    "anneal",
+    "boolean",
+    "certificate",
+    "draw",
+    "eventually",
+    "explain",
+    "hard",
+    "historically",
+    "history",
+    "horizon",
+    "latex",
+    "next_",
+    "nnf",
+    "normalised",
+    "once",
+    "online",
+    "parse",
+    "prev",
+    "read",
+    "resample",
+    "robustness",
+    "robustness_signal",
+    "satisfied",
+    "signal",
+    "signals",
+    "simplify",
+    "since",
+    "smooth",
+    "until",
+]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

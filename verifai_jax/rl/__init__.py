@@ -24,3 +24,34 @@ from verifai_jax.rl.task.task import Discrete as Discrete
 from verifai_jax.rl.task.task import Task as Task
 from verifai_jax.rl.trainings import Configuration as Configuration
 from verifai_jax.rl.trainings import Trainings as Trainings
+
+__all__ = [
+    "ALGORITHMS",
+    "Algorithm",
+    "Configuration",
+    "Continuous",
+    "Discrete",
+    "PPO",
+    "PQN",
+    "Policy",
+    "PolicyFileError",
+    "Progress",
+    "SAC",
+    "Snapshot",
+    "Task",
+    "Trained",
+    "Trainings",
+    "brax_task",
+    "evaluate",
+    "gymnax_task",
+    "load_policy",
+    "mjx_task",
+    "ode_task",
+    "policy_notes",
+    "save_policy",
+    "train",
+]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -33,6 +33,41 @@ from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
 
+__all__ = [
+    "Annealing",
+    "Bandit",
+    "Bayes",
+    "CECompat",
+    "CMAES",
+    "CrossEntropy",
+    "Cube",
+    "Diverse",
+    "EpsilonGreedy",
+    "Gradient",
+    "Grid",
+    "Halton",
+    "Mutation",
+    "Observations",
+    "Plan",
+    "PointList",
+    "Portfolio",
+    "Search",
+    "Sobol",
+    "Split",
+    "Uniform",
+    "distinct",
+    "from_json",
+    "named",
+    "names",
+    "split",
+    "to_json",
+]
+
+
+def __dir__() -> list[str]:
+    return list(__all__)
+
+
 _SEARCHES: dict[str, type[Search]] = {
     "uniform": Uniform,
     "halton": Halton,

@@ -1,0 +1,110 @@
+"""The language of the package: first words, typed arguments, one name for one thing.
+
+Counts that are above their aims may only shrink; the aims are written beside them.
+"""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "verifai_jax"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+QUESTIONS = {"What", "Which", "Whether", "How", "Who", "Of", "That", "Whose"}
+"""First words of a sentence that names neither an act nor a thing."""
+
+QUESTIONING_DOCSTRINGS = 259
+"""Public docstrings that begin with one of them, at most. Aim: 0."""
+
+SHARE_OF_ANY = 0.181
+"""Argument annotations that are `Any`, at most. Aim: 0.05."""
+
+SHADOWED_MODULES = 10
+"""Modules hidden by a function of the same name that their package exports. Aim: at most 10."""
+
+SHADOWED_BY_OTHERS = 1
+"""Those hidden by something out of another file, at most. Aim: 0."""
+
+Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+def documented(tree: ast.Module) -> Iterator[Documented | ast.Module]:
+    yield tree
+    for node in ast.walk(tree):
+        if isinstance(node, Documented) and not node.name.startswith("_"):
+            yield node
+
+
+def first_word(docstring: str) -> str:
+    return docstring.split()[0].rstrip(",:;.").split("'")[0].split("-")[0]
+
+
+def questioning(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield lines of public docstrings that begin as a question does."""
+    for node in documented(tree):
+        text = ast.get_docstring(node)
+        if text and first_word(text) in QUESTIONS:
+            yield getattr(node, "lineno", 1), text.splitlines()[0]
+
+
+def argument_annotations(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            for argument in arguments:
+                if argument.annotation is not None:
+                    yield ast.unparse(argument.annotation)
+
+
+def shadowed(package: Path) -> Iterator[tuple[str, str]]:
+    """Yield each module that a name of its package's `__init__` hides, and the name's module."""
+    here = ".".join(package.relative_to(PACKAGE.parent).parts)
+    for node in ast.parse((package / "__init__.py").read_text()).body:
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                name = alias.asname or alias.name
+                is_module = node.module == here
+                exists = (package / f"{name}.py").exists() or (package / name).is_dir()
+                if exists and not is_module:
+                    yield f"{here}.{name}", node.module or ""
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            exists = (package / f"{node.name}.py").exists()
+            yield from [(f"{here}.{node.name}", here)] * exists
+
+
+def test_first_words():
+    wrong = [
+        f"{file.relative_to(PACKAGE)}:{line} {text}"
+        for file in FILES
+        for line, text in questioning(ast.parse(file.read_text()))
+    ]
+    assert len(wrong) <= QUESTIONING_DOCSTRINGS, "\n".join(wrong)
+
+
+def test_first_words_are_noticed():
+    source = (
+        '"""Whether it holds."""\ndef f():\n    """How."""\n'
+        'def _g():\n    """What."""\nclass A:\n    """Something."""\n'
+    )
+    assert list(questioning(ast.parse(source))) == [(1, "Whether it holds."), (2, "How.")]
+
+
+def test_arguments_have_types():
+    annotations = [
+        text for file in FILES for text in argument_annotations(ast.parse(file.read_text()))
+    ]
+    share = sum(text in ("Any", "typing.Any") for text in annotations) / len(annotations)
+    assert share <= SHARE_OF_ANY, f"{share:.1%} of {len(annotations)} annotations are Any"
+
+
+def test_one_file_calls_shard_map():
+    calls = [file for file in FILES if "shard_map(" in file.read_text()]
+    assert calls == [PACKAGE / "core" / "devices.py"]
+
+
+def test_modules_hidden_by_a_function_of_their_name():
+    packages = [file.parent for file in FILES if file.name == "__init__.py"]
+    hidden = [pair for package in packages for pair in shadowed(package)]
+    by_others = [pair for pair in hidden if pair[0] != pair[1]]
+    assert len(hidden) <= SHADOWED_MODULES, hidden
+    assert len(by_others) <= SHADOWED_BY_OTHERS, by_others
