@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.errors import check_names, require
 from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.systems.mujoco.bindings import scaled
+from verifai_jax.systems.mujoco.bindings import Scaled
 from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Scalar = Float[Array, ""]
@@ -41,8 +41,8 @@ STANCE = np.array([0.0, 1.03, 0.0, -0.2, 0.4, -0.2])
 BINDINGS = {
     "torso_mass": "body/torso/mass",  # kg
     "friction": "geom/floor/friction[0]",
-    "strength": [scaled(f"actuator/{joint}/gear[0]") for joint in ("hip", "knee", "ankle")],
-    "damping": [scaled(f"joint/{joint}/damping") for joint in ("hip", "knee", "ankle")],
+    "strength": [Scaled(f"actuator/{joint}/gear[0]") for joint in ("hip", "knee", "ankle")],
+    "damping": [Scaled(f"joint/{joint}/damping") for joint in ("hip", "knee", "ankle")],
     "foot": "geom/foot/size[1]",  # m, half its length
     "pitch0": "joint/rooty/qpos",  # rad
     "speed0": "joint/rootx/qvel",  # m/s

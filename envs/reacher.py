@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.errors import check_names
 from verifai_jax.rl import Continuous, Policy, load_policy
 from verifai_jax.rl.task.mjx import MjxTask, mjx_task
-from verifai_jax.systems.mujoco.bindings import scaled
+from verifai_jax.systems.mujoco.bindings import Scaled
 from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Controller = Callable[..., Float[Array, "2"]]
@@ -69,8 +69,8 @@ BINDINGS = {
     "shoulder0": "joint/shoulder/qpos",  # rad
     "elbow0": "joint/elbow/qpos",
     "load": "body/load/mass",  # kg at the tip
-    "strength": [scaled(f"actuator/{joint}/gear[0]") for joint in ("shoulder", "elbow")],
-    "damping": [scaled(f"joint/{joint}/damping") for joint in ("shoulder", "elbow")],
+    "strength": [Scaled(f"actuator/{joint}/gear[0]") for joint in ("shoulder", "elbow")],
+    "damping": [Scaled(f"joint/{joint}/damping") for joint in ("shoulder", "elbow")],
 }
 NOMINAL = {
     "target_angle": 1.0,

@@ -78,14 +78,14 @@ if TYPE_CHECKING:
     from verifai_jax.synthesis import synthesize as synthesize
     from verifai_jax.systems.base import System as System
     from verifai_jax.systems.blackbox import blackbox as blackbox
-    from verifai_jax.systems.blackbox import stacked as stacked
+    from verifai_jax.systems.blackbox import stack_traces as stack_traces
     from verifai_jax.systems.environments import brax as brax
     from verifai_jax.systems.environments import gymnasium as gymnasium
     from verifai_jax.systems.environments import gymnax as gymnax
+    from verifai_jax.systems.mujoco import Scaled as Scaled
     from verifai_jax.systems.mujoco import mjx as mjx
     from verifai_jax.systems.mujoco import mujoco as mujoco
     from verifai_jax.systems.mujoco import native as native
-    from verifai_jax.systems.mujoco import scaled as scaled
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
@@ -182,7 +182,7 @@ _NAMES = {
     "systems.base": ("System",),
     "systems.blackbox": (
         "blackbox",
-        "stacked",
+        "stack_traces",
     ),
     "systems.environments": (
         "brax",
@@ -193,7 +193,7 @@ _NAMES = {
         "mjx",
         "mujoco",
         "native",
-        "scaled",
+        "Scaled",
     ),
     "systems.ode": (
         "ode",

@@ -19,7 +19,7 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import System
-from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor
 
 Features = Mapping[str, Any]

@@ -7,12 +7,11 @@ are cores.
 """
 
 import verifai_jax as vj
-from verifai_jax.systems.remote._remote import remote
 
 swing = vj.Problem(
     "swing",
     {"theta0": vj.Box(-1.5, 1.5), "length": vj.Box(0.2, 2.0)},
-    remote(port=4567, signals=("theta", "omega"), dt=0.02, length=200),
+    vj.remote(port=4567, signals=("theta", "omega"), dt=0.02, length=200),
     "always abs(omega) <= 8",
     description="a pendulum in another program must not swing faster than 8 rad/s",
 )

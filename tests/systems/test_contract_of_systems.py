@@ -29,7 +29,7 @@ def test_black_boxes():
     check_system(vj.blackbox(lambda f: Trace({"x": np.full(3, f["x0"])}, dt=1.0)), SPACE)
 
     def whole(features, seeds):
-        return vj.stacked({"x": np.repeat(features["x0"][:, None], 3, axis=1)}, dt=1.0)
+        return vj.stack_traces({"x": np.repeat(features["x0"][:, None], 3, axis=1)}, dt=1.0)
 
     check_system(vj.blackbox(whole, vectorised=True, seeded=True), SPACE)
 

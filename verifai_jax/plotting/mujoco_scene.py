@@ -124,7 +124,7 @@ def _recorder(system: Any) -> tuple[Any, Any]:
         return {"qpos": state.qpos}
 
     def placed(features: Any, times: Any) -> tuple[Any, Any]:
-        acting = jax.vmap(lambda time: loop.bindings.acting(features, time))(times)
+        acting = jax.vmap(lambda time: loop.bindings.applied_at(features, time))(times)
         return loop.bindings.leaves(features), acting
 
     recorder = replace(system, loop=replace(loop, signals=positions))

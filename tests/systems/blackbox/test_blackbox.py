@@ -5,7 +5,7 @@ import pytest
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.systems.blackbox import blackbox
-from verifai_jax.systems.blackbox._blackbox import stacked
+from verifai_jax.systems.blackbox._blackbox import stack_traces
 
 
 def test_features_arrive_as_plain_values():
@@ -79,7 +79,7 @@ def test_a_trace_holds_numbers():
 def falling(features, seeds):
     a = np.asarray(features["a"])
     x = a[:, None] - np.arange(4.0)
-    return stacked({"x": x, "v": np.stack([x, x], axis=2)}, dt=0.5, valid=seeds % 4 + 1)
+    return stack_traces({"x": x, "v": np.stack([x, x], axis=2)}, dt=0.5, valid=seeds % 4 + 1)
 
 
 def test_vectorised_is_many_single_ones():
@@ -104,10 +104,10 @@ def test_vectorised_is_many_single_ones():
         (Trace({"x": np.ones(7)}, dt=1.0), r"shape \[3, time\] or \[3, time, k\].*got \[7\]"),
         (Trace({"x": np.ones((2, 7))}, dt=1.0), r"got \[2, 7\]"),
         (
-            stacked({"x": np.ones((3, 7))}, dt=1.0, valid=np.ones(2, int)),
+            stack_traces({"x": np.ones((3, 7))}, dt=1.0, valid=np.ones(2, int)),
             r"valid of a vectorised black box must have shape \[3\]; got \[2\]",
         ),
-        (stacked({"x": np.ones((3, 7))}, dt=2.0), r"period dt=1\.0; got dt=2\.0"),
+        (stack_traces({"x": np.ones((3, 7))}, dt=2.0), r"period dt=1\.0; got dt=2\.0"),
     ],
 )
 def test_vectorised_refuses_other_shapes(trace, match):
@@ -118,4 +118,4 @@ def test_vectorised_refuses_other_shapes(trace, match):
 
 def test_stacked_refuses_what_a_trace_refuses():
     with pytest.raises(ValueError, match="signals must have one length"):
-        stacked({"x": np.ones((3, 7)), "y": np.ones((3, 6))}, dt=1.0)
+        stack_traces({"x": np.ones((3, 7)), "y": np.ones((3, 6))}, dt=1.0)

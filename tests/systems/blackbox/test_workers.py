@@ -16,7 +16,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.blackbox import blackbox, workers
-from verifai_jax.systems.blackbox._blackbox import only
+from verifai_jax.systems.blackbox._blackbox import single_trace
 
 ROOT = Path(__file__).parents[3]
 
@@ -63,7 +63,7 @@ def test_one_simulation_raises_what_went_wrong(troublesome):
         troublesome({"a": 1})
     late = Outcome(None, Status.TIMEOUT, "the simulation took longer than 1 s")
     with pytest.raises(TimeoutError, match="longer than 1 s"):
-        only(iter([(0, late)]))
+        single_trace(iter([(0, late)]))
 
 
 def test_workers_are_used_again_and_end_with_the_pool(troublesome):

@@ -13,7 +13,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.rl import Discrete, Policy
 from verifai_jax.rl.policy import new_layers
-from verifai_jax.systems.environments.episode import keys_of
+from verifai_jax.systems.environments.episode import episode_keys
 from verifai_jax.testing import check_system
 
 pytest.importorskip("brax")
@@ -107,7 +107,7 @@ def jitter(observation, key):
 
 @pytest.mark.parametrize("policy", [push, jitter])
 def test_equal_to_the_environment_stepped_by_hand(policy):
-    env, keys = Slide(), keys_of(KEY)
+    env, keys = Slide(), episode_keys(KEY)
     state, rows = env.reset(keys.start), []
     for k in range(31):
         action = (
@@ -384,7 +384,7 @@ def test_pendulum_is_that_of_brax_stepped_by_hand(backend, path):
         env.sys = env.sys.tree_replace({field: changed})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
-            drawn = jax.jit(env.reset)(keys_of(KEY).start).pipeline_state
+            drawn = jax.jit(env.reset)(episode_keys(KEY).start).pipeline_state
             physics = jax.jit(env.pipeline_init)(drawn.q.at[1].set(0.05), drawn.qd)
             state = State(
                 physics,

@@ -10,15 +10,15 @@ from verifai_jax.core.waveform import Waveform
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
-    at_time,
-    deciding,
-    folded,
-    inputs_used,
-    keys_of,
-    period,
+    episode_keys,
+    features_at,
+    fold,
+    has_waveforms,
+    policy_function,
     rollout,
+    sampling_period,
     step_count,
-    varies,
+    used_inputs,
     vector_action,
 )
 
@@ -36,7 +36,7 @@ def tank(level, **changes):
         "name": "tank",
         "start": lambda key: Moment(level, level[None], 0, False),
         "step": step,
-        "decide": deciding(lambda observation: 0.0),
+        "decide": policy_function(lambda observation: 0.0),
         "memory": None,
         "see": lambda time, moment, action: {"level": moment.state, "time": time},
         "steps": 30,
@@ -70,7 +70,7 @@ def test_a_fold_takes_in_the_samples_of_the_trace():
     for level, steps in ((1.0, 30), (9.0, 30)):
         episode = tank(jnp.float32(level), steps=steps)
         trace = rollout(episode, KEY)
-        (total, latest), status = folded(episode, KEY, (0.0, 0.0), add)
+        (total, latest), status = fold(episode, KEY, (0.0, 0.0), add)
         assert float(total) == pytest.approx(float(trace["level"].sum()), rel=1e-5)
         assert float(latest) == float(trace["time"][-1])
         assert int(status) == int(trace.status) == Status.OK
@@ -134,10 +134,10 @@ def test_random_policies_get_a_key_of_each_step():
     def see(time, moment, action):
         return {"action": action}
 
-    decide = deciding(lambda observation, key: jax.random.normal(key))
+    decide = policy_function(lambda observation, key: jax.random.normal(key))
     trace = rollout(tank(jnp.float32(9.0), decide=decide, see=see), KEY)
     for k in range(31):
-        seen.append(jax.random.normal(jax.random.fold_in(keys_of(KEY).decide, k)))
+        seen.append(jax.random.normal(jax.random.fold_in(episode_keys(KEY).decide, k)))
     np.testing.assert_allclose(trace["action"], seen, rtol=1e-6)
 
 
@@ -153,16 +153,16 @@ class Actor:
 
 def test_forms_of_a_policy():
     seen, key = jnp.array([2.0]), KEY
-    assert deciding(Actor())(seen, None, key) == (2.0, None)
-    assert deciding(jax.jit(lambda o: o[0]))(seen, None, key)[0] == 2.0
-    assert deciding(functools.partial(lambda a, o: a, 3.0))(seen, None, key)[0] == 3.0
-    assert deciding(lambda *a: len(a))(seen, None, key)[0] == 1
-    assert deciding(lambda o, scale=2: scale * o[0])(seen, None, key)[0] == 4.0
-    assert deciding(lambda o, k: k is key)(seen, None, key)[0] is True
-    assert deciding(lambda o, m: (o[0], m + 1), 0)(seen, 5, key) == (2.0, 6)
-    assert deciding(lambda o, m, k: (k is key, m), 0)(seen, 5, key) == (True, 5)
+    assert policy_function(Actor())(seen, None, key) == (2.0, None)
+    assert policy_function(jax.jit(lambda o: o[0]))(seen, None, key)[0] == 2.0
+    assert policy_function(functools.partial(lambda a, o: a, 3.0))(seen, None, key)[0] == 3.0
+    assert policy_function(lambda *a: len(a))(seen, None, key)[0] == 1
+    assert policy_function(lambda o, scale=2: scale * o[0])(seen, None, key)[0] == 4.0
+    assert policy_function(lambda o, k: k is key)(seen, None, key)[0] is True
+    assert policy_function(lambda o, m: (o[0], m + 1), 0)(seen, 5, key) == (2.0, 6)
+    assert policy_function(lambda o, m, k: (k is key, m), 0)(seen, 5, key) == (True, 5)
     with pytest.raises(ValueError, match=r"\(observation, memory\) or .*; got one of 1 arguments"):
-        deciding(lambda o: o, 0)
+        policy_function(lambda o: o, 0)
 
 
 def test_vector_actions():
@@ -177,19 +177,19 @@ def test_vector_actions():
 
 def test_features_of_an_instant():
     features = {"wind": Waveform(jnp.array([0.0, 2.0]), duration=4.0), "mass": 3.0}
-    assert varies(features)
-    assert not varies({"mass": 3.0})
-    assert float(at_time(features, 1.0)["wind"]) == 0.5
-    assert at_time(features, 1.0)["mass"] == 3.0
+    assert has_waveforms(features)
+    assert not has_waveforms({"mass": 3.0})
+    assert float(features_at(features, 1.0)["wind"]) == 0.5
+    assert features_at(features, 1.0)["mass"] == 3.0
 
 
 def test_steps_and_periods():
     assert step_count(None, 1.0, 0.1) == 10
     assert step_count(None, None, 0.1, 7) == 7
-    assert period(np.float32(0.05)) == 0.05
-    assert period(jnp.float32(0.008)) == 0.008
+    assert sampling_period(np.float32(0.05)) == 0.05
+    assert sampling_period(jnp.float32(0.008)) == 0.008
     with pytest.raises(ValueError, match="dt must be a positive number of seconds; got 'x'"):
-        period("x")
+        sampling_period("x")
     with pytest.raises(ValueError, match="steps must be an integer of at least 1; got True"):
         step_count(True, None, 0.1)
 
@@ -198,5 +198,5 @@ def test_inputs_that_nothing_depends_on():
     def function(tree, b):
         return jax.jit(lambda used, unused: used * 2)(tree["a"], tree["c"]) + 0 * jnp.sum(b)
 
-    used = inputs_used(function, {"a": 1.0, "c": 2.0}, jnp.ones(2))
+    used = used_inputs(function, {"a": 1.0, "c": 2.0}, jnp.ones(2))
     assert used == [True, False, True]

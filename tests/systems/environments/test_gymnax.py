@@ -13,7 +13,7 @@ from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
 from verifai_jax.rl.policy import new_layers
-from verifai_jax.systems.environments.episode import keys_of
+from verifai_jax.systems.environments.episode import episode_keys
 from verifai_jax.testing import check_system
 
 package = pytest.importorskip("gymnax")
@@ -43,7 +43,7 @@ def by_hand(name, choose, steps, key, **changes):
     """Observations, rewards and ends of an environment stepped in Python, without reset."""
     env, params = package.make(name)
     params = params.replace(**changes)
-    keys = keys_of(key)
+    keys = episode_keys(key)
     observation, state = env.reset_env(keys.start, params)
     seen = [(np.asarray(observation), 0.0, False)]
     step = jax.jit(lambda k, s, a: env.step_env(k, s, a, params))

@@ -12,7 +12,7 @@ from envs import cartpole as analytic
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
-from verifai_jax.systems.mujoco.bindings import scaled
+from verifai_jax.systems.mujoco.bindings import Scaled
 from verifai_jax.systems.mujoco.system import mjx, native
 from verifai_jax.systems.mujoco.system import mujoco as model
 from verifai_jax.systems.ode import ode
@@ -24,7 +24,7 @@ BIND = {
     "theta0": "joint/hinge/qpos",
     "masspole": "body/pole/mass",
     "length": ["geom/pole/size[2]", "geom/pole/pos[2]"],
-    "cart": scaled("body/cart/mass"),
+    "cart": Scaled("body/cart/mass"),
     "wind": "body/cart/force[0]",
 }
 SIGNALS = {
@@ -302,7 +302,7 @@ def test_a_model_that_mjx_cannot_do_is_left_to_native():
         ("body/pole", r"'body/pole' lacks a field: write body/pole/FIELD"),
         ("actuator/motor/kp", r"kp and kv are those of a servo"),
         ("actuator/motor/act", r"this actuator has no activation state"),
-        (scaled("joint/hinge/qpos"), r"the model has no value there to multiply"),
+        (Scaled("joint/hinge/qpos"), r"the model has no value there to multiply"),
     ],
 )
 def test_bindings_to_nothing_are_refused(bind, message):

@@ -25,7 +25,7 @@ import verifai_jax as vj
 from verifai_jax import remote_client
 from verifai_jax.core.trace import Status
 from verifai_jax.core.waveform import Waveform
-from verifai_jax.systems.blackbox._blackbox import Declared
+from verifai_jax.systems.blackbox._blackbox import TraceForm
 from verifai_jax.systems.remote import connection, server, wire
 from verifai_jax.systems.remote._remote import remote
 
@@ -280,7 +280,7 @@ def test_whatever_comes_is_a_trace_or_a_clear_error(data, changes):
         data = data[:at] + new + data[at + 1 :]
     with contextlib.suppress(ValueError, TypeError):  # WireError is a ValueError
         for message in decoded(data, most=1 << 16) if data else ():
-            Declared(("x",), 0.1).accept(wire.trace_of(message))
+            TraceForm(("x",), 0.1).accept(wire.trace_of(message))
 
 
 def test_what_a_stranger_says_cannot_garble_a_log(system, caplog):

@@ -19,7 +19,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.stepping import Shown, kept, vector
 from verifai_jax.rl.task.task import Continuous
 from verifai_jax.systems.environments._brax import Brax, brax
-from verifai_jax.systems.environments.brax_parts import explained
+from verifai_jax.systems.environments.brax_model import explain_errors
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class BraxTask:
 
     def reset(self, key: Key[Array, ""]) -> Shown:
         """The environment's own start."""
-        with explained(self.env, self.name, "reset"):
+        with explain_errors(self.env, self.name, "reset"):
             first = self.env.reset(key)
         start = self._shown(first)
         action = jax.ShapeDtypeStruct((self.env.action_size,), jnp.float32)
@@ -57,7 +57,7 @@ class BraxTask:
         return state.observation
 
     def _stepped(self, state: Shown, action: Array) -> Shown:
-        with explained(self.env, self.name, "step"):
+        with explain_errors(self.env, self.name, "step"):
             after = self.env.step(state.state, action)
         return self._shown(after)
 

@@ -22,7 +22,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.stepping import Fit, Shown, choice, fitted, kept, vector
 from verifai_jax.rl.task.task import Action
 from verifai_jax.systems.environments._gymnax import Gymnax, gymnax
-from verifai_jax.systems.structure import outline
+from verifai_jax.systems.pytree_checks import outline
 
 
 @jax.tree_util.register_dataclass

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Key
 from verifai_jax.core.errors import check_names, require, suggests_options
 from verifai_jax.rl.task.task import Action, Continuous
 from verifai_jax.systems.mujoco.model import load
-from verifai_jax.systems.structure import outline
+from verifai_jax.systems.pytree_checks import outline
 
 
 class Body(NamedTuple):

@@ -17,7 +17,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.ode._ode import Ode
 from verifai_jax.systems.ode.integrators import integrator
-from verifai_jax.systems.structure import floating, outline
+from verifai_jax.systems.pytree_checks import as_floating, outline
 
 
 class Moment(NamedTuple):
@@ -44,7 +44,7 @@ class OdeTask:
         """The loop's own start, under features of this episode."""
         features_key, start_key = jax.random.split(key)
         features = jax.tree.map(jnp.asarray, self.features(features_key))
-        state = floating(self.loop.initial(features, start_key), "initial")
+        state = as_floating(self.loop.initial(features, start_key), "initial")
         return Moment(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
 
     def step(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
-from verifai_jax.systems.structure import outline
+from verifai_jax.systems.pytree_checks import outline
 
 
 class Shown(NamedTuple):

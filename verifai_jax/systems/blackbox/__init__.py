@@ -2,4 +2,4 @@
 
 from verifai_jax.systems.blackbox._blackbox import BlackBox as BlackBox
 from verifai_jax.systems.blackbox._blackbox import blackbox as blackbox
-from verifai_jax.systems.blackbox._blackbox import stacked as stacked
+from verifai_jax.systems.blackbox._blackbox import stack_traces as stack_traces

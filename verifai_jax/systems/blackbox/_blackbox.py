@@ -23,11 +23,11 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import FunctionSystem, Outcome, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
 
-Names = Sequence[str] | Mapping[str, int]
+SignalNames = Sequence[str] | Mapping[str, int]
 
 
 @dataclass(frozen=True)
-class Declared:
+class TraceForm:
     """What every trace of a simulator must have; what is None may be anything.
 
     **Arguments:**
@@ -39,7 +39,7 @@ class Declared:
     **Raises:** `ValueError` for a declaration that no trace can meet.
     """
 
-    signals: Names | None = None
+    signals: SignalNames | None = None
     dt: float | None = None
     length: int | None = None
 
@@ -124,7 +124,7 @@ class Simulation:
 
     function: Callable[..., Trace]
     seeded: bool
-    declared: Declared
+    declared: TraceForm
 
     def __call__(self, features: Any, seed: int) -> Trace:
         return self.declared.accept(
@@ -184,7 +184,7 @@ class PooledBlackBox(System):
 
         **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
         """
-        return only(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
+        return single_trace(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
 
     def simulate_each(
         self, features: Sequence[Any], seeds: Sequence[int]
@@ -212,7 +212,7 @@ class VectorisedBlackBox(System):
     black_box: ClassVar[bool] = True
     function: Callable[..., Trace]
     seeded: bool
-    declared: Declared
+    declared: TraceForm
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one, as a batch of one."""
@@ -270,7 +270,7 @@ class VectorisedBlackBox(System):
                 )
             whole[name] = np.broadcast_to(np.asarray(value), shape)
         signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
-        trace = stacked(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
+        trace = stack_traces(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
         self.declared.accept(jax.tree.map(lambda leaf: leaf[0], trace))
         return trace
 
@@ -284,7 +284,7 @@ def blackbox(
     timeout: float | None = None,
     retries: int = 1,
     vectorised: bool = False,
-    signals: Names | None = None,
+    signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
 ) -> BlackBox | PooledBlackBox | VectorisedBlackBox:
@@ -304,8 +304,8 @@ def blackbox(
       `timeout`; needs `workers`. What a worker's first simulation compiles or loads counts.
     - `retries`: how often a simulation whose process dies is started again, in a new one.
     - `vectorised`: `function` simulates many at a time: arrays of features are `[n, ...]`, `seeds`
-      is `[n]`, and so is every array of the trace; see `stacked`.
-    - `signals`, `dt`, `length`: what every trace must have; see `Declared`. One that differs is a
+      is `[n]`, and so is every array of the trace; see `stack_traces`.
+    - `signals`, `dt`, `length`: what every trace must have; see `TraceForm`. One that differs is a
       row with status `error`.
 
     **Raises:** `ValueError` for something that is not callable, or not importable by workers;
@@ -313,7 +313,7 @@ def blackbox(
     """
     if not callable(function):
         raise ValueError(f"blackbox needs a function (features) -> Trace; got {function!r}")
-    declared = Declared(signals, dt, length)
+    declared = TraceForm(signals, dt, length)
     if vectorised and workers is not None:
         raise ValueError(
             f"blackbox runs either vectorised or in workers; got (vectorised=True, {workers=})"
@@ -331,7 +331,7 @@ def blackbox(
     return PooledBlackBox(simulation, Pool(simulation, function, workers, timeout, retries))
 
 
-def stacked(
+def stack_traces(
     signals: Mapping[str, Any],
     dt: float | None = None,
     times: Any = None,
@@ -357,7 +357,7 @@ def stacked(
     return trace
 
 
-def only(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
+def single_trace(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
     """The trace of the one simulation that was asked for.
 
     **Raises:** `TimeoutError` or `RuntimeError` with its message where there is none.

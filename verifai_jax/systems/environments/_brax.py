@@ -26,34 +26,34 @@ from verifai_jax.core.errors import (
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import System
-from verifai_jax.systems.environments.brax_parts import (
+from verifai_jax.systems.environments.brax_model import (
     Place,
-    check_read,
-    explained,
-    finer,
+    check_parts_are_read,
+    explain_errors,
     joint_place,
-    starting_at,
     system_place,
+    with_finer_step,
+    with_start,
     with_system,
     with_value,
 )
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
-    at_time,
     check_features,
     check_signals_option,
-    deciding,
-    folded,
-    period,
-    read,
+    features_at,
+    fold,
+    has_waveforms,
+    policy_function,
+    read_signals,
     rollout,
+    sampling_period,
     step_count,
-    varies,
     vector_action,
 )
 from verifai_jax.systems.ode.integrators import check_factor
-from verifai_jax.systems.structure import outline
+from verifai_jax.systems.pytree_checks import outline
 
 OLDEST = (0, 14)
 BACKENDS = ("generalized", "spring", "positional", "mjx")
@@ -94,7 +94,7 @@ class Brax(System):
         environment that is another model at another step (backends spring and positional).
         """
         check_factor(factor)
-        return replace(self, env=finer(self.env, factor, self.name))
+        return replace(self, env=with_finer_step(self.env, factor, self.name))
 
     def __call__(self, features: Any, key: Any = None) -> Trace:
         """Simulate one episode, not reset at its end."""
@@ -108,36 +108,38 @@ class Brax(System):
         Behind an early end the last valid sample comes again, until the last step.
         Returns the carry and the status.
         """
-        return folded(self._episode(features), key, carry, update)
+        return fold(self._episode(features), key, carry, update)
 
     def _episode(self, features: Any) -> Episode:
         """The environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
-        fixed = None if varies(features) else self._configured(features, 0.0)
+        fixed = None if has_waveforms(features) else self._configure(features, 0.0)
 
         def env_at(time: Any) -> Any:
-            return self._configured(features, time) if fixed is None else fixed
+            return self._configure(features, time) if fixed is None else fixed
 
         def start(key: Any) -> Moment:
-            env, now = env_at(0.0), at_time(features, 0.0)
+            env, now = env_at(0.0), features_at(features, 0.0)
             if callable(self.initial):
                 return _moment(self.initial(env, now, key), self.name)
             if self.initial:
-                env = starting_at(env, {place: now[name] for name, place in self.initial.items()})
-            with explained(self.env, self.name, "reset"):
+                env = with_start(env, {place: now[name] for name, place in self.initial.items()})
+            with explain_errors(self.env, self.name, "reset"):
                 return _moment(env.reset(key), self.name)
 
         def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
             env = env_at(time)
-            with explained(self.env, self.name, "step"):
+            with explain_errors(self.env, self.name, "step"):
                 return _moment(env.step(state, action), self.name)
 
         def see(time: Any, moment: Moment, action: Any) -> Any:
-            now = at_time(features, time)
-            return read(self.signals, moment, action, now, _named(moment.state), self.name)
+            now = features_at(features, time)
+            return read_signals(
+                self.signals, moment, action, now, _named_parts(moment.state), self.name
+            )
 
-        decide, size = deciding(self.policy, self.policy_memory), self.env.action_size
+        decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
 
         def fitting(observation: Any, memory: Any, key: Any) -> Any:
             action, memory = decide(observation, memory, key)
@@ -147,9 +149,9 @@ class Brax(System):
             self.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
         )
 
-    def _configured(self, features: Any, time: Any) -> Any:
+    def _configure(self, features: Any, time: Any) -> Any:
         """The environment under the features of an instant."""
-        now, env = at_time(features, time), self.env
+        now, env = features_at(features, time), self.env
         if self.features:
             sys = env.unwrapped.sys
             for name, place in self.features.items():
@@ -245,7 +247,7 @@ def brax(
     _check_version()
     if isinstance(env, str):
         name = env
-        env = _made(name, backend, dict(options or {}))
+        env = _make(name, backend, dict(options or {}))
     else:
         name = type(getattr(env, "unwrapped", env)).__name__
         if backend is not None or options:
@@ -258,9 +260,9 @@ def brax(
             dt = env.dt
         except AttributeError as error:
             raise ValueError(f"{name} has no dt: give dt=..., seconds of a step") from error
-    seconds = period(dt)
+    seconds = sampling_period(dt)
     check_signals_option(signals)
-    deciding(policy, policy_memory)
+    policy_function(policy, policy_memory)
     bindings = features if isinstance(features, Mapping) else {path: path for path in features}
     places = {feature: system_place(env, path, name) for feature, path in bindings.items()}
     starts = initial
@@ -271,7 +273,7 @@ def brax(
                 "State"
             )
         starts = {feature: joint_place(env, path, name) for feature, path in initial.items()}
-    check_read(env, name, places)
+    check_parts_are_read(env, name, places)
     return Brax(
         env=env,
         name=name,
@@ -304,7 +306,7 @@ def _check_version() -> None:
         )
 
 
-def _made(name: str, backend: str | None, options: dict[str, Any]) -> Any:
+def _make(name: str, backend: str | None, options: dict[str, Any]) -> Any:
     """An environment of Brax's own, by its name."""
     envs = _import("brax.envs")
     known = getattr(envs, "_envs", {})
@@ -314,7 +316,7 @@ def _made(name: str, backend: str | None, options: dict[str, Any]) -> Any:
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, BACKENDS)
         options["backend"] = backend
-    with explained(None, name, "construction", backend):
+    with explain_errors(None, name, "construction", backend):
         return envs.get_environment(name, **options)
 
 
@@ -351,7 +353,7 @@ def _moment(state: Any, name: str) -> Moment:
     return Moment(state, state.obs, state.reward, state.done)
 
 
-def _named(state: Any) -> dict[str, Any]:
+def _named_parts(state: Any) -> dict[str, Any]:
     """The parts of a brax State that have names of their own."""
     physics = getattr(state, "pipeline_state", None)
     parts = {part: getattr(physics, part, None) for part in ("q", "qd")}

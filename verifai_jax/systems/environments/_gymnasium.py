@@ -20,7 +20,12 @@ from verifai_jax.core.errors import check_names, require, suggests_options, unkn
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound, is_waveform
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
-from verifai_jax.systems.environments.episode import Moment, check_signals_option, period, read
+from verifai_jax.systems.environments.episode import (
+    Moment,
+    check_signals_option,
+    read_signals,
+    sampling_period,
+)
 
 # What environments compute once from their attributes, and would not follow a feature.
 DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
@@ -32,7 +37,7 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 
 @dataclass(eq=False)
-class EpisodeOf:
+class EpisodeFunction:
     """One episode of an environment as a function `(features, seed) -> Trace`.
 
     The environment is made once in each process, and does not travel to workers.
@@ -127,7 +132,7 @@ class EpisodeOf:
         for name in ("dt", "tau"):
             value = getattr(self.environment.unwrapped, name, None)
             if isinstance(value, int | float | np.number) and 0 < value < math.inf:
-                return period(value)
+                return sampling_period(value)
         return 1.0
 
     def _set(self, features: Mapping[str, Any], time: float) -> None:
@@ -156,7 +161,7 @@ class EpisodeOf:
 
     def _act(self, env: Any, observation: Any) -> Any:
         if self._decide is None:
-            self._decide = _deciding(self.policy)
+            self._decide = _policy_function(self.policy)
         action, space = self._decide(observation), env.action_space
         array = np.asarray(action)
         if hasattr(space, "n"):
@@ -178,7 +183,7 @@ class EpisodeOf:
     ) -> dict[str, np.ndarray]:
         now: Any = (env, _arrays(observation), np.asarray(reward, float), np.array(False))
         seen = Moment(*now)
-        samples = read(self.signals, seen, np.asarray(action), features, {}, self.name)
+        samples = read_signals(self.signals, seen, np.asarray(action), features, {}, self.name)
         # Copied: an environment may write its next observation into the same array.
         return {name: np.array(value) for name, value in samples.items()}
 
@@ -232,13 +237,15 @@ def gymnasium(
             raise unknown_name("environment of Gymnasium", env, package.registry)
     elif not callable(env):
         raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
-    _deciding(policy, compiled=False)
+    _policy_function(policy, compiled=False)
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
         raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
     check_signals_option(signals)
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
-    seconds = None if dt is None else period(dt)
-    episode = EpisodeOf(env, policy, steps, signals, dict(bindings), configure, reset, seconds)
+    seconds = None if dt is None else sampling_period(dt)
+    episode = EpisodeFunction(
+        env, policy, steps, signals, dict(bindings), configure, reset, seconds
+    )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
 
@@ -249,7 +256,7 @@ def _arrays(observation: Any) -> Any:
     return np.asarray(observation)
 
 
-def _deciding(policy: Any, compiled: bool = True) -> Callable[[Any], Any]:
+def _policy_function(policy: Any, compiled: bool = True) -> Callable[[Any], Any]:
     function = policy.act if callable(getattr(policy, "act", None)) else policy
     if not callable(function):
         raise ValueError(

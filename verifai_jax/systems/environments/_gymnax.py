@@ -30,20 +30,20 @@ from verifai_jax.systems.base import System
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
-    at_time,
     check_features,
     check_signals_option,
-    deciding,
-    folded,
-    inputs_used,
-    period,
-    read,
+    features_at,
+    fold,
+    has_waveforms,
+    policy_function,
+    read_signals,
     rollout,
+    sampling_period,
     step_count,
-    varies,
+    used_inputs,
     vector_action,
 )
-from verifai_jax.systems.structure import check_like, outline
+from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)
 
@@ -89,22 +89,22 @@ class Gymnax(System):
         Behind an early end the last valid sample comes again, until the last step.
         Returns the carry and the status.
         """
-        return folded(self._episode(features), key, carry, update)
+        return fold(self._episode(features), key, carry, update)
 
     def _episode(self, features: Any) -> Episode:
         """The environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
-        fixed = None if varies(features) else self._configured(features, 0.0)
+        fixed = None if has_waveforms(features) else self._configure(features, 0.0)
 
         def params_at(time: Any) -> Any:
-            return self._configured(features, time) if fixed is None else fixed
+            return self._configure(features, time) if fixed is None else fixed
 
         def start(key: Any) -> Moment:
             params = params_at(0.0)
             observation, state = self.env.reset_env(key, params)
             if self.initial is not None:
-                state = self._placed(state, at_time(features, 0.0), key)
+                state = self._initial_state(state, features_at(features, 0.0), key)
                 observation = self.env.observe(key, state, None, params)
             return Moment(state, observation, 0.0, False)
 
@@ -118,22 +118,22 @@ class Gymnax(System):
 
         def see(time: Any, moment: Moment, action: Any) -> Any:
             named = {n: v for n, v in _fields(moment.state).items() if n != "time"}
-            now = at_time(features, time)
-            return read(self.signals, moment, action, now, named, self.env.name)
+            now = features_at(features, time)
+            return read_signals(self.signals, moment, action, now, named, self.env.name)
 
-        decide = deciding(self.policy, self.policy_memory)
+        decide = policy_function(self.policy, self.policy_memory)
 
         def fitting(observation: Any, memory: Any, key: Any) -> Any:
             action, memory = decide(observation, memory, key)
-            return _fitted(action, self.env.action_space(self.params), self.env.name), memory
+            return _as_action(action, self.env.action_space(self.params), self.env.name), memory
 
         return Episode(
             self.env.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
         )
 
-    def _configured(self, features: Any, time: Any) -> Any:
+    def _configure(self, features: Any, time: Any) -> Any:
         """The environment's parameters under the features of an instant."""
-        now, params = at_time(features, time), self.params
+        now, params = features_at(features, time), self.params
         if self.features:
             fields = {field: now[name] for name, field in self.features.items()}
             params = params.replace(**fields)
@@ -150,7 +150,7 @@ class Gymnax(System):
                 )
         return params
 
-    def _placed(self, state: Any, features: Any, key: Any) -> Any:
+    def _initial_state(self, state: Any, features: Any, key: Any) -> Any:
         """The state to start from."""
         if not isinstance(self.initial, Mapping):
             assert self.initial is not None
@@ -260,9 +260,9 @@ def gymnax(
             )
     if dt is None:
         dt = fields[clocks[0]] if clocks else 1.0
-    seconds = period(dt)
+    seconds = sampling_period(dt)
     check_signals_option(signals)
-    deciding(policy, policy_memory)
+    policy_function(policy, policy_memory)
     _check_choices(policy, env.action_space(params), env.name)
     if isinstance(initial, Mapping):
         state = jax.eval_shape(env.reset_env, jax.eval_shape(lambda: jax.random.key(0)), params)[1]
@@ -303,7 +303,7 @@ def _check_choices(policy: Any, space: Any, name: str) -> None:
         raise ValueError(f"policy chooses one of {chosen} actions; {name} takes {space!r}")
 
 
-def _fitted(action: Any, space: Any, name: str) -> Array:
+def _as_action(action: Any, space: Any, name: str) -> Array:
     """A policy's output as an action of the space.
 
     **Raises:** `ValueError` for another shape, or numbers of another kind.
@@ -356,7 +356,7 @@ def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) ->
     def stops() -> bool:
         abstract, action, key = shapes
         values = [abstract[i] for i in moving]
-        used = inputs_used(tangents, values, values, abstract, action, key)
+        used = used_inputs(tangents, values, values, abstract, action, key)
         return bool(values) and not any(used[len(values) : 2 * len(values)])
 
     @jax.custom_jvp

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
-from verifai_jax.systems.horizon import checkpointed_scan
-from verifai_jax.systems.structure import check_like, check_signals, outline
+from verifai_jax.systems.checkpointing import checkpointed_scan
+from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 
 Time = Float[Array, ""]
 Decide = Callable[[Any, Any, Any], tuple[Any, Any]]
@@ -41,8 +41,8 @@ class Episode:
 
     - `start(key) -> Moment`
     - `step(time, state, action, key) -> Moment`: from the sample at `time` seconds to the next.
-    - `decide(observation, memory, key) -> (action, memory)`: see `deciding`.
-    - `see(time, moment, action) -> dict`: the samples of the signals.
+    - `decide(observation, memory, key) -> (action, memory)`: see `policy_function`.
+    - `signals(time, moment, action) -> dict`: the samples of the signals.
     - `steps`, `dt`: how many at most, and seconds between two samples.
     """
 
@@ -51,11 +51,11 @@ class Episode:
     step: Callable[..., Moment]
     decide: Decide
     memory: Any
-    see: Callable[..., Mapping[str, Any]]
+    signals: Callable[..., Mapping[str, Any]]
     steps: int
     dt: float
 
-    def after(self, time: Any, state: Any, action: Any, key: Any) -> Moment:
+    def next_moment(self, time: Any, state: Any, action: Any, key: Any) -> Moment:
         """The moment that a step leads to, `over` as a truth value."""
         moment = self.step(time, state, action, key)
         return moment._replace(over=jnp.asarray(moment.over, bool))
@@ -69,7 +69,7 @@ class _Keys(NamedTuple):
     decide: Key[Array, ""]
 
 
-def keys_of(key: Any) -> _Keys:
+def episode_keys(key: Any) -> _Keys:
     """The keys of one simulation; step `k` has `fold_in(keys.step, k)`, decision `k` likewise."""
     return _Keys(*jax.random.split(jax.random.key(0) if key is None else key, 3))
 
@@ -87,7 +87,7 @@ def rollout(episode: Episode, key: Any) -> Trace:
     return Trace(samples, dt=episode.dt, valid=age + 1, status=_status(last), held=True)
 
 
-def folded(
+def fold(
     episode: Episode, key: Any, carry: Any, update: Callable[[Any, Any], Any]
 ) -> tuple[Any, Int[Array, ""]]:
     """`carry = update(carry, sample)` over the samples of `rollout`, of which none is kept.
@@ -100,8 +100,8 @@ def folded(
 
 def _run(episode: Episode, key: Any, kept: Any, keep: Any) -> tuple[Moment, Any, Any, Any]:
     """The last moment, how many steps were lived, and what `keep` made of the samples."""
-    keys = keys_of(key)
-    first, memory = _settled(episode, episode.start(keys.start), keys)
+    keys = episode_keys(key)
+    first, memory = _first_moment(episode, episode.start(keys.start), keys)
 
     def sample(carry: Any, k: Any) -> Any:
         (moment, memory, age), kept = carry
@@ -110,10 +110,10 @@ def _run(episode: Episode, key: Any, kept: Any, keep: Any) -> tuple[Moment, Any,
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
         action, after = episode.decide(moment.observation, memory, decide_key)
-        kept, output = keep(kept, episode.see(time, moment, action))
+        kept, output = keep(kept, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
-        following = _cast(episode.after(time, state, action, step_key), moment)
+        following = _cast(episode.next_moment(time, state, action, step_key), moment)
         return (_where(frozen, carry[0], (following, after, age + 1)), kept), output
 
     # One iteration more than there are steps samples the end and moves nothing.
@@ -132,13 +132,13 @@ def _status(last: Moment) -> Int[Array, ""]:
     return jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
 
 
-def _settled(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:
+def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:
     """The first moment and memory in the types that they keep; refuses parts that do not fit."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
     memory = jax.tree.map(jnp.asarray, episode.memory)
     action, after = jax.eval_shape(episode.decide, first.observation, memory, keys.decide)
     check_like(after, memory, "policy", "(action, memory), its memory in the form of policy_memory")
-    following = jax.eval_shape(episode.after, jnp.zeros(()), first.state, action, keys.step)
+    following = jax.eval_shape(episode.next_moment, jnp.zeros(()), first.state, action, keys.step)
     if jax.tree.structure(first) != jax.tree.structure(following):
         raise ValueError(
             f"{episode.name}: a step must return a state in the form that the start has: "
@@ -160,11 +160,11 @@ def _settled(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]
         raise ValueError(
             f"{episode.name}: the reward must be one number; got {outline(first.reward)}"
         )
-    check_signals(jax.eval_shape(episode.see, jnp.zeros(()), first, action))
+    check_signals(jax.eval_shape(episode.signals, jnp.zeros(()), first, action))
     return first, memory
 
 
-def deciding(policy: Any, memory: Any = None) -> Decide:
+def policy_function(policy: Any, memory: Any = None) -> Decide:
     """A user's policy as `decide(observation, memory, key) -> (action, memory)`.
 
     **Arguments:**
@@ -182,7 +182,7 @@ def deciding(policy: Any, memory: Any = None) -> Decide:
     forms = f"({', '.join(given)}) or ({', '.join(given)}, key)"
     if not callable(function):
         raise ValueError(f"policy must be a function of {forms}; got {policy!r}")
-    needed = _required(function)
+    needed = _count_required(function)
     if needed is not None and not len(given) <= needed <= len(given) + 1:
         raise ValueError(f"policy must be a function of {forms}; got one of {needed} arguments")
     random = needed == len(given) + 1
@@ -199,7 +199,7 @@ def deciding(policy: Any, memory: Any = None) -> Decide:
     return decide
 
 
-def _required(function: Callable[..., Any]) -> int | None:
+def _count_required(function: Callable[..., Any]) -> int | None:
     """How many arguments it needs; None for one that does not say, or takes any number."""
     try:
         parameters = inspect.signature(function).parameters.values()
@@ -229,7 +229,7 @@ def vector_action(action: Any, size: int, name: str) -> Float[Array, " size"]:
     return jnp.reshape(action, (size,))
 
 
-def read(
+def read_signals(
     signals: Any, moment: Moment, action: Any, features: Any, named: Mapping[str, Any], name: str
 ) -> Any:
     """The samples of the signals that were asked for.
@@ -261,7 +261,7 @@ def read(
 
 
 def check_signals_option(signals: Any) -> None:
-    """Refuse a `signals=` option that `read` could not use.
+    """Refuse a `signals=` option that `read_signals` could not use.
 
     **Raises:** `ValueError`.
     """
@@ -320,12 +320,12 @@ def check_features(
             raise ValueError(f"feature {feature!r} changes nothing in {name}: bind it by {how}")
 
 
-def at_time(features: Any, time: Any) -> Any:
+def features_at(features: Any, time: Any) -> Any:
     """The same features, each waveform by its value at a time in seconds."""
     return jax.tree.map(lambda v: v(time) if is_waveform(v) else v, features, is_leaf=is_waveform)
 
 
-def varies(features: Any) -> bool:
+def has_waveforms(features: Any) -> bool:
     """Whether any of the features is a function of time."""
     return any(map(is_waveform, jax.tree.leaves(features, is_leaf=is_waveform)))
 
@@ -351,7 +351,7 @@ def step_count(
     return int(steps)
 
 
-def period(seconds: Any) -> float:
+def sampling_period(seconds: Any) -> float:
     """A sampling period, checked; one that comes from a float32 is the number that was meant."""
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():
@@ -363,7 +363,7 @@ def period(seconds: Any) -> float:
     return float(seconds)
 
 
-def inputs_used(function: Callable[..., Any], *arguments: Any) -> list[bool]:
+def used_inputs(function: Callable[..., Any], *arguments: Any) -> list[bool]:
     """For each leaf of the arguments, whether any result of the function depends on it.
 
     Abstract: nothing is computed or compiled.

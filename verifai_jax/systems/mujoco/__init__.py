@@ -1,6 +1,6 @@
 """MuJoCo models as systems, in MJX or in C."""
 
-from verifai_jax.systems.mujoco.bindings import scaled as scaled
+from verifai_jax.systems.mujoco.bindings import Scaled as Scaled
 from verifai_jax.systems.mujoco.system import MuJoCo as MuJoCo
 from verifai_jax.systems.mujoco.system import mjx as mjx
 from verifai_jax.systems.mujoco.system import mujoco as mujoco

@@ -2,7 +2,7 @@
 
     bind={"masspole": "body/pole/mass", "wind": "body/cart/force[0]", "x0": "joint/slider/qpos"}
     bind={"grip": ["geom/left/friction[0]", "geom/right/friction[0]"]}    # one feature, several
-    bind={"payload": scaled("body/torso/mass")}                           # times the model's value
+    bind={"payload": Scaled("body/torso/mass")}                           # times the model's value
 
 Everything here is pure JAX on one row of features; the native backend runs it on a batch.
 """
@@ -18,8 +18,12 @@ from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.waveform import is_waveform
-from verifai_jax.systems.mujoco.derived import Solids, bodies_of_geoms, rebuilt
-from verifai_jax.systems.mujoco.model import Model, Place, movable, place
+from verifai_jax.systems.mujoco.derived_constants import (
+    SolidBody,
+    bodies_of_geoms,
+    recompute_inertia,
+)
+from verifai_jax.systems.mujoco.model import Model, Place, free_centres_of_mass, place
 
 STATE = ("qpos", "qvel", "act")
 APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")
@@ -36,14 +40,12 @@ Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
 
 @dataclass(frozen=True)
 class Scaled:
-    """A place whose value is multiplied by the feature; made by `scaled`."""
+    """A place whose value the feature multiplies: at 1 the model's value stays as it is.
+
+    - `path`: of the place, as in `bind`: `"body/torso/mass"`.
+    """
 
     path: str
-
-
-def scaled(path: str) -> Scaled:
-    """Bind a feature as a factor: 1 leaves the model's value as it is."""
-    return Scaled(path)
 
 
 @dataclass(frozen=True)
@@ -57,16 +59,16 @@ class Binding:
 
 @dataclass(frozen=True, eq=False)
 class Bindings:
-    """All bindings of a system, sorted by what they set; made by `bindings`."""
+    """All bindings of a system, sorted by what they set; made by `resolve_bindings`."""
 
     model: Model
     parameters: tuple[Binding, ...]
     state: tuple[Binding, ...]
     applied: tuple[Binding, ...]
     # The bodies whose mass and inertia come from geoms that features change.
-    solids: tuple[Solids, ...]
+    solids: tuple[SolidBody, ...]
     # What a backend has made of the model, by whatever it depends on.
-    kept: dict[Any, Any] = field(default_factory=dict, repr=False)
+    models: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
     def all(self) -> tuple[Binding, ...]:
@@ -101,7 +103,7 @@ class Bindings:
         ]
         leaves = {name: jnp.asarray(self._base(name), _float()) for name in sorted(self.arrays)}
         leaves = _set(leaves, groups[0], features, self._base)
-        leaves = rebuilt(self.model.compiled, self.solids, leaves)
+        leaves = recompute_inertia(self.model.compiled, self.solids, leaves)
         before = leaves.get("body_mass")
         leaves = _set(leaves, groups[1], features, self._base)
         if before is not None:
@@ -121,7 +123,7 @@ class Bindings:
         }
         return _set(values, self.state, features, self._base)
 
-    def acting(
+    def applied_at(
         self, features: Mapping[str, Any], time: Float[Array, ""]
     ) -> dict[str, Float[Array, "..."]]:
         """Forces and controls that features apply from `time` on, by the array's name."""
@@ -170,7 +172,7 @@ class Bindings:
         return np.asarray(getattr(owner, name), np.float64)
 
 
-def bindings(model: Model, bind: Bound | None) -> Bindings:
+def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
     """Resolve the `bind` argument of a system.
 
     **Raises:** what `mujoco_model.place` raises; `ValueError` for two features on one number, or a
@@ -186,14 +188,14 @@ def bindings(model: Model, bind: Bound | None) -> Bindings:
                 group = "applied" if where.array in APPLIED else group
                 if isinstance(target, Scaled) and group != "parameters":
                     raise ValueError(
-                        f"scaled({path!r}): the model has no value there to multiply; bind it as "
+                        f"Scaled({path!r}): the model has no value there to multiply; bind it as "
                         "it is"
                     )
                 _claim(taken, where, feature)
                 sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
     parameters, state, applied = (tuple(group) for group in sorted_.values())
     solids = bodies_of_geoms(model, _rows(parameters, "geom_size", "geom_pos", "geom_quat"))
-    model = movable(model, _moving(model, parameters, solids))
+    model = free_centres_of_mass(model, _moving_bodies(model, parameters, solids))
     return Bindings(model, parameters, state, applied, solids)
 
 
@@ -207,7 +209,9 @@ def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
     }
 
 
-def _moving(model: Model, parameters: Iterable[Binding], solids: Iterable[Solids]) -> set[int]:
+def _moving_bodies(
+    model: Model, parameters: Iterable[Binding], solids: Iterable[SolidBody]
+) -> set[int]:
     """The bodies whose centre of mass or axes features move."""
     joints = _rows(parameters, "jnt_pos", "jnt_axis")
     placed = _rows(parameters, "geom_pos", "geom_quat")
@@ -249,43 +253,43 @@ def _float() -> Any:
     return jnp.result_type(float)
 
 
-class Watched(dict[str, Any]):
+class RecordingFeatures(dict[str, Any]):
     """Features that note which of them are read."""
 
-    def __init__(self, features: Mapping[str, Any], seen: set[str]) -> None:
+    def __init__(self, features: Mapping[str, Any], read: set[str]) -> None:
         super().__init__(features)
-        self.seen = seen
+        self.read = read
 
     def __getitem__(self, name: str) -> Any:
-        self.seen.add(name)
+        self.read.add(name)
         return super().__getitem__(name)
 
     def get(self, name: str, default: Any = None) -> Any:
         """As a dictionary's."""
         if name in self:
-            self.seen.add(name)
+            self.read.add(name)
         return super().get(name, default)
 
     def __contains__(self, name: object) -> bool:
         if super().__contains__(name):
-            self.seen.add(str(name))
+            self.read.add(str(name))
         return super().__contains__(name)
 
     def __iter__(self) -> Any:
-        self.seen.update(super().keys())
+        self.read.update(super().keys())
         return super().__iter__()
 
     def keys(self) -> Any:
         """As a dictionary's; whoever asks for all may read all."""
-        self.seen.update(super().keys())
+        self.read.update(super().keys())
         return super().keys()
 
     def values(self) -> Any:
         """As a dictionary's."""
-        self.seen.update(super().keys())
+        self.read.update(super().keys())
         return super().values()
 
     def items(self) -> Any:
         """As a dictionary's."""
-        self.seen.update(super().keys())
+        self.read.update(super().keys())
         return super().items()

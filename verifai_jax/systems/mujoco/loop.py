@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.systems.mujoco.bindings import Bindings, Watched
+from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Place, names, reading
-from verifai_jax.systems.structure import check_like, check_signals, outline
+from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 
 Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
@@ -49,7 +49,7 @@ class State(NamedTuple):
     actuator_length: Float[Array, " nu"]
 
 
-class Sampled(NamedTuple):
+class Sample(NamedTuple):
     """What one sample decides for the control period that begins there.
 
     - `inputs`: `ctrl`, and the forces that features apply.
@@ -61,8 +61,8 @@ class Sampled(NamedTuple):
     frozen: Bool[Array, ""]
 
 
-class Lived(NamedTuple):
-    """What goes from sample to sample beside the physics: memory, periods lived, all finite."""
+class Progress(NamedTuple):
+    """What goes from sample to sample beside the physics: memory, periods simulated, all finite."""
 
     memory: Any
     age: Int[Array, ""]
@@ -119,7 +119,7 @@ class Loop:
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals
         places = {}
-        hidden = list(self.bindings.model.hidden)
+        hidden = list(self.bindings.model.contact_sensors)
         for name, path in chosen.items():
             if callable(path):
                 continue
@@ -138,7 +138,7 @@ class Loop:
         return found
 
     @cached_property
-    def late(self) -> np.ndarray:
+    def delayed_sensors(self) -> np.ndarray:
         """Which of `sensordata` come from the last physics step."""
         late = np.zeros(self.compiled.nsensordata, bool)
         for i in range(self.compiled.nsensor):
@@ -165,34 +165,34 @@ class Loop:
             start[name] = jnp.asarray(value, start[name].dtype)
         return start
 
-    def lived(self) -> Lived:
+    def initial_progress(self) -> Progress:
         """Before the first sample."""
-        return Lived(
+        return Progress(
             jax.tree.map(jnp.asarray, self.controller_memory), jnp.int32(0), jnp.array(True)
         )
 
     def sample(
-        self, k: Int[Array, ""], arrays: Mapping[str, Array], lived: Lived, features: Features
-    ) -> tuple[Sampled, Lived]:
+        self, k: Int[Array, ""], arrays: Mapping[str, Array], progress: Progress, features: Features
+    ) -> tuple[Sample, Progress]:
         """Look at the state at sample `k`, and decide what happens until the next.
 
         `arrays`: of the state, those that `reads` names at least.
         """
-        time = lived.age.astype(jnp.result_type(float)) * self.control_period
+        time = progress.age.astype(jnp.result_type(float)) * self.control_period
         state, sensors = self.state(time, arrays)
-        ctrl, memory = self.control(state, lived.memory, features)
-        inputs = {"ctrl": ctrl, **self.bindings.acting(features, time)}
+        ctrl, memory = self.control(state, progress.memory, features)
+        inputs = {"ctrl": ctrl, **self.bindings.applied_at(features, time)}
         frozen = k >= self.periods
         if self.terminate is not None:
             frozen |= self.terminate(state, features)
-        signals = self.seen(state, sensors, inputs["ctrl"], features)
-        finite = lived.finite
+        signals = self.signal_values(state, sensors, inputs["ctrl"], features)
+        finite = progress.finite
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
             finite &= jnp.all(jnp.abs(value) <= HUGE)
-        after = Lived(memory, lived.age + 1, finite)
-        kept = Lived(lived.memory, lived.age, finite)
+        after = Progress(memory, progress.age + 1, finite)
+        kept = Progress(progress.memory, progress.age, finite)
         after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, kept)
-        return Sampled(inputs, signals, frozen), after
+        return Sample(inputs, signals, frozen), after
 
     def state(self, time: Array, arrays: Mapping[str, Array]) -> tuple[State, Array]:
         """The state as users see it, and all sensors. What is not given is zero."""
@@ -202,7 +202,7 @@ class Loop:
         }
         sensors = full["sensordata"]
         # Sensors that were added for contacts lie behind the model's own.
-        own = sensors[: self.compiled.nsensordata - len(self.bindings.model.hidden)]
+        own = sensors[: self.compiled.nsensordata - len(self.bindings.model.contact_sensors)]
         return State(time, **{**full, "sensordata": own}), sensors
 
     def control(self, state: State, memory: Any, features: Features) -> tuple[Any, Any]:
@@ -217,7 +217,9 @@ class Loop:
         control = jnp.asarray(control, state.time.dtype)
         return control.reshape(nu), memory
 
-    def seen(self, state: State, sensors: Array, ctrl: Array, features: Features) -> dict[str, Any]:
+    def signal_values(
+        self, state: State, sensors: Array, ctrl: Array, features: Features
+    ) -> dict[str, Any]:
         """The signals at one sample."""
         if callable(self.signals):
             return dict(self.signals(state.time, state, ctrl, features))
@@ -231,12 +233,12 @@ class Loop:
                 seen[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
         return seen
 
-    def vouched(self) -> tuple[str, ...]:
+    def finite_signals(self) -> tuple[str, ...]:
         """Signals that are parts of the state, whose finiteness is the state's."""
         parts = ("qpos", "qvel", "act", "ctrl")
         return tuple(name for name, place in self.places.items() if place.array in parts)
 
-    def reads(self, features: Features) -> frozenset[str]:
+    def arrays_read(self, features: Features) -> frozenset[str]:
         """The arrays of the state that something looks at."""
         fields = [name for name in State._fields if name != "time"]
         zero = jnp.zeros(())
@@ -276,14 +278,14 @@ class Loop:
         key = jax.eval_shape(lambda: jax.random.key(0))
 
         def everything(features: Features, key: Any) -> Any:
-            watched = Watched(features, used)
+            watched = RecordingFeatures(features, used)
             start = self.start(watched, key)
             state, sensors = self.state(jnp.zeros((), jnp.result_type(float)), start)
             memory = jax.tree.map(jnp.asarray, self.controller_memory)
             if self.controller is not None:
                 self._check_controller(state, memory, watched)
             control, _ = self.control(state, memory, watched)
-            signals = self.seen(state, sensors, control, watched)
+            signals = self.signal_values(state, sensors, control, watched)
             check_signals(signals)
             if self.terminate is not None:
                 ended = jnp.asarray(self.terminate(state, watched))

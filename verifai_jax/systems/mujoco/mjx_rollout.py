@@ -15,8 +15,8 @@ from jaxtyping import Array, Int
 
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.mujoco.bindings import Bindings
-from verifai_jax.systems.mujoco.derived import constants
-from verifai_jax.systems.mujoco.loop import Lived, Loop, Sampled
+from verifai_jax.systems.mujoco.derived_constants import recompute_constants
+from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
 from verifai_jax.systems.mujoco.model import mjx_module
 
 # What MJX decides once from the model's values, and features may change: it has to see that there
@@ -38,7 +38,7 @@ class Physics(NamedTuple):
 def rollout(loop: Loop, features: Any, key: Any) -> Trace:
     """Simulate once."""
     mjx = mjx_module()
-    model, blank = prepared(loop.bindings, features)
+    model, blank = prepare_model(loop.bindings, features)
     if not _is_one(loop.finer):
         model = model.tree_replace({"opt.timestep": model.opt.timestep / loop.finer})
     substeps = loop.substeps * loop.finer
@@ -49,10 +49,10 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         sensordata=blank.sensordata,
     )
 
-    lived = loop.lived()
+    progress = loop.initial_progress()
     arrays = {name: jnp.zeros(shape, physics.qpos.dtype) for name, shape in loop.shapes.items()}
-    form: Sampled = jax.eval_shape(
-        lambda: loop.sample(jnp.int32(0), arrays, lived, features)[0],
+    form: Sample = jax.eval_shape(
+        lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0],
     )
 
     def step(physics: Physics, time: Array, decide: Any) -> tuple[Physics, Any]:
@@ -62,16 +62,20 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         inputs, rest = decide(data)
         data = data.replace(**{name: v.reshape(getattr(data, name).shape) for name, v in inputs})
         data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-        data = solved(model, data) if data._impl.efc_J.size else data.replace(qacc=data.qacc_smooth)
+        data = (
+            solve_constraints(model, data)
+            if data._impl.efc_J.size
+            else data.replace(qacc=data.qacc_smooth)
+        )
         data = mjx.sensor_acc(model, data)
         moved = _integrator(mjx, model)(model, data)
         after = {name: getattr(moved, name) for name in Physics._fields}
         # Runge-Kutta evaluates the sensors at its inner stages too.
         return Physics(**{**after, "sensordata": data.sensordata}), rest
 
-    def sample(carry: tuple[Physics, Lived], k: Int[Array, ""]) -> Any:
-        before, lived = carry
-        time = lived.age.astype(before.qpos.dtype) * loop.control_period
+    def sample(carry: tuple[Physics, Progress], k: Int[Array, ""]) -> Any:
+        before, progress = carry
+        time = progress.age.astype(before.qpos.dtype) * loop.control_period
 
         def substep(carry: Any, j: Int[Array, ""]) -> Any:
             physics, sampled, after = carry
@@ -79,7 +83,7 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
             def decide(data: Any) -> Any:
                 def look() -> Any:
                     arrays = {name: getattr(data, name) for name in loop.shapes}
-                    return loop.sample(k, arrays, lived, features)
+                    return loop.sample(k, arrays, progress, features)
 
                 if _is_one(substeps):
                     decided = look()
@@ -92,31 +96,31 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
             return (physics, sampled, after), None
 
         blank_sample = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
-        begun = (before, blank_sample, lived)
+        begun = (before, blank_sample, progress)
         if isinstance(substeps, int):
-            (after, sampled, lived), _ = jax.lax.scan(substep, begun, jnp.arange(substeps))
+            (after, sampled, progress), _ = jax.lax.scan(substep, begun, jnp.arange(substeps))
         else:  # Traced: a loop without a derivative in reverse mode.
-            after, sampled, lived = jax.lax.fori_loop(
+            after, sampled, progress = jax.lax.fori_loop(
                 0, substeps, lambda j, carry: substep(carry, j)[0], begun
             )
         held = jax.tree.map(lambda new, old: jnp.where(sampled.frozen, old, new), after, before)
-        return (held, lived), sampled.signals
+        return (held, progress), sampled.signals
 
     # Reverse mode keeps the state at each sample, and does a control period again for what is
     # between: memory does not grow with the substeps.
-    (physics, lived), signals = jax.lax.scan(
+    (physics, progress), signals = jax.lax.scan(
         jax.checkpoint(sample, prevent_cse=False),
-        (physics, lived),
+        (physics, progress),
         jnp.arange(loop.periods + 1),
     )
     ends = loop.terminate is not None
     return Trace(
         signals,
         dt=loop.control_period,
-        valid=lived.age + 1 if ends else None,
-        status=jnp.where(lived.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
+        valid=progress.age + 1 if ends else None,
+        status=jnp.where(progress.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
         held=ends,
-        finite=loop.vouched(),
+        finite=loop.finite_signals(),
     )
 
 
@@ -125,15 +129,15 @@ def _is_one(count: Any) -> bool:
 
 
 @jax.custom_jvp
-def _attached(value: Array, other: Array) -> Array:
+def _with_derivative_of(value: Array, other: Array) -> Array:
     """`value`, with the derivative of `other`; which is not even computed without derivatives."""
     return value
 
 
-_attached.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
+_with_derivative_of.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
 
 
-def solved(model: Any, data: Any) -> Any:
+def solve_constraints(model: Any, data: Any) -> Any:
     """The data after MJX's constraint solver, with derivatives in forward and in reverse mode.
 
     The accelerations minimise a convex cost, so their derivative is that of one Newton step from
@@ -152,13 +156,13 @@ def solved(model: Any, data: Any) -> Any:
     zero = jnp.zeros_like(residual)
     curved = jax.lax.stop_gradient(here).replace(Ma=residual, qfrc_constraint=zero)
     step = update(constant_newton, constant.replace(qfrc_smooth=zero), curved).Mgrad
-    qacc = _attached(found.qacc, -step)
+    qacc = _with_derivative_of(found.qacc, -step)
     there = create(newton, start.replace(qacc=qacc), grad=False)
     return data.tree_replace(
         {
             "qacc": qacc,
-            "qfrc_constraint": _attached(found.qfrc_constraint, there.qfrc_constraint),
-            "_impl.efc_force": _attached(found._impl.efc_force, there.efc_force),
+            "qfrc_constraint": _with_derivative_of(found.qfrc_constraint, there.qfrc_constraint),
+            "_impl.efc_force": _with_derivative_of(found._impl.efc_force, there.efc_force),
         }
     )
 
@@ -169,12 +173,12 @@ def _solver() -> tuple[Any, Any]:
     return solver.Context.create, solver._update_gradient
 
 
-def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
+def prepare_model(bindings: Bindings, features: Any) -> tuple[Any, Any]:
     """The MJX model of one row of features, and blank MJX data.
 
     **Raises:** `NotImplementedError` for a model that MJX cannot do.
     """
-    model, blank = _put(bindings)
+    model, blank = _mjx_model(bindings)
     if not bindings.arrays:
         return model, blank
     leaves = bindings.leaves(features)
@@ -186,15 +190,15 @@ def prepared(bindings: Bindings, features: Any) -> tuple[Any, Any]:
         changes[name] = value.reshape(old.shape).astype(old.dtype)
     model = model.tree_replace(changes)
     if bindings.moves_constants:
-        model = constants(model)
+        model = recompute_constants(model)
     return model, blank
 
 
-def _put(bindings: Bindings) -> tuple[Any, Any]:
+def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
     """The model as it is compiled, on the device, in the present precision; made once."""
     mjx = mjx_module()
     precision = bool(jax.config.read("jax_enable_x64"))
-    if precision not in bindings.kept:
+    if precision not in bindings.models:
         compiled = copy.copy(bindings.model.compiled)
         for binding in bindings.parameters:
             array, where = binding.place.array, binding.place.index
@@ -206,14 +210,14 @@ def _put(bindings: Bindings) -> tuple[Any, Any]:
         # Constants of every program that is traced, so never traced themselves.
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(compiled, impl="jax")
-            bindings.kept[precision] = (model, mjx.make_data(model))
-    return bindings.kept[precision]
+            bindings.models[precision] = (model, mjx.make_data(model))
+    return bindings.models[precision]
 
 
 def why_not(bindings: Bindings) -> str | None:
     """Why MJX cannot simulate a model; None where it can."""
     try:
-        _put(bindings)
+        _mjx_model(bindings)
     except NotImplementedError as error:
         return f"MJX cannot do this model: {error}"
     compiled = bindings.model.compiled
@@ -240,7 +244,7 @@ def _integrator(mjx: Any, model: Any) -> Any:
 
 def reverse_hint(compiled: Any) -> str | None:
     """Why reverse mode does not work on a model, and what makes it work; None where it does."""
-    if compiled.opt.integrator != 1 or not constrained(compiled):  # 1: Runge-Kutta
+    if compiled.opt.integrator != 1 or not has_constraints(compiled):  # 1: Runge-Kutta
         return None
     return (
         "MJX solves constraints in a loop of unknown length, which has no reverse-mode derivative "
@@ -248,7 +252,7 @@ def reverse_hint(compiled: Any) -> str | None:
     )
 
 
-def constrained(compiled: Any) -> bool:
+def has_constraints(compiled: Any) -> bool:
     """Whether a model can have active constraints: contacts, limits, friction, equalities."""
     data = mjx_module().make_data(compiled, impl="jax")
     return bool(data._impl.efc_J.size)

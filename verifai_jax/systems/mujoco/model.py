@@ -103,7 +103,7 @@ class Model:
 
     compiled: Any
     spec: Any = None
-    hidden: tuple[str, ...] = ()
+    contact_sensors: tuple[str, ...] = ()
 
 
 def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
@@ -141,7 +141,7 @@ def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> 
     return Model(compiled, spec, tuple(f"__contact{k}" for k in range(len(contacts))))
 
 
-def movable(model: Model, bodies: Collection[int]) -> Model:
+def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
     """The same model, in which the centre of mass of these bodies can move away from their origin.
 
     MuJoCo leaves out parts of the mass matrix that are zero as compiled ("simple" bodies).

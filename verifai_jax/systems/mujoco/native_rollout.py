@@ -20,7 +20,7 @@ import numpy as np
 
 from verifai_jax.core.errors import require
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.systems.mujoco.loop import Lived, Loop, Sampled
+from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
 
 BLOCK = 64  # Rows whose policy is evaluated together.
 HALVED = 64  # Rows from which two halves are worth their overhead.
@@ -55,15 +55,15 @@ class Native:
                 for number, part in enumerate(_split(size))
             ]
             first, others = parts[0], parts[1:]
-            first.look(0)
+            first.observe(0)
             for k in range(self.loop.periods + 1):
                 for part in others:
-                    part.look(k)
-                first.go()
+                    part.observe(k)
+                first.advance()
                 if k < self.loop.periods:
-                    first.look(k + 1)
+                    first.observe(k + 1)
                 for part in others:
-                    part.go()
+                    part.advance()
         trace = self._trace([part.results() for part in parts])
         return jax.tree.map(lambda leaf: leaf[:count], trace)
 
@@ -76,7 +76,7 @@ class Native:
                 lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf)[1:], _kind(leaf)), features
             )
             self.loop.check(one)
-            self.programs[key] = _Program(self.loop, self.loop.reads(one))
+            self.programs[key] = _Program(self.loop, self.loop.arrays_read(one))
         return self.programs[key]
 
     def batch(self, size: int, number: int) -> Any:
@@ -109,7 +109,7 @@ class Native:
             valid=1 if ends else None,
             status=0,
             held=ends,
-            finite=self.loop.vouched(),
+            finite=self.loop.finite_signals(),
         )
         leaves = [*signals.values(), *([(age + 1).astype(np.int32)] if ends else []), status]
         return jax.tree.unflatten(jax.tree.structure(form), leaves)
@@ -140,7 +140,9 @@ class _Program:
             needed = 2
         return needed
 
-    def _sample(self, k: Any, packed: Any, lived: Lived, features: Any) -> tuple[Sampled, Lived]:
+    def _sample(
+        self, k: Any, packed: Any, progress: Progress, features: Any
+    ) -> tuple[Sample, Progress]:
         parts = jnp.split(packed, np.cumsum(self.sizes)[:-1])
         arrays = {
             name: part.reshape(self.loop.shapes[name])
@@ -148,13 +150,13 @@ class _Program:
         }
         if "sensordata" in arrays:
             # Before the first step there is no acceleration yet.
-            unknown = (k == 0) & self.loop.late
+            unknown = (k == 0) & self.loop.delayed_sensors
             arrays["sensordata"] = jnp.where(unknown, 0.0, arrays["sensordata"])
-        return self.loop.sample(k, arrays, lived, features)
+        return self.loop.sample(k, arrays, progress, features)
 
 
 class _Results(NamedTuple):
-    """Signals `[n, time, ...]`, and by row: periods lived, all finite, refused by MuJoCo."""
+    """Signals `[n, time, ...]`, and by row: periods simulated, all finite, refused by MuJoCo."""
 
     signals: dict[str, np.ndarray]
     age: np.ndarray
@@ -195,27 +197,27 @@ class _Part:
             self.batch.forward(stage=program.stage)
         dtype = np.float64 if jax.config.read("jax_enable_x64") else np.float32
         self.packed = np.zeros((count, sum(program.sizes)), dtype)
-        self.lived = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.lived()
+        self.progress = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.loop.initial_progress()
         )
         self.refused = require("mujoco.batch", extra="mujoco").SimulationError
         self.samples: list[dict[str, Any]] = []
         self.sampled: Any = None
 
-    def look(self, k: int) -> None:
+    def observe(self, k: int) -> None:
         """Start to evaluate the policy on the state at sample `k`."""
         start = 0
         for view, size in zip(self.views, self.program.sizes, strict=True):
             self.packed[:, start : start + size] = view.reshape(len(view), size)
             start += size
-        self.sampled, self.lived = self.program.sample(
-            np.int32(k), self.packed, self.lived, self.features
+        self.sampled, self.progress = self.program.sample(
+            np.int32(k), self.packed, self.progress, self.features
         )
 
-    def go(self) -> None:
+    def advance(self) -> None:
         """Step to the next sample what has not ended, under the control that was decided."""
         self.samples.append(self.sampled.signals)
-        ended = np.asarray(self.sampled.frozen) | ~np.asarray(self.lived.finite)
+        ended = np.asarray(self.sampled.frozen) | ~np.asarray(self.progress.finite)
         for name, value in self.sampled.inputs.items():
             self.batch.bind(name)[...] = np.asarray(value).reshape(self.batch.bind(name).shape)
         going = self.alive & ~self.failed & ~ended
@@ -237,7 +239,7 @@ class _Part:
             name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
             for name in self.samples[0]
         }
-        age, finite = np.asarray(self.lived.age), np.asarray(self.lived.finite)
+        age, finite = np.asarray(self.progress.age), np.asarray(self.progress.finite)
         return _Results(signals, age, finite, self.failed)
 
 

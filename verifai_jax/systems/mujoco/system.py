@@ -21,9 +21,9 @@ from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import System
-from verifai_jax.systems.mujoco.bindings import Bound, bindings
+from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
-from verifai_jax.systems.mujoco.mjx_rollout import constrained, reverse_hint, rollout, why_not
+from verifai_jax.systems.mujoco.mjx_rollout import has_constraints, reverse_hint, rollout, why_not
 from verifai_jax.systems.mujoco.model import load
 from verifai_jax.systems.mujoco.native_rollout import Native
 from verifai_jax.systems.ode.integrators import check_factor
@@ -66,7 +66,7 @@ class MuJoCo(System):
         Without anything for a constraint solver to do, MJX measured three times native's speed
         (a cart-pole); with a contact a seventh of it (a ball).
         """
-        return "native" if constrained(self.loop.compiled) else "mjx"
+        return "native" if has_constraints(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
         """Why an engine cannot simulate this model; None where it can."""
@@ -126,7 +126,7 @@ class MuJoCo(System):
 
         def trace(features: Any) -> Trace:
             zeros = {name: jnp.zeros(shape) for name, shape in loop.shapes.items()}
-            sampled, lived = loop.sample(jnp.int32(0), zeros, loop.lived(), features)
+            sampled, progress = loop.sample(jnp.int32(0), zeros, loop.initial_progress(), features)
             signals = {
                 name: jnp.broadcast_to(value, (loop.periods + 1, *value.shape))
                 for name, value in sampled.signals.items()
@@ -135,10 +135,10 @@ class MuJoCo(System):
             return Trace(
                 signals,
                 dt=loop.control_period,
-                valid=lived.age if ends else None,
+                valid=progress.age if ends else None,
                 status=jnp.int32(0),
                 held=ends,
-                finite=loop.vouched(),
+                finite=loop.finite_signals(),
             )
 
         return jax.eval_shape(trace, features)
@@ -188,7 +188,7 @@ def mujoco(
     - `duration`: in seconds, a multiple of `control_period`.
     - `control_period`: seconds between two runs of the controller, a multiple of the model's
       timestep, and the sampling period of the trace. Control and forces are held in between.
-    - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `scaled(path)`
+    - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `Scaled(path)`
       for a factor on the model's value, or a list of these. See docs/mujoco.md for all paths.
     - `controller(time, state, features) -> control`: `[nu]`, or one number for one actuator;
       `state` is a `mujoco_loop.State`.
@@ -233,7 +233,7 @@ def mujoco(
     loaded = load(model, contacts, iterations=solver_iterations, ls_iterations=ls_iterations)
     timestep = float(loaded.compiled.opt.timestep)
     loop = Loop(
-        bindings=bindings(loaded, bind),
+        bindings=resolve_bindings(loaded, bind),
         controller=controller,
         controller_memory=controller_memory,
         initial=initial,

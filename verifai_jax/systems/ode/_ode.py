@@ -21,13 +21,13 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import System
-from verifai_jax.systems.horizon import checkpointed_scan
+from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor, integrator
-from verifai_jax.systems.structure import (
+from verifai_jax.systems.pytree_checks import (
+    as_floating,
     check_like,
     check_signals,
     default_signals,
-    floating,
     outline,
 )
 
@@ -77,7 +77,7 @@ class Ode(System):
         Only a waveform without a duration is given that of the simulation.
         """
         features = bound(features, self.duration)
-        return _Rollout(self, features).trace(floating(self.initial(features, key), "initial"))
+        return _Rollout(self, features).trace(as_floating(self.initial(features, key), "initial"))
 
     def fold(
         self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
@@ -89,7 +89,7 @@ class Ode(System):
         """
         features = bound(features, self.duration)
         rollout = _Rollout(self, features)
-        return rollout.folded(floating(self.initial(features, key), "initial"), carry, update)
+        return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class _Rollout:
     def trace(self, state: Any) -> Trace:
         loop = self.loop
         memory = jax.tree.map(jnp.asarray, loop.controller_memory)
-        vouched = self.check(state, memory)
+        finite = self.check(state, memory)
         last, age, _, samples = self.run(state, memory, None, lambda _, seen: (None, seen))
         ends = loop.terminate is not None
         return Trace(
@@ -111,10 +111,10 @@ class _Rollout:
             valid=age + 1 if ends else None,
             status=_status(last),
             held=ends,
-            finite=vouched,
+            finite=finite,
         )
 
-    def folded(self, state: Any, carry: Any, update: Any) -> Any:
+    def fold(self, state: Any, carry: Any, update: Any) -> Any:
         memory = jax.tree.map(jnp.asarray, self.loop.controller_memory)
         self.check(state, memory)
         last, _, carry, _ = self.run(state, memory, carry, lambda c, seen: (update(c, seen), None))
@@ -126,10 +126,10 @@ class _Rollout:
 
         def sample(carry: Any, k: Int[Array, ""]) -> Any:
             (state, memory, held, age), kept = carry
-            time, frozen = self.now(k, age, state)
+            time, frozen = self.clock(k, age, state)
             control, next_memory = self.decide(k, age, time, state, memory, held)
-            seen = self.seen(time, state, control)
-            next_state = self.step(time, self.safe(frozen, state, start), control)
+            seen = self.signals(time, state, control)
+            next_state = self.step(time, self.safe_state(frozen, state, start), control)
             applied = None if held is None else control
             following = (next_state, next_memory, applied, age + 1)
             after = _where(frozen, (state, memory, applied, age), following)
@@ -167,7 +167,7 @@ class _Rollout:
         # What has ended earlier keeps the control that it ended with.
         return _where(age < k, (held, memory), (control, next_memory))
 
-    def now(
+    def clock(
         self, k: Int[Array, ""], age: Int[Array, ""], state: Any
     ) -> tuple[Time, Bool[Array, ""]]:
         """Time in seconds at sample `k`, and whether the state stays as it is from here on."""
@@ -179,7 +179,7 @@ class _Rollout:
         ended = self.loop.terminate(state, self.features)
         return age.astype(_dtype(state)) * self.loop.dt, over | ended
 
-    def safe(self, frozen: Bool[Array, ""], state: Any, start: Any) -> Any:
+    def safe_state(self, frozen: Bool[Array, ""], state: Any, start: Any) -> Any:
         """A state at which the dynamics may be evaluated.
 
         A frozen state may lie where the dynamics have no finite slope (an emptied tank), and in
@@ -195,7 +195,7 @@ class _Rollout:
             return loop.controller(time, state, self.features), memory
         return loop.controller(time, state, memory, self.features)
 
-    def seen(self, time: Time, state: Any, control: Any) -> Any:
+    def signals(self, time: Time, state: Any, control: Any) -> Any:
         if self.loop.signals is None:
             return default_signals(state, control)
         return self.loop.signals(time, state, control, self.features)
@@ -244,12 +244,12 @@ class _Rollout:
             lambda control: loop.dynamics(time, state, control, self.features), control
         )
         check_like(slope, state, "dynamics", "the state's slope, in the form of the state")
-        parts, vouched = jax.tree.leaves(state), []
+        parts, finite = jax.tree.leaves(state), []
 
         def seen(control: Any) -> Any:
-            signals = self.seen(time, state, control)
+            signals = self.signals(time, state, control)
             if isinstance(signals, Mapping):
-                vouched.extend(n for n, v in signals.items() if any(v is part for part in parts))
+                finite.extend(n for n, v in signals.items() if any(v is part for part in parts))
             return signals
 
         check_signals(jax.eval_shape(seen, control))
@@ -257,7 +257,7 @@ class _Rollout:
             ended = jax.eval_shape(loop.terminate, state, self.features)
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
                 raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
-        return tuple(vouched)
+        return tuple(finite)
 
 
 def _status(last: Any) -> Int[Array, ""]:

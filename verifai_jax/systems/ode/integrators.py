@@ -3,7 +3,7 @@
     step = integrator("rk4")
     state = step(slope, time, state, dt)                 # slope(time, state) -> d state / d time
 
-The state is any pytree of floating-point arrays.
+The state is any pytree of as_floating-point arrays.
 """
 
 from collections.abc import Callable

@@ -21,7 +21,13 @@ from typing import Any, ClassVar, Self
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Trace
 from verifai_jax.systems.base import Outcome, System
-from verifai_jax.systems.blackbox._blackbox import Declared, Names, only, plain_leaves, seed_of
+from verifai_jax.systems.blackbox._blackbox import (
+    SignalNames,
+    TraceForm,
+    plain_leaves,
+    seed_of,
+    single_trace,
+)
 from verifai_jax.systems.remote import wire
 from verifai_jax.systems.remote.connection import Batch, Rules
 from verifai_jax.systems.remote.server import Server
@@ -72,7 +78,7 @@ class Remote(System):
 
         **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
         """
-        return only(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
+        return single_trace(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
 
     def simulate_each(
         self, features: Sequence[Any], seeds: Sequence[int]
@@ -129,7 +135,7 @@ def remote(
     timeout: float | None = 60.0,
     retries: int = 1,
     patience: float | None = None,
-    signals: Names | None = None,
+    signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
     most_bytes: int = MOST_BYTES,
@@ -173,7 +179,7 @@ def remote(
             f"host {host!r} is open to other machines, and whoever connects answers for the "
             "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
         )
-    declared = Declared(signals, dt, length)
+    declared = TraceForm(signals, dt, length)
     return Remote(host, port, Rules(token, timeout, retries, patience, most_bytes, declared))
 
 

@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from verifai_jax.systems.blackbox._blackbox import Declared
+from verifai_jax.systems.blackbox._blackbox import TraceForm
 from verifai_jax.systems.remote import wire
 
 GREETING_SECONDS = 10.0
@@ -35,7 +35,7 @@ class Rules:
     retries: int
     patience: float | None
     most_bytes: int
-    declared: Declared
+    declared: TraceForm
 
 
 @dataclass(eq=False)

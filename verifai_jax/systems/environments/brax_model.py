@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.core.errors import UnknownNameError, require, unknown_name
-from verifai_jax.systems.environments.episode import inputs_used
+from verifai_jax.systems.environments.episode import used_inputs
 
 # Arrays of MuJoCo by the beginnings of their names, and what their rows are called after.
 _ROWS = {
@@ -41,7 +41,7 @@ class Place(NamedTuple):
 
 
 @contextlib.contextmanager
-def explained(env: Any, name: str, what: str, backend: str | None = None) -> Iterator[None]:
+def explain_errors(env: Any, name: str, what: str, backend: str | None = None) -> Iterator[None]:
     """Say which environment, backend and versions an error within Brax belongs to."""
     try:
         with warnings.catch_warnings():
@@ -189,14 +189,14 @@ def with_system(env: Any, sys: Any) -> Any:
     return other
 
 
-def finer(env: Any, factor: int, name: str) -> Any:
+def with_finer_step(env: Any, factor: int, name: str) -> Any:
     """A copy of the environment with a `factor` times smaller step of its physics.
 
     **Raises:** `ValueError` for one whose physics is another at another step.
     """
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
-        other.env = finer(other.env, factor, name)
+        other.env = with_finer_step(other.env, factor, name)
         return other
     frames, backend = getattr(other, "_n_frames", None), getattr(other, "_backend", None)
     if frames is None or not hasattr(getattr(other, "sys", None), "opt"):
@@ -212,11 +212,11 @@ def finer(env: Any, factor: int, name: str) -> Any:
     return other
 
 
-def starting_at(env: Any, values: Mapping[Place, Any]) -> Any:
+def with_start(env: Any, values: Mapping[Place, Any]) -> Any:
     """A copy whose reset starts from these entries of `q` and `qd`, and observes what they give."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
-        other.env = starting_at(other.env, values)
+        other.env = with_start(other.env, values)
         return other
     begin = other.pipeline_init
 
@@ -232,7 +232,7 @@ def starting_at(env: Any, values: Mapping[Place, Any]) -> Any:
     return other
 
 
-def check_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
+def check_parts_are_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
     """Refuse a part of the system that neither reset nor step looks at: it would change nothing.
 
     Each backend reads its own copies of masses, gains and the like.
@@ -252,11 +252,11 @@ def check_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
         for place, value in zip(places.values(), values, strict=True):
             changed = _replaced(changed, place.parts, value)
         played = with_system(env, changed)
-        with explained(env, name, "reset and step"):
+        with explain_errors(env, name, "reset and step"):
             return jax.tree.leaves(played.step(played.reset(key), action))
 
     values = [leaf(place) for place in places.values()]
-    used = inputs_used(play, values, jax.random.key(0), jnp.zeros(env.action_size))
+    used = used_inputs(play, values, jax.random.key(0), jnp.zeros(env.action_size))
     for (feature, place), read_at_all in zip(places.items(), used, strict=False):
         if not read_at_all:
             raise ValueError(

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from verifai_jax.systems.mujoco.mjx_rollout import prepared
+from verifai_jax.systems.mujoco.mjx_rollout import prepare_model
 from verifai_jax.systems.mujoco.system import mujoco as model
 
 # Bodies with one geom and with several, all kinds of joints and solids, two kinds of tendons.
@@ -107,7 +107,7 @@ def system():
 def in_jax(system):
     with jax.enable_x64():
         values = {name: jnp.asarray(value) for name, value in VALUES.items()}
-        constants = jax.jit(lambda values: prepared(system.loop.bindings, values)[0])
+        constants = jax.jit(lambda values: prepare_model(system.loop.bindings, values)[0])
         # It runs once: a quick compilation is worth more than a quick program.
         quick = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
         return constants.lower(values).compile(compiler_options=quick)(values)

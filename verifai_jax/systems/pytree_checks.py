@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 
-def floating(tree: Any, origin: str) -> Any:
-    """The same pytree with every leaf an array of one common floating-point dtype.
+def as_floating(tree: Any, origin: str) -> Any:
+    """The same pytree with every leaf an array of one common as_floating-point dtype.
 
     **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is no real
     number.

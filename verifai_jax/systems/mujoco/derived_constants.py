@@ -1,10 +1,10 @@
-"""What follows from a MuJoCo model's masses and geometry, recomputed where features change them.
+"""Constants of a MuJoCo model that follow from its masses and geometry, for changed features.
 
-- `rebuilt`: mass, centre and inertia of bodies whose geoms change, at constant density (or at the
-  mass that a geom states); for both backends.
-- `constants`: what `mj_setConst` computes and MJX reads: `body_subtreemass`, `body_invweight0`,
-  `dof_invweight0`, `tendon_length0`, `tendon_invweight0`, `actuator_acc0` and `geom_rbound`, in
-  JAX. The native backend calls `mj_setConst` itself.
+- `recompute_inertia`: mass, centre and inertia of bodies whose geoms change, at constant density
+  (or at the mass that a geom states); for both backends.
+- `recompute_constants`: the constants that `mj_setConst` computes and MJX reads:
+  `body_subtreemass`, `body_invweight0`, `dof_invweight0`, `tendon_length0`, `tendon_invweight0`,
+  `actuator_acc0` and `geom_rbound`, in JAX. The native backend calls `mj_setConst` itself.
 """
 
 import math
@@ -26,7 +26,7 @@ Leaves = dict[str, Float[Array, "..."]]
 
 
 @dataclass(frozen=True)
-class Solids:
+class SolidBody:
     """A body that is made of its geoms.
 
     - `geoms`: their numbers; `kinds`: their MuJoCo types.
@@ -41,7 +41,7 @@ class Solids:
     densities: tuple[float, ...]
 
 
-def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[Solids, ...]:
+def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[SolidBody, ...]:
     """The bodies whose inertia comes from their geoms, among those with a `changed` geom.
 
     A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
@@ -69,13 +69,13 @@ def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[Solids, ...
                 parts.append((g, int(compiled.geom_type[g]), mass, float(geoms[g].density)))
         if not parts:
             continue
-        solid = Solids(body, *(tuple(column) for column in zip(*parts, strict=True)))  # pyright: ignore[reportArgumentType]
+        solid = SolidBody(body, *(tuple(column) for column in zip(*parts, strict=True)))  # pyright: ignore[reportArgumentType]
         _check_solid(compiled, solid)
         solids.append(solid)
     return tuple(solids)
 
 
-def _check_solid(compiled: Any, solid: Solids) -> None:
+def _check_solid(compiled: Any, solid: SolidBody) -> None:
     """Refuse what does not come out as MuJoCo compiled it."""
     name = compiled.body(solid.body).name
     advice = f"give body {name!r} an <inertial>, which then stays as it is"
@@ -87,7 +87,7 @@ def _check_solid(compiled: Any, solid: Solids) -> None:
     names = ("geom_size", "geom_pos", "geom_quat", "body_mass", "body_inertia", "body_ipos")
     with jax.enable_x64():
         leaves = {n: jnp.asarray(getattr(compiled, n)) for n in (*names, "body_iquat")}
-        again = jax.jit(lambda leaves: rebuilt(compiled, (solid,), leaves))(leaves)
+        again = jax.jit(lambda leaves: recompute_inertia(compiled, (solid,), leaves))(leaves)
     same = np.allclose(again["body_mass"], compiled.body_mass, rtol=1e-6) and np.allclose(
         np.sort(again["body_inertia"][solid.body]),
         np.sort(compiled.body_inertia[solid.body]),
@@ -100,7 +100,7 @@ def _check_solid(compiled: Any, solid: Solids) -> None:
         )
 
 
-def rebuilt(compiled: Any, solids: Collection[Solids], leaves: Leaves) -> Leaves:
+def recompute_inertia(compiled: Any, solids: Collection[SolidBody], leaves: Leaves) -> Leaves:
     """The leaves with mass, centre and inertia of the `solids` as their geoms have them."""
     leaves = dict(leaves)
     for solid in solids:
@@ -110,7 +110,7 @@ def rebuilt(compiled: Any, solids: Collection[Solids], leaves: Leaves) -> Leaves
                 solid.geoms, solid.kinds, solid.masses, solid.densities, strict=True
             )
         ]
-        mass, centre, inertia, quat = parts[0] if len(parts) == 1 else _together(parts)
+        mass, centre, inertia, quat = parts[0] if len(parts) == 1 else _combine(parts)
         for name, value in (
             ("body_mass", mass),
             ("body_ipos", centre),
@@ -166,7 +166,7 @@ def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
     return (jnp.sum(squares) - squares) / (5 if kind == _ELLIPSOID else 3)
 
 
-def _together(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
+def _combine(parts: list[Any]) -> tuple[Array, Array, Array, Array]:
     masses, places = (jnp.stack([part[i] for part in parts]) for i in range(2))
     mass = jnp.sum(masses)
     centre = masses @ places / mass
@@ -209,7 +209,7 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     return best / jnp.linalg.norm(best)
 
 
-def constants(model: Any) -> Any:
+def recompute_constants(model: Any) -> Any:
     """An MJX model with the constants that `mj_setConst` computes from its other leaves.
 
     Source: MuJoCo, engine_setconst.c (set0 and setFixed); see "Computation: Model" in its manual.

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.systems.horizon import LONG, checkpointed_scan
+from verifai_jax.systems.checkpointing import MAX_PLAIN_STEPS, checkpointed_scan
 
 
 def step(carry, k):
@@ -25,7 +25,7 @@ def test_is_one_scan(length):
 
     outputs, gradient = jax.jit(lambda: ends(lambda s: checkpointed_scan(step, s, length)))()
     wanted, slope = jax.jit(lambda: ends(lambda s: jax.lax.scan(step, s, jnp.arange(length))))()
-    assert (length > LONG) == (length != 5)
+    assert (length > MAX_PLAIN_STEPS) == (length != 5)
     np.testing.assert_array_equal(outputs["k"], np.arange(length))
     np.testing.assert_allclose(outputs["carry"], wanted["carry"], rtol=1e-6)
     np.testing.assert_allclose(gradient, slope, rtol=1e-5)

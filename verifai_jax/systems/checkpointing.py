@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-LONG = 512
+MAX_PLAIN_STEPS = 512
 """Steps up to which a scan is left whole: the way back then costs no second simulation."""
 
 
@@ -25,9 +25,9 @@ def checkpointed_scan(
 
     Forward results are those of one scan.
     """
-    if length <= LONG:
+    if length <= MAX_PLAIN_STEPS:
         return jax.lax.scan(step, carry, jnp.arange(length), unroll=unroll)
-    each = _segment(length)
+    each = _segment_length(length)
     whole = length // each * each
 
     @jax.checkpoint
@@ -42,7 +42,7 @@ def checkpointed_scan(
     return carry, jax.tree.map(lambda a, b: jnp.concatenate([a, b]), outputs, rest)
 
 
-def _segment(length: int) -> int:
+def _segment_length(length: int) -> int:
     """A segment near the root of the length, that divides it if one does."""
     root = math.isqrt(length)
     divisors = [n for n in range(root // 2, 2 * root) if length % n == 0]
