@@ -2,14 +2,15 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help falsify test test-slow lint notebooks bench policy wheel clean
+.PHONY: help falsify test test-all lint notebooks notebooks-update bench policy wheel clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
-	@echo "make test       set up, then run the tests"
-	@echo "make test-slow  the tests marked slow"
+	@echo "make test       set up, then run the tests of every room (5 minutes on two cores)"
+	@echo "make test-all   these and the slow ones: parity, statistics, training (40 minutes)"
 	@echo "make lint       ruff and pyright"
-	@echo "make notebooks  execute the notebooks"
+	@echo "make notebooks  execute the notebooks; their text must be what is stored"
+	@echo "make notebooks-update  execute the notebooks and store what they show"
 	@echo "make bench      measure; see benchmarks/RESULTS.md"
 	@echo "make policy     train the networks again from their seeds (the hopper: 7 minutes)"
 
@@ -36,12 +37,14 @@ help:
 falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
-# Tests of one file share what they compile, so a file stays with one worker.
-test: .venv/installed
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+# Tests of one file share what they compile, so a file stays with one worker; long files begin.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test-slow: .venv/installed
-	$(BIN)/python -m pytest -m slow
+test: .venv/installed
+	$(PYTEST)
+
+test-all: .venv/installed
+	$(PYTEST) -m "slow or not slow"
 
 lint: .venv/lint
 	$(BIN)/ruff check .
@@ -50,6 +53,9 @@ lint: .venv/lint
 
 notebooks: .venv/installed
 	$(BIN)/python notebooks/execute.py
+
+notebooks-update: .venv/installed
+	$(BIN)/python notebooks/execute.py --update
 
 # The monitors to compare with pin old versions of what others use newer ones of, so they get an
 # environment of their own, without the constraints.

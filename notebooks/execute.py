@@ -1,10 +1,12 @@
-"""Execute the notebooks and fail when a cell does; `--write` keeps the outputs.
+"""Execute the notebooks, and compare what they print with what is stored in them.
 
-python notebooks/execute.py                         # all, as CI does
-python notebooks/execute.py --write 01_falsify_cartpole.ipynb
+python notebooks/execute.py                                     # all, as CI does
+python notebooks/execute.py 01_falsify_cartpole.ipynb           # one
+python notebooks/execute.py --update 01_falsify_cartpole.ipynb  # store the new outputs
 """
 
 import argparse
+import copy
 import sys
 import time
 from pathlib import Path
@@ -14,36 +16,58 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+
+from outputs import differences  # noqa: E402 - beside this file, wherever it is called from
 
 
-def execute(path: Path, write: bool) -> bool:
-    """Run one notebook from the root of the checkout; returns whether every cell succeeded."""
-    notebook = nbformat.read(path, as_version=4)
+def execute(path: Path, update: bool) -> bool:
+    """Execute one notebook from the root of the checkout, and check or store its outputs.
+
+    **Arguments:**
+
+    - `path`: the notebook.
+    - `update`: store the outputs, instead of comparing them with those stored.
+
+    **Returns:** True where every cell succeeded and, unless they are stored, all outputs agree.
+    """
+    stored = nbformat.read(path, as_version=4)
+    notebook = copy.deepcopy(stored)
     started = time.perf_counter()
     client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": HERE.parent}})
     try:
         client.execute()
     except CellExecutionError as error:
-        print(f"{path.name}: FAILED\n{error}", file=sys.stderr)
+        print(f"{path.name}: a cell FAILED\n{error}", file=sys.stderr)
         return False
-    print(f"{path.name}: {time.perf_counter() - started:.0f} s")
-    if write:
+    print(f"{path.name}: {time.perf_counter() - started:.0f} s", flush=True)
+    if update:
         for cell in notebook.cells:
             # When a cell ran and on which kernel is noise in a diff.
             cell.metadata.pop("execution", None)
         nbformat.write(notebook, path)
-    return True
+        return True
+    different = differences(stored, notebook)
+    for difference in different:
+        print(f"{path.name}, {difference}", file=sys.stderr)
+    if different:
+        print(
+            f"{path.name}: {len(different)} outputs differ from the stored ones; where that is "
+            f"right, python notebooks/execute.py --update {path.name}",
+            file=sys.stderr,
+        )
+    return not different
 
 
 def main() -> None:
-    """Run the notebooks named on the command line, or all."""
+    """Execute the notebooks named on the command line, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("notebooks", nargs="*", type=Path)
-    parser.add_argument("--write", action="store_true", help="keep the outputs in the file")
+    parser.add_argument("--update", action="store_true", help="store the outputs in the files")
     options = parser.parse_args()
     paths = [HERE / path.name for path in options.notebooks] or sorted(HERE.glob("*.ipynb"))
-    done = [execute(path, options.write) for path in paths]
-    sys.exit(0 if all(done) else 1)
+    results = [execute(path, options.update) for path in paths]
+    sys.exit(0 if all(results) else 1)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,17 @@
+"""Settings of all tests: no compile cache, checked annotations, memory given back between files."""
+
+import gc
 import os
+import resource
+import sys
+from collections.abc import Iterator
+from typing import Any
 
 # Tests measure what the code compiles, not what an earlier session left behind.
 os.environ.setdefault("VERIFAI_JAX_CACHE", "off")
 
 import matplotlib
+import pytest
 from jaxtyping import install_import_hook
 
 matplotlib.use("Agg")
@@ -14,3 +22,55 @@ CHECKED_ROOMS: list[str] = ["estimation"]
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")
 
 import verifai_jax  # noqa: E402, F401 - before any test starts JAX's backend, as users should
+
+LONG_FILES: tuple[str, ...] = ()
+"""Test files that take longest, the longest first: what begins last must be short."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first, so that two workers end at nearly the same time."""
+    order = {name: place for place, name in enumerate(LONG_FILES)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_given_back(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Free the programs that a file has compiled: the next one compiles others."""
+    yield
+    jax = sys.modules.get("jax")
+    if jax is None:
+        return
+    specs = [module for name, module in sys.modules.items() if name.startswith("specs")]
+    for module in (request.module, *specs):
+        for value in vars(module).values():
+            if isinstance(value, verifai_jax.Problem):
+                value.engines.clear()
+    jax.clear_caches()
+    gc.collect()
+
+
+def peak_memory() -> float:
+    """Return the peak resident memory of this process so far, in GB."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+
+
+PEAKS: list[float] = []
+"""Peak memory of each worker that has ended, in GB."""
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Send a worker's peak memory to the main process."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["peak_memory"] = peak_memory()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: Any) -> None:
+    """Receive a worker's peak memory."""
+    PEAKS.append(getattr(node, "workeroutput", {}).get("peak_memory", 0.0))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print the peak memory, in GB, of the process that ran tests and needed most."""
+    terminalreporter.write_line(f"peak memory of a worker: {max(PEAKS or [peak_memory()]):.1f} GB")
