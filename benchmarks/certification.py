@@ -19,7 +19,7 @@ import numpy as np
 
 from verifai_jax.certification import certify, race
 from verifai_jax.certification.allocation import Allocation
-from verifai_jax.statistics.confidence_sequences import bounded, verdict
+from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 PROFILES = {
     "facts": np.r_[0, 0, 0.004, 0.035, 0.299, 0.357, np.linspace(0.05, 0.9, 58)],
@@ -95,7 +95,9 @@ def verdicts_of(rates, random, p, budget, draw_of=bernoulli, samples=512):
             failures[arm] += draw(arm, count)
             simulations[arm] += count
     pairs = zip(failures, simulations, strict=True)
-    return [verdict(bounded(k, n, 0.95, len(rates)), p) for k, n in pairs], simulations
+    return [
+        verdict(simultaneous_interval(k, n, 0.95, len(rates)), p) for k, n in pairs
+    ], simulations
 
 
 def count_wrong(name, rates, runs, p, draw_of=bernoulli):

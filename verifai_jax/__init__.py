@@ -56,14 +56,14 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
-    from verifai_jax.statistics.binomial import Decided as Decided
     from verifai_jax.statistics.binomial import Rate as Rate
-    from verifai_jax.statistics.binomial import Within as Within
-    from verifai_jax.statistics.binomial import at_any_time as at_any_time
     from verifai_jax.statistics.binomial import clopper_pearson as clopper_pearson
     from verifai_jax.statistics.binomial import (
         simulations_without_failure as simulations_without_failure,
     )
+    from verifai_jax.statistics.confidence_sequences import anytime_interval as anytime_interval
+    from verifai_jax.statistics.stopping import Decided as Decided
+    from verifai_jax.statistics.stopping import Within as Within
     from verifai_jax.sweeps import Halving as Halving
     from verifai_jax.sweeps import OptunaSampler as OptunaSampler
     from verifai_jax.sweeps import Study as Study
@@ -156,12 +156,14 @@ _NAMES = {
         "Rulebook",
     ),
     "statistics.binomial": (
-        "Decided",
         "Rate",
-        "Within",
-        "at_any_time",
         "clopper_pearson",
         "simulations_without_failure",
+    ),
+    "statistics.confidence_sequences": ("anytime_interval",),
+    "statistics.stopping": (
+        "Decided",
+        "Within",
     ),
     "sweeps": (
         "Halving",

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
-from verifai_jax.mtl.clauses import ABSENT, CLAUSES
+from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Observations, Search
 from verifai_jax.systems.base import as_system
 from verifai_jax.systems.blackbox._blackbox import plain_leaves

@@ -129,7 +129,7 @@ def test_refusals():
     table = judged(x=[1.0, 1.0])
     with pytest.raises(ValueError, match="nothing varies among 2 rows of 'table': x has one value"):
         coverage(table)
-    with pytest.raises(ValueError, match="cells must be a whole number of at least 2; got 1"):
+    with pytest.raises(ValueError, match="cells must be an integer of at least 2; got 1"):
         coverage(judged(x=[1.0, 2.0]), cells=1)
 
 

@@ -74,7 +74,7 @@ def test_starts_where_told():
     assert diverse(frame, 3, start=4).rows[0] == 4
     with pytest.raises(IndexError, match="row 3 is not among the 40 counterexamples of table"):
         diverse(frame, 3, start=3)
-    with pytest.raises(ValueError, match="k must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="k must be an integer of at least 1; got 0"):
         diverse(frame, 0)
 
 

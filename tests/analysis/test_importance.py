@@ -88,7 +88,7 @@ def test_refusals():
         "learn from; robustness: it is 1 in every row",
     ):
         importance(failing_table(100).assign(rho=1.0, violated=False))
-    with pytest.raises(ValueError, match="repeats must be a whole number of at least 2"):
+    with pytest.raises(ValueError, match="repeats must be an integer of at least 2"):
         importance(failing_table(100), repeats=1)
 
 

@@ -106,9 +106,9 @@ def test_random_rows():
 
 def test_refused():
     frame = table("mixed")
-    with pytest.raises(ValueError, match="k must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="k must be an integer of at least 1; got 0"):
         k_closest(frame, 0)
-    with pytest.raises(ValueError, match=r"k must be a whole number of at least 1; got 2.5"):
+    with pytest.raises(ValueError, match=r"k must be an integer of at least 1; got 2.5"):
         random_rows(frame, 2.5, 0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(UnknownNameError, match=r"unknown feature 'y'.*Known: x, a, b"):
         nearest(frame, {"x": 1.0, "a": "p", "b": True})

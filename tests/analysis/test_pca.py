@@ -176,7 +176,7 @@ def test_refused():
         pca(frame, columns=["alg"])
     with pytest.raises(ValueError, match=r"from 1 to 3, the lesser of 3 rows and 4 .*got 4"):
         pca(frame, components=4)
-    with pytest.raises(ValueError, match="components must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="components must be an integer of at least 1; got 0"):
         pca(frame, components=0)
     with pytest.raises(ValueError, match="spread must be positive and finite; got -1"):
         pca(frame).generate(0, 3, spread=-1)

@@ -163,7 +163,7 @@ def test_refused(monkeypatch):
         recurrent(frame, columns=["speed"])
     with pytest.raises(ValueError, match="minimum is a share, above 0 and at most 1; got 5"):
         recurrent(frame, minimum=5)
-    with pytest.raises(ValueError, match="size must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="size must be an integer of at least 1; got 0"):
         recurrent(frame, size=0)
     with pytest.raises(ValueError, match="against must be 'auto', 'table' or 'prior'; got 'safe'"):
         recurrent(frame, against="safe")  # pyright: ignore[reportArgumentType]

@@ -217,7 +217,7 @@ def test_refusals():
         rules(table)
     with pytest.raises(ValueError, match="held_out must lie between 0 and 1; got 1"):
         rules(table, held_out=1)
-    with pytest.raises(ValueError, match="depth must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="depth must be an integer of at least 1; got 0"):
         rules(table, depth=0)
     with pytest.raises(ValueError, match="the table is empty"):
         rules(table.iloc[:0])

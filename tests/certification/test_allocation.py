@@ -6,7 +6,7 @@ from scipy.stats import beta
 
 from verifai_jax.certification import race
 from verifai_jax.certification.allocation import Allocation, standing
-from verifai_jax.statistics.confidence_sequences import bounded, verdict
+from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 # Failure rates of 64 policies: the six of `facts` that reached full return, the others worse.
 FACTS = np.concatenate([[0, 0, 0.004, 0.035, 0.299, 0.357], np.linspace(0.05, 0.9, 58)])
@@ -87,7 +87,9 @@ def certified(rates, run, p, budget=40_000):
     assert simulations.sum() <= budget
     assert (simulations >= 256).all()
     pairs = zip(failures, simulations, strict=True)
-    return [verdict(bounded(k, n, 0.95, len(rates)), p) for k, n in pairs], simulations
+    return [
+        verdict(simultaneous_interval(k, n, 0.95, len(rates)), p) for k, n in pairs
+    ], simulations
 
 
 def wrong(verdicts, rates, p):

@@ -297,7 +297,7 @@ def test_it_reads_well(certificates):
         ({"budget": 100}, "5 policies with 512 samples each need a budget of at least 2560"),
         ({"attack": "gradient"}, "attack 'gradient' follows gradients"),
         ({"attack": "portfolio"}, "use one of uniform, halton"),
-        ({"tie": 2}, "tie must lie between 0 and 1; got 2"),
+        ({"tie": 2}, "tie must be in \\[0, 1\\); got 2"),
     ],
 )
 def test_refuses(options, told):

@@ -113,7 +113,7 @@ def test_errors_in_one_line(call, tmp_path):
         (("specs/drift.py:safe", "--only", "raet"), "did you mean 'rate'"),
         (("specs/drift.py:safe", "--only", "rate"), "noise has none"),
         (("--resume", "nowhere"), "Error: no sweep to go on with in nowhere"),
-        (("specs/drift.py:safe", "--samples", 0), "samples must be a whole number"),
+        (("specs/drift.py:safe", "--samples", 0), "samples must be an integer"),
     ):
         output = call(*arguments, code=1)
         assert told in output

@@ -6,9 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, genpareto
 
-from verifai_jax.estimation import simulations_until, upper_bound
 from verifai_jax.estimation.intervals import skewed_interval, tail_index, weighted_mean
-from verifai_jax.statistics.binomial import simulations_without_failure
+from verifai_jax.statistics.binomial import (
+    simulations_until,
+    simulations_without_failure,
+    upper_bound,
+)
 
 
 @given(st.integers(1, 3000), st.data(), st.sampled_from([0.9, 0.95, 0.99]))

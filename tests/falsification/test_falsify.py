@@ -100,7 +100,7 @@ def test_stops_after_counterexamples_at_once(problem):
     before_last = run.table.all.iloc[: run.simulations - 16]
     assert before_last["violated"].sum() < 5
     # How many were simulated depends on the outcomes, so no binomial interval holds.
-    assert run.failure_rate == vj.at_any_time(len(run.table.counterexamples), run.simulations)
+    assert run.failure_rate == vj.anytime_interval(len(run.table.counterexamples), run.simulations)
     assert "whenever stopped" in run.summary()
 
 

@@ -70,7 +70,7 @@ class TestConstraints:
             (lambda f: None, "one truth value; got NoneType"),
             (
                 lambda f: f["x"] > 2,
-                "accepted none of 65536 samples of the space, so fewer than 0.0046 %.*95 %",
+                "accepted none of 65536 samples of the space, so fewer than 0.00457 %.*95 %",
             ),
         ],
     )

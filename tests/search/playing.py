@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.landscapes import LANDSCAPES
-from verifai_jax.mtl.clauses import ABSENT, CLAUSES
+from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Observations
 
 SEEDS = 25

@@ -7,13 +7,14 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import beta
 
-from verifai_jax.statistics.binomial import at_any_time, clopper_pearson
+from verifai_jax.statistics.binomial import clopper_pearson
 from verifai_jax.statistics.confidence_sequences import (
     ATOM,
-    bounded,
+    anytime_interval,
     evidence_above,
     evidence_below,
-    needed,
+    required_evidence,
+    simultaneous_interval,
     verdict,
 )
 
@@ -50,22 +51,22 @@ def test_evidence_is_monotone_in_the_rate_on_its_side(evidence):
 
 
 def test_the_interval_ends_where_the_evidence_suffices():
-    rate = bounded(6, 900, 0.9, among=10)
-    limit = needed(0.9, 10)
+    rate = simultaneous_interval(6, 900, 0.9, among=10)
+    limit = required_evidence(0.9, 10)
     assert limit == pytest.approx(np.log(200))
     assert evidence_below(6, 900, rate.high) == pytest.approx(limit, abs=1e-6)
     assert evidence_above(6, 900, rate.low) == pytest.approx(limit, abs=1e-6)
     assert rate.low < 6 / 900 < rate.high
     assert rate.at_any_time
     assert rate.confidence == 0.9
-    assert bounded(0, 10).low == 0.0
-    assert bounded(10, 10).high == 1.0
+    assert simultaneous_interval(0, 10).low == 0.0
+    assert simultaneous_interval(10, 10).high == 1.0
 
 
 def test_the_interval_is_honest_but_not_much_wider_than_needed():
     # No interval for all times can be narrower than the exact one for one time.
     for k, n in [(0, 768), (3, 512), (40, 512)]:
-        exact, ours = clopper_pearson(k, n), bounded(k, n)
+        exact, ours = clopper_pearson(k, n), simultaneous_interval(k, n)
         assert ours.low <= exact.low
         assert exact.high <= ours.high
     # Without a failure: ln(1 / ATOM) / p more samples than the exact bound, and far fewer than
@@ -75,10 +76,10 @@ def test_the_interval_is_honest_but_not_much_wider_than_needed():
     def least(interval):
         return bisect.bisect_left(range(3000), True, lo=300, key=lambda n: interval(n).high < p)
 
-    ours = least(lambda n: bounded(0, n, 0.95, among=32))
+    ours = least(lambda n: simultaneous_interval(0, n, 0.95, among=32))
     exact = int(np.ceil(np.log(0.025 / 32) / np.log1p(-p)))
     assert 0 <= ours - exact <= 1 + np.log(1 / ATOM) / p
-    assert ours + 200 < least(lambda n: at_any_time(0, n, 1 - 0.05 / 32))
+    assert ours + 200 < least(lambda n: anytime_interval(0, n, 1 - 0.05 / 32))
 
 
 @pytest.mark.parametrize("q", [0.0, 0.004, 0.05])
@@ -86,7 +87,7 @@ def test_looking_again_and_again_the_intervals_miss_as_rarely_as_they_say(q):
     random = np.random.default_rng(0)
     looks = np.arange(8, 1500, 8)
     failures = np.cumsum(random.binomial(8, q, (1000, len(looks))), axis=1)
-    limit = needed(0.9, 1)
+    limit = required_evidence(0.9, 1)
     if q == 0:
         assert (evidence_above(0, looks, 1e-12) < limit).all()
         return
@@ -100,10 +101,10 @@ def test_looking_again_and_again_the_intervals_miss_as_rarely_as_they_say(q):
 
 
 def test_verdicts():
-    assert verdict(bounded(0, 2000), 0.01) == "safe@0.01"
-    assert verdict(bounded(0, 100), 0.01) == "undecided"
-    assert verdict(bounded(50, 500), 0.01) == "unsafe"
-    assert verdict(bounded(50, 500), 0.25) == "safe@0.25"
+    assert verdict(simultaneous_interval(0, 2000), 0.01) == "safe@0.01"
+    assert verdict(simultaneous_interval(0, 100), 0.01) == "undecided"
+    assert verdict(simultaneous_interval(50, 500), 0.01) == "unsafe"
+    assert verdict(simultaneous_interval(50, 500), 0.25) == "safe@0.25"
     assert verdict(None, 0.01) == "undecided"
 
 
@@ -113,9 +114,9 @@ def test_verdicts():
         ((5, 4), "failures=5, simulations=4"),
         ((0, 0), "at least one simulation"),
         ((0, 4, 1.0), "confidence must lie between 0 and 1; got 1.0"),
-        ((0, 4, 0.9, 0), "among must be at least 1; got 0"),
+        ((0, 4, 0.9, 0), "among must be an integer of at least 1; got 0"),
     ],
 )
 def test_bounds_refuse(arguments, told):
     with pytest.raises(ValueError, match=told):
-        bounded(*arguments)
+        simultaneous_interval(*arguments)

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from verifai_jax.statistics.least_distance import least_change, uphill
+from verifai_jax.statistics.least_distance import least_change
+from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.optimize import least
 from verifai_jax.synthesis.parametric import Pairs
 
@@ -47,7 +48,7 @@ def test_least_change_is_the_nearest(size):
 def test_uphill_beats_every_corner_and_stays_inside(size):
     p, n, seed = size
     theta, _, rho, slopes = drawn(p, n, seed)
-    step = uphill(theta, rho, slopes, 0.2, free=np.ones(p, bool), bounded=True)
+    step = max_min_step(theta, rho, slopes, 0.2, free=np.ones(p, bool), bounded=True)
     assert (abs(step) <= 0.2 + 1e-9).all()
     assert (theta + step >= -1e-9).all()
     assert (theta + step <= 1 + 1e-9).all()
@@ -60,7 +61,7 @@ def test_uphill_beats_every_corner_and_stays_inside(size):
 def test_coordinates_that_are_not_free_stay():
     theta, nominal, rho, slopes = drawn(3, 2, 1)
     free = np.array([True, False, True])
-    assert uphill(theta, rho, slopes, 0.2, free=free, bounded=True)[1] == 0
+    assert max_min_step(theta, rho, slopes, 0.2, free=free, bounded=True)[1] == 0
     step = least_change(theta, nominal, rho, slopes, -9.0, free=free, bounded=True)
     np.testing.assert_allclose(step, np.where(free, nominal - theta, 0))
 
@@ -68,7 +69,7 @@ def test_coordinates_that_are_not_free_stay():
 def test_no_slope_no_step():
     flat = np.zeros((2, 3))
     theta = np.full(3, 0.5)
-    assert not uphill(theta, np.ones(2), flat, 0.2, free=np.ones(3, bool), bounded=True).any()
+    assert not max_min_step(theta, np.ones(2), flat, 0.2, free=np.ones(3, bool), bounded=True).any()
     found = least_change(theta, theta, -np.ones(2), flat, 0, free=np.ones(3, bool), bounded=True)
     assert found is None
 

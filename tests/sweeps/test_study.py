@@ -135,9 +135,9 @@ def test_a_combination_is_not_refused_as_long_as_some_company_is_right():
 def test_parts_of_a_wrong_kind():
     for wrong, message in (
         (lambda: study(p=0.0), "p must lie between 0 and 1"),
-        (lambda: study(seeds=0), "seeds must be a whole number of at least 1"),
+        (lambda: study(seeds=0), "seeds must be an integer of at least 1"),
         (lambda: study(seeds=(1, 1)), "training seeds must be different"),
-        (lambda: study(snapshots=(0,)), "a snapshot must be a whole number of at least 1"),
+        (lambda: study(snapshots=(0,)), "a snapshot must be an integer of at least 1"),
         (lambda: study(problem=drifting().untrained_problem()), "must be a function from a policy"),
         (lambda: study(curve="always retrun >= 3"), "did you mean 'return'"),
         (lambda: Trainer(Point(), {}), "at least one algorithm"),

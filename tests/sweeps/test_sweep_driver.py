@@ -364,7 +364,7 @@ def test_a_budget_is_for_all_policies():
 def test_options_are_refused_first(monkeypatch):
     monkeypatch.setattr(driver, "Lessons", None)
     for how, error, told in (
-        ({"configurations": 0}, ValueError, "configurations must be a whole number of at least 1"),
+        ({"configurations": 0}, ValueError, "configurations must be an integer of at least 1"),
         ({"confidence": 1.0}, ValueError, "confidence must lie between 0 and 1"),
         ({"max_seconds": 0}, ValueError, "max_seconds must be positive"),
         ({"search": "halten"}, UnknownNameError, "did you mean 'halton'"),
@@ -372,7 +372,7 @@ def test_options_are_refused_first(monkeypatch):
         ({"search": 3}, TypeError, "search must be a name, a Search or an OptunaSampler; got 3"),
         ({"halving": 3}, TypeError, "halving must be a Halving; got 3"),
         ({"sampels": 3}, UnknownNameError, "did you mean 'samples'"),
-        ({"seed": -1}, ValueError, "seed must be a whole number of at least 0; got -1"),
+        ({"seed": -1}, ValueError, "seed must be an integer of at least 0; got -1"),
         ({"attack": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
         ({"attack": "gradient"}, ValueError, "follows gradients"),
     ):

@@ -15,10 +15,11 @@ from jaxtyping import Float
 
 from verifai_jax.analysis.data.cells import cut, occupied
 from verifai_jax.analysis.data.marginals import Marginal, marginals
-from verifai_jax.analysis.data.samples import Samples, whole
+from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.holes import MOST_TREE, alike, largest_hole
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.lazy import late
-from verifai_jax.core.text import format_features
+from verifai_jax.core.text import format_features, format_percent
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,8 +79,8 @@ class Coverage:
         what = "pairs of cells" if len(self.table) > 1 else "cells"
         share, uniform = self.occupied, float(np.nanmean(self.table[expected].to_numpy(float)))
         lines = [
-            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {100 * share:.0f} % of "
-            f"all {what} ({100 * uniform:.0f} % if they were uniform), "
+            f"{len(self.samples):,} rows of {self.samples.name!r} lie in {format_percent(share)} "
+            f"of all {what} ({format_percent(uniform)} if they were uniform), "
             + _evenness(self.discrepancy)
         ]
         if self.hole is not None:
@@ -92,7 +93,9 @@ class Coverage:
         shares = self.table["occupied"].to_numpy(float)
         if shares.min() < 1:
             worst = self.table.index[int(shares.argmin())]
-            lines.append(f"least covered feature: {worst}, {100 * shares.min():.0f} % of its cells")
+            lines.append(
+                f"least covered feature: {worst}, {format_percent(shares.min())} of its cells"
+            )
         if self.untried_count:
             shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
             more = self.untried_count - len(shown)
@@ -126,7 +129,7 @@ def coverage(
 
     **Raises:** `ValueError` for no rows, no feature that varies, or fewer than 2 cells.
     """
-    cells = whole(cells, "cells", 2)
+    cells = check_count("cells", cells, 2)
     samples = Samples.of(source, "all")
     samples = _varying(samples)
     generator = np.random.default_rng(seed)

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, distances, whole
+from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, distances
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -87,7 +88,7 @@ def diverse(
     `IndexError` for a start that is not among the rows.
     """
     samples = Samples.of(source, which, columns, space)
-    k = min(whole(k, "k"), len(samples))
+    k = min(check_count("k", k), len(samples))
     place = samples.worst
     if start is not None:
         place = int(samples.frame.index.get_indexer(np.array([start]))[0])

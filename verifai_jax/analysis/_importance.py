@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.analysis.data.samples import Samples, whole
+from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.lazy import late
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def importance(
     **Raises:** `ValueError` for no rows, or where neither failing nor the robustness can be
     learned.
     """
-    repeats = whole(repeats, "repeats", 2)
+    repeats = check_count("repeats", repeats, 2)
     samples = Samples.of(source, "all")
     matrix, groups = _encoded(samples)
     names = [column.name for column in (*samples.ordered, *samples.unordered)]

@@ -22,8 +22,10 @@ import numpy as np
 from jaxtyping import Float, Int, Key
 
 from verifai_jax.analysis.data.columns import feature_columns
-from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, generator, whole
+from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, generator
+from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -111,9 +113,8 @@ class Components:
         """
         import pandas as pd
 
-        whole(n, "the number of samples", least=0)
-        if not (np.isfinite(spread) and spread > 0):
-            raise ValueError(f"spread must be positive and finite; got {spread!r}")
+        check_count("the number of samples", n, 0)
+        check_positive("spread", spread, finite=True)
         rng = generator(seed)
         found, donors = self._features(self._draw(rng, n, spread))
         for turn in range(_REDRAWS + 1):
@@ -197,7 +198,8 @@ class Components:
             ]
             rest = ", ..." if len(parts) > 4 else ""
             lines.append(
-                f"  {i + 1}: {self.shares[i]:.0%} of variance: {', '.join(parts[:4])}{rest}"
+                f"  {i + 1}: {format_percent(self.shares[i])} of variance: "
+                f"{', '.join(parts[:4])}{rest}"
             )
         if not len(self.directions):
             lines.append("  the rows do not vary")
@@ -228,7 +230,7 @@ def pca(
     offset, width = samples.scaling(scale)
     scaled = samples.matrix(scale)
     most = min(scaled.shape)
-    if components is not None and whole(components, "components") > most:
+    if components is not None and check_count("components", components) > most:
         raise ValueError(
             f"components must be from 1 to {most}, the lesser of {scaled.shape[0]} rows and "
             f"{scaled.shape[1]} ordered columns; got {components}"

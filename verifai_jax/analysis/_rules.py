@@ -17,9 +17,11 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.conditions import Condition, Region, everywhere
 from verifai_jax.analysis.data.columns import Column
-from verifai_jax.analysis.data.samples import Samples, whole
+from verifai_jax.analysis.data.samples import Samples
 from verifai_jax.analysis.trees import proposals
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -64,7 +66,7 @@ class Rule:
         return str(self)
 
     def __str__(self) -> str:
-        covered = f"covers {100 * self.coverage:.0f} % of the failures"
+        covered = f"covers {format_percent(self.coverage)} of the failures"
         return f"{self.words}: {covered}, {_told(self.precision)}"
 
 
@@ -122,7 +124,8 @@ class Rules:
         lines = [str(rule) for rule in self.rules]
         if len(self.rules) > 1:
             lines.append(
-                f"together: {100 * self.coverage:.0f} % of the failures, {_told(self.precision)}"
+                f"together: {format_percent(self.coverage)} of the failures, "
+                f"{_told(self.precision)}"
             )
         lines.append(self.basis)
         return "\n".join(lines)
@@ -170,10 +173,9 @@ def rules(
 
     **Raises:** `ValueError` without failing or without safe rows, or for options out of range.
     """
-    depth, most = whole(depth, "depth"), whole(most, "most")
-    for name, value in (("cover", cover), ("held_out", held_out)):
-        if not 0 < value <= 1 or (name == "held_out" and value == 1):
-            raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
+    depth, most = check_count("depth", depth), check_count("most", most)
+    check_fraction("cover", cover, one=True)
+    check_fraction("held_out", held_out)
     samples = Samples.of(source, "all")
     failing = samples.failing
     check_both(samples, "rules tell failing rows from safe ones")

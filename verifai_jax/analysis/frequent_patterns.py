@@ -23,8 +23,10 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from verifai_jax.analysis.data.columns import Column
-from verifai_jax.analysis.data.samples import Samples, Which, whole
+from verifai_jax.analysis.data.samples import Samples, Which
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -138,14 +140,14 @@ class Recurrent:
         ]
         for column, value in list(self.top.items())[:8]:
             share = self.values.loc[self.values["column"] == column, "share"].max()
-            lines.append(f"  most recurrent: {column}={value} ({share:.0%})")
+            lines.append(f"  most recurrent: {column}={value} ({format_percent(share)})")
         against = {"table": "among all rows", "prior": "in the prior"}.get(self.against)
         rows: Any = self.telling.head(5).itertuples()
         for row in rows:
             if row.lift > 1:
                 lines.append(
-                    f"  {row.combination}: {row.share:.0%} of them, {row.lift:.2f} times the share "
-                    f"{against}"
+                    f"  {row.combination}: {format_percent(row.share)} of them, "
+                    f"{row.lift:.2f} times the share {against}"
                 )
         return "\n".join(lines)
 
@@ -194,7 +196,7 @@ def recurrent(
     a space that knows the prior; more than 50 000 combinations.
     """
     samples = Samples.of(source, which, columns, space)
-    whole(size, "size")
+    check_count("size", size)
     if not (isinstance(minimum, float | int) and 0 < minimum <= 1):
         raise ValueError(f"minimum is a share, above 0 and at most 1; got {minimum!r}")
     if against not in ("auto", "table", "prior"):
@@ -202,7 +204,7 @@ def recurrent(
     if bins is None:
         samples.need_unordered("recurrent values without bins=...")
     else:
-        whole(bins, "bins")
+        check_count("bins", bins)
     items, present = _items(samples, bins, samples.frame)
     verdicts = _has_both_verdicts(samples)
     priors = all(item.prior is not None for item in items)

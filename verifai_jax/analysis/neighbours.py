@@ -24,9 +24,9 @@ from verifai_jax.analysis.data.samples import (
     beside,
     distances,
     generator,
-    whole,
 )
 from verifai_jax.analysis.tightest import tightest
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
@@ -93,7 +93,7 @@ def k_closest(
     """
     samples = Samples.of(source, which, columns, space)
     n = len(samples)
-    k = n if k is None else min(whole(k, "k"), n)
+    k = n if k is None else min(check_count("k", k), n)
     rows = samples.place(scale)
     centre = tightest(*rows, k) if k < n else _middle(rows)
     far = distances(rows, (rows[0][centre], rows[1][centre]))
@@ -130,7 +130,7 @@ def nearest(
     import pandas as pd
 
     samples = Samples.of(source, which, columns, space)
-    k = min(whole(k, "k"), len(samples))
+    k = min(check_count("k", k), len(samples))
     if isinstance(point, int | np.integer):
         frame = samples.at([int(point)])
         what = f"row {int(point)}"
@@ -158,6 +158,6 @@ def random_rows(
 ) -> Neighbours:
     """`k` different rows, each as likely as any other; all of them if there are no more."""
     samples = Samples.of(source, which, columns, space)
-    k = min(whole(k, "k"), len(samples))
+    k = min(check_count("k", k), len(samples))
     chosen = generator(seed).permutation(len(samples))[:k]
     return Neighbours(samples, samples.rows[chosen], np.full(k, np.nan), None, f"{k} at random")

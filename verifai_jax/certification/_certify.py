@@ -16,12 +16,13 @@ from verifai_jax.certification.allocation import Allocation, standing
 from verifai_jax.certification.attack import Seen, refute, usable_search
 from verifai_jax.certification.blocks import Pieces, Remember
 from verifai_jax.certification.result import Certificate, Certificates
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.confidence_sequences import bounded, verdict
+from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
 """Samples of a policy in one block."""
@@ -169,7 +170,7 @@ def _certificate(
     rate = None
     if sampled.simulations:
         failing = sampled.failures + sampled.not_finite
-        rate = bounded(failing, sampled.simulations, allocation.confidence, among)
+        rate = simultaneous_interval(failing, sampled.simulations, allocation.confidence, among)
     worst, features, counterexamples = _met(pieces.space, (sampled, attacked))
     return Certificate(
         number=number,
@@ -255,18 +256,15 @@ def _check(
     if not policies:
         raise ValueError("there is no policy to certify")
     for name, value in (("p", p), ("confidence", confidence)):
-        if not 0 < value < 1:
-            raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
+        check_fraction(name, value)
     for name, value, least in (
         ("samples", samples, 1),
         ("seed", seed, 0),
         ("attack_simulations", attack_simulations, 0),
     ):
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not whole or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")
-    if tie is not None and not 0 <= tie < 1:
-        raise ValueError(f"tie must lie between 0 and 1; got {tie!r}")
+        check_count(name, value, least)
+    if tie is not None:
+        check_fraction("tie", tie, zero=True)
     least = len(policies) * samples
     if budget is None:
         return 4 * least

@@ -29,7 +29,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.statistics.confidence_sequences import evidence_above, evidence_below, needed
+from verifai_jax.statistics.confidence_sequences import (
+    evidence_above,
+    evidence_below,
+    required_evidence,
+)
 
 QUANTILES = 24
 """Points of the leader's posterior in the integral over it."""
@@ -132,7 +136,7 @@ class Allocation:
     ) -> Bool[np.ndarray, " n"]:
         """Which verdicts are open; that of a policy without samples is."""
         simulations = np.maximum(simulations, 1)
-        limit = needed(self.confidence, len(failures))
+        limit = required_evidence(self.confidence, len(failures))
         p = np.full(len(failures), self.p)
         safe = evidence_below(failures, simulations, p) > limit
         return ~(safe | (evidence_above(failures, simulations, p) > limit))
@@ -191,7 +195,7 @@ class Allocation:
         """
         from scipy.special import betaincinv
 
-        limit = needed(self.confidence, among)
+        limit = required_evidence(self.confidence, among)
         most = max(self.budget, 2 * self.block)
         steps = np.geomspace(self.block, most, 32)
         fewest = np.full(len(failures), np.inf)

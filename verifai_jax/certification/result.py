@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import Rate
 from verifai_jax.statistics.confidence_sequences import UNSAFE, safe_at
 
@@ -53,7 +54,7 @@ class Certificate:
             text = "no sample yet"
         else:
             failing = self.failures + self.not_finite
-            low, high = _percent(self.rate.low), _percent(self.rate.high)
+            low, high = format_percent(self.rate.low), format_percent(self.rate.high)
             text = f"{failing} of {self.simulations} fail, between {low} and {high}"
         if self.not_finite:
             text += f"; {self.not_finite} of them gave no verdict"
@@ -181,12 +182,7 @@ class Certificates:
 
     @staticmethod
     def _chance(chance: float) -> str:
-        return "almost certain" if chance > 0.9995 else f"chance {100 * chance:.1f} %"
-
-
-def _percent(rate: float) -> str:
-    percent = 100 * rate
-    return f"{percent:.1f} %" if percent >= 10 else f"{percent:.2g} %"
+        return "almost certain" if chance > 0.9995 else f"chance {format_percent(chance)}"
 
 
 def _rank(row: Certificate, p: float) -> float:

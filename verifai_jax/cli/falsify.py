@@ -23,7 +23,7 @@ from verifai_jax.cli.arguments import (
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
-    from verifai_jax.statistics.binomial import Decided, Within
+    from verifai_jax.statistics.stopping import Decided, Within
 
 
 @click.command()
@@ -127,7 +127,7 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
         return None
     if within is not None and decide is not None:
         raise click.UsageError("--within and --decide are two ways to stop; give one")
-    from verifai_jax.statistics.binomial import Decided, Within
+    from verifai_jax.statistics.stopping import Decided, Within
 
     if within is not None:
         return Within(within)

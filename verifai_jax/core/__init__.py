@@ -1,1 +1,1 @@
-"""Ground that everything stands on and that knows nobody: traces, errors, keys, devices, text."""
+"""The ground of every room, which imports none: traces, errors, keys, devices, checks, text."""

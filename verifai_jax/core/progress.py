@@ -1,54 +1,113 @@
-"""The progress bar of a run: simulations per second, best robustness, counterexamples, time left.
+"""Progress bars: how much is done, how fast, and how much time is left.
 
-Drawn by rich on the error stream, on a terminal or in a notebook that has ipywidgets; nothing
-elsewhere.
+    with SimulationProgress("cartpole", budget, show=None) as progress:
+        progress.update(simulations, counterexamples, best)
+
+Rich draws them on the error stream, on a terminal or in a notebook that has ipywidgets; elsewhere
+nothing is drawn.
 """
 
 import importlib.util
 import sys
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
 
 
-class Progress:
-    """A context manager around the loop; `show=None` decides by where the output goes."""
+class ProgressBar:
+    """One bar, for one stage of a computation at a time; a context manager around all of them.
 
-    def __init__(self, name: str, budget: int, show: bool | None = None) -> None:
-        self.name, self.budget = name, budget
-        self.show = _watched() if show is None else show
-        self._bar: Any = None
-        self._task: Any = None
+    **Arguments:**
 
-    def __enter__(self) -> "Progress":
+    - `show`: whether to draw; None decides by where the error stream goes.
+    """
+
+    def __init__(self, show: bool | None = None) -> None:
+        self.show = has_viewer() if show is None else show
+        self._display: Progress | None = None
+        self._stage: TaskID | None = None
+
+    def __enter__(self) -> "ProgressBar":
         if self.show:
             from rich.console import Console
-            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bar
+            from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-            self._bar = Bar(
+            self._display = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
-                TextColumn("{task.completed:,.0f}/{task.total:,.0f}  {task.fields[figures]}"),
+                TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}"),
+                TextColumn("{task.fields[figures]}"),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
                 transient=True,
             )
-            self._bar.start()
-            self._task = self._bar.add_task(self.name, total=self.budget, figures="compiling")
+            self._display.start()
         return self
 
-    def update(self, simulations: int, found: int, best: float) -> None:
-        """Tell what is done so far."""
-        if self._bar is not None:
-            speed = self._bar.tasks[0].speed or 0.0
-            figures = f"{speed:,.0f}/s  best {best:.3g}  {found} counterexamples"
-            self._bar.update(self._task, completed=simulations, figures=figures)
-
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        if self._display is not None:
+            self._display.stop()
+
+    def begin(self, name: str, total: float, unit: str) -> None:
+        """Begin a stage of `total` units of work."""
+        if self._display is not None:
+            self._stage = self._display.add_task(name, total=total, unit=unit, figures="compiling")
+
+    def end(self) -> None:
+        """End the present stage."""
+        if self._display is not None and self._stage is not None:
+            self._display.remove_task(self._stage)
+        self._stage = None
+
+    def advance(self, amount: float, figures: str = "") -> None:
+        """Count `amount` more units as done, and show `figures` beside the bar."""
+        if self._display is not None and self._stage is not None:
+            self._display.update(self._stage, advance=amount, figures=figures)
+
+    def update(self, done: float, total: float | None = None, figures: str = "") -> None:
+        """Set the units that are done, and their total where it has changed."""
+        if self._display is not None and self._stage is not None:
+            self._display.update(self._stage, completed=done, total=total, figures=figures)
+
+    @property
+    def speed(self) -> float:
+        """Units per second of the present stage."""
+        if self._display is None:
+            return 0.0
+        return next((t.speed or 0.0 for t in self._display.tasks if t.id == self._stage), 0.0)
 
 
-def _watched() -> bool:
+class SimulationProgress:
+    """The bar of a run: simulations per second, least robustness, counterexamples, time left.
+
+    **Arguments:**
+
+    - `name`: text in front of the bar.
+    - `budget`: simulations in all.
+    - `show`: whether to draw; None decides by where the error stream goes.
+    """
+
+    def __init__(self, name: str, budget: int, show: bool | None = None) -> None:
+        self.name, self.budget = name, budget
+        self.bar = ProgressBar(show)
+
+    def __enter__(self) -> "SimulationProgress":
+        self.bar.__enter__()
+        self.bar.begin(self.name, self.budget, "simulations")
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.bar.__exit__(*reason)
+
+    def update(self, simulations: int, counterexamples: int, best: float) -> None:
+        """Show the simulations made, the counterexamples among them and the least robustness."""
+        figures = f"{self.bar.speed:,.0f}/s  best {best:.3g}  {counterexamples} counterexamples"
+        self.bar.update(simulations, figures=figures)
+
+
+def has_viewer() -> bool:
+    """Return whether the error stream is a terminal or a notebook that can draw a bar."""
     if sys.stderr is not None and sys.stderr.isatty():
         return True
     # In a notebook rich draws through ipywidgets, and without it warns instead.

@@ -1,13 +1,27 @@
-"""Words and numbers as a person reads them."""
+"""Text for people: numbers, shares, features and errors in one line."""
 
+import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 
-def format_features(features: Mapping[str, Any]) -> str:
-    """Write features as a person reads them: `x0=0.1353, alg=sac`."""
+def format_percent(share: float) -> str:
+    """Write a share as a percentage of three digits: `3.8 %`, `0.00171 %`, `>99.9 %`.
+
+    Only a share of exactly 1 is written `100 %`; one that is not finite is `unknown`.
+    """
+    if not math.isfinite(share):
+        return "unknown"
+    percent = 100 * share
+    # Between 99.95 and 100 three digits would round to 100.
+    if 99.95 <= percent < 100:
+        return ">99.9 %"
+    return f"{percent:.3g} %"
+
+
+def format_features(features: Mapping[str, object]) -> str:
+    """Write features with four digits: `x0=0.1353, alg=sac`."""
     return ", ".join(
         f"{name}={value:.4g}" if isinstance(value, (float, np.floating)) else f"{name}={value}"
         for name, value in features.items()
@@ -15,7 +29,7 @@ def format_features(features: Mapping[str, Any]) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Write an exception in one line."""
+    """Write an exception in one line: its type and the first line of its message."""
     first = (str(error).splitlines() or [""])[0]
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
@@ -162,8 +163,7 @@ def shrink(
     problem = problem_of(run)
     if by not in ORDERS:
         raise unknown_name("order", by, ORDERS)
-    if isinstance(budget, bool) or not isinstance(budget, int | np.integer) or budget < 1:
-        raise ValueError(f"budget must be an integer of at least 1; got {budget!r}")
+    check_count("budget", budget)
     number, first = row_of(run, row)
     at = Nominal.of(problem, nominal)
     problem = with_key_of(problem, run, number)

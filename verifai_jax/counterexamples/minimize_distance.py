@@ -9,8 +9,8 @@ Each round a batch of candidates for each point that is followed:
   Hasofer and Lind (Exact and invariant second-moment code format, Journal of the Engineering
   Mechanics Division 100, 1974) and of Rackwitz and Fiessler (Structural reliability under combined
   random load sequences, Computers and Structures 9, 1978), with a line search by batch; where
-  several pieces of the boundary meet, nearest to all of their half-spaces (Lawson and Hanson,
-  Solving least squares problems, 1974, chapter 23: least distance programming);
+  several pieces of the boundary meet, nearest to all of their half-spaces
+  (`statistics.least_distance`);
 - beside it and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial attacks,
   ICLR 2018), which needs no slope and no continuity;
 - one coordinate nearer alone; a cell nearer where discrete.
@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.counterexamples.candidates import Judge, Linear
+from verifai_jax.statistics.least_distance import shortest_in_box
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
@@ -132,7 +133,7 @@ def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.n
         if not len(rows) or not rows.any():
             continue
         levels = np.array([p.slope[places] @ (p.point[places] - u0) - p.value for p in some])
-        found = least(rows, levels, low - u0, high - u0)
+        found = shortest_in_box(rows, levels, low - u0, high - u0)
         if found is not None:
             targets.append(found)
     track.aimed = None
@@ -147,35 +148,6 @@ def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.n
         for stretch in (STRETCHES if turn == 1 else (1.0, 0.99))
     ]
     return np.array(steps)
-
-
-def least(
-    rows: Float[np.ndarray, "m k"],
-    levels: Float[np.ndarray, " m"],
-    low: Float[np.ndarray, " k"],
-    high: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, " k"] | None:
-    """The shortest `v` with `rows v <= levels` and `low <= v <= high`; None where there is none.
-
-    Lawson and Hanson, chapter 23: the dual is a problem of non-negative least squares.
-    """
-    from scipy.optimize import nnls
-
-    scale = np.linalg.norm(rows, axis=1)
-    rows, levels = rows[scale > 0], levels[scale > 0]
-    scale = scale[scale > 0]
-    k = rows.shape[1]
-    over = np.concatenate([-rows / scale[:, None], np.eye(k), -np.eye(k)])
-    bounds = np.concatenate([-levels / scale, low, -high])
-    dual, target = np.vstack([over.T, bounds]), np.r_[np.zeros(k), 1.0]
-    try:
-        weights, residual = nnls(dual, target)
-    except RuntimeError:
-        return None
-    if residual < 1e-8:
-        return None
-    rest = dual @ weights - target
-    return np.clip(-rest[:k] / rest[k], low, high)
 
 
 def fitted(judge: Judge, track: Track, places: np.ndarray) -> list[Linear]:

@@ -6,7 +6,7 @@ simulations_until(1e-6, failures=0, simulations=50_000)
 """
 
 from verifai_jax.estimation._estimate import estimate as estimate
-from verifai_jax.estimation.intervals import simulations_until as simulations_until
-from verifai_jax.estimation.intervals import upper_bound as upper_bound
 from verifai_jax.estimation.result import METHODS as METHODS
 from verifai_jax.estimation.result import Estimate as Estimate
+from verifai_jax.statistics.binomial import simulations_until as simulations_until
+from verifai_jax.statistics.binomial import upper_bound as upper_bound

@@ -5,7 +5,6 @@ result = vj.estimate(problem, method="splitting", p0=1e-6)
 result.probability, result.interval, result.upper_bound
 """
 
-import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -13,9 +12,10 @@ from contextlib import AbstractContextManager, nullcontext
 import numpy as np
 
 from verifai_jax._version import __version__
+from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import Progress
+from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
@@ -89,9 +89,9 @@ def estimate(
     if method is not None and method not in METHODS:
         raise unknown_name("method", method, METHODS)
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
-    _check_share("confidence", confidence)
+    check_fraction("confidence", confidence)
     if p0 is not None:
-        _check_share("p0", p0)
+        check_fraction("p0", p0)
     in_precision(precision)
     problem.space.check_where()
     share = SHARE_OF_REPLICATE if method == "splitting" else SHARE_OF_LEVEL
@@ -101,7 +101,7 @@ def estimate(
     choice.problem.check()
     simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed)
     simulated.compile()
-    with Progress(problem.name, budget, progress) as bar, _one_thread():
+    with SimulationProgress(problem.name, budget, progress) as bar, _one_thread():
         limit_state = LimitState(
             simulated,
             problem.space.dim,
@@ -197,12 +197,6 @@ def _result(
 def _constraint(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
     accepts = problem.space.accepts_points
     return lambda u: np.asarray(accepts(np.asarray(u, np.float32)))
-
-
-def _check_share(name: str, value: float) -> None:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and 0 < value < 1 and math.isfinite(value)):
-        raise ValueError(f"{name} must lie between 0 and 1; got {value!r}")
 
 
 def _one_thread() -> AbstractContextManager[object]:

@@ -1,8 +1,4 @@
-"""Intervals and bounds of prior samples, of weighted samples, and of splitting.
-
-upper_bound(0, 2000)                            # 0.0015: what no failure in 2000 says
-simulations_until(1e-4, failures=0, simulations=2000)
-"""
+"""Intervals of the mean of weighted samples, and of the products of fractions of splitting."""
 
 import math
 from typing import NamedTuple
@@ -29,26 +25,6 @@ class WeightedMean(NamedTuple):
     effective: float
     largest: float
     tail: float
-
-
-def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
-    """Return the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
-
-    Without a failure it is about `3 / simulations` at 95 %. Source: Clopper and Pearson, Biometrika
-    26 (1934).
-
-    **Arguments:**
-
-    - `failures`, `simulations`: counts of independent samples of the prior.
-    - `confidence`: probability that the bound holds, between 0 and 1.
-
-    **Returns:** a failure probability between 0 and 1; 1 without simulations.
-    """
-    from scipy.special import betaincinv
-
-    if simulations < 1 or failures >= simulations:
-        return 1.0
-    return float(betaincinv(failures + 1, simulations - failures, confidence))
 
 
 def weighted_mean(x: Float[np.ndarray, " n"]) -> WeightedMean:
@@ -133,34 +109,3 @@ def tail_index(weights: Float[np.ndarray, " n"]) -> float:
     share /= share.sum()
     shape = float(np.mean(np.log1p(-float(b @ share) * x)))
     return (count * shape + 5) / (count + 10)  # Their weak prior at one half.
-
-
-def simulations_until(
-    rate: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
-) -> int:
-    """Count further simulations that show a failure rate below `rate` if none of them fails.
-
-    **Arguments:**
-
-    - `rate`: failure probability to be shown, between 0 and 1.
-    - `failures`, `simulations`: independent samples of the prior that are there already.
-    - `confidence`: of the bound, between 0 and 1.
-
-    **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `rate`.
-
-    **Raises:** `ValueError` unless `0 < rate < 1`.
-    """
-    if not 0 < rate < 1:
-        raise ValueError(f"p0 must lie between 0 and 1; got {rate!r}")
-    low, high = 0, 1
-    while upper_bound(failures, simulations + high, confidence) > rate:
-        low, high = high, 2 * high
-        if high > 2**62:
-            break
-    if upper_bound(failures, max(simulations, 1), confidence) <= rate and simulations:
-        return 0
-    while high - low > 1:
-        middle = (low + high) // 2
-        enough = upper_bound(failures, simulations + middle, confidence) <= rate
-        low, high = (low, middle) if enough else (middle, high)
-    return high

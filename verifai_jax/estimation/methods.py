@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.monte_carlo import Counts
@@ -203,7 +204,7 @@ def _importance_answer(
     if samples.unresolved > 0.01:
         answer.notes.append(
             f"failures lie where single precision or a distribution's outermost value hides up to "
-            f"{100 * samples.unresolved:.0f} % of them; the interval is wider by that"
+            f"{format_percent(samples.unresolved)} of them; the interval is wider by that"
         )
     return answer
 

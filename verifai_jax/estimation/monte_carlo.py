@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from verifai_jax.estimation.intervals import upper_bound
 from verifai_jax.estimation.normal_space import Ended, LimitState
-from verifai_jax.statistics.binomial import clopper_pearson
+from verifai_jax.statistics.binomial import clopper_pearson, upper_bound
 
 AT_ONCE = 8
 """Batches between two looks at the clock, after which nothing of them is lost."""

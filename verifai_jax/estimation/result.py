@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import verifai_jax.estimation.intervals as intervals
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
+from verifai_jax.statistics.binomial import simulations_until
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,7 +102,7 @@ class Estimate:
 
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
-        return intervals.simulations_until(
+        return simulations_until(
             p0,
             self.prior_failures + self.prior_no_verdict,
             self.prior_simulations,
@@ -109,7 +110,7 @@ class Estimate:
         )
 
     def __str__(self) -> str:
-        sure = f"{100 * self.confidence:g} %"
+        sure = format_percent(self.confidence)
         if self.probability is None or self.method is None:
             lines = [
                 f"{self.name}: no estimate of the failure probability; at most "
@@ -129,15 +130,17 @@ class Estimate:
             worth = ""
             if math.isfinite(self.effective):
                 worth = f", worth {self.effective:,.0f} independent failures"
-            lines.append(f"  precision    relative error {100 * self.relative_error:.2g} %{worth}")
+            lines.append(
+                f"  precision    relative error {format_percent(self.relative_error)}{worth}"
+            )
         lines.append(
             f"  guaranteed   at most {self.upper_bound:.2g} at {sure}, by {self.prior_failures:,} "
             f"failures in {self.prior_simulations:,} independent samples of the prior alone"
         )
         if self.no_verdict:
             lines.append(
-                f"  no verdict   {100 * self.no_verdict_probability:.2g} % of the prior's samples; "
-                "neither safe nor failing: the upper ends count them as failing"
+                f"  no verdict   {format_percent(self.no_verdict_probability)} of the prior's "
+                "samples; neither safe nor failing: the upper ends count them as failing"
             )
         if self.p0 is not None:
             lines.append(f"  p < {self.p0:g}    {self._conclusion(self.p0)}")

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
@@ -28,7 +29,7 @@ from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.packing import Packing
 from verifai_jax.evaluation.streaming_monitor import carried_monitor, with_status
 from verifai_jax.mtl import hard, robustness, satisfied, smooth
-from verifai_jax.mtl.clauses import ABSENT, CLAUSES, Goals, goals_of
+from verifai_jax.mtl.clauses import ABSENT, Goals, goals_of
 from verifai_jax.problem.problem import Problem
 
 

@@ -16,7 +16,7 @@ from verifai_jax import search as searches
 from verifai_jax._version import __version__
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import Progress
+from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.run import Run, load, write_record
@@ -37,7 +37,7 @@ from verifai_jax.falsification.validation import (
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.binomial import StoppingRule
+from verifai_jax.statistics.stopping import StoppingRule
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -328,7 +328,7 @@ def _play(
             write_record(run("running"), place)
     stopped, cause = None, None
     try:
-        with Progress(problem.name, ends.budget, progress) as bar:
+        with SimulationProgress(problem.name, ends.budget, progress) as bar:
             rounds.compile()
             prepare()
             # Checking and tracing are part of what a second run of the problem does not repeat.

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
-from verifai_jax.search.base import CLAUSES
 
 VALUES_AT_ONCE, SLOPES_AT_ONCE = 256, 64
 

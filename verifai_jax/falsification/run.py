@@ -20,7 +20,7 @@ from jaxtyping import Array, Key
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.text import format_features
+from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.engine import judge, verdict
 from verifai_jax.falsification.checkpoint import read_snapshot, write_snapshot
@@ -28,7 +28,8 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
-from verifai_jax.statistics.binomial import Rate, at_any_time, clopper_pearson
+from verifai_jax.statistics.binomial import Rate, clopper_pearson
+from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -160,7 +161,7 @@ class Run:
         if not self.prior or failures + safe == 0:
             return None
         if self.stopped in ("stop_after", "stop_when"):
-            return at_any_time(failures, failures + safe)
+            return anytime_interval(failures, failures + safe)
         return clopper_pearson(failures, failures + safe)
 
     @property
@@ -384,7 +385,9 @@ def _summary(run: Run) -> str:
             lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
     lines.extend(f"  note         {note}" for note in run.notes)
     if run.acceptance is not None:
-        lines.append(f"  constraint   let through {100 * run.acceptance:.3g} % of all proposals")
+        lines.append(
+            f"  constraint   let through {format_percent(run.acceptance)} of all proposals"
+        )
     speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
     lines.append(
         f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from verifai_jax import search as searches
+from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import informative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.binomial import StoppingRule
+from verifai_jax.statistics.stopping import StoppingRule
 from verifai_jax.systems.base import System
 
 
@@ -53,12 +54,11 @@ def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_aft
     for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
         if name == "stop_after" and value is None:
             continue
-        if not _is_integer(value) or value < 1:
-            raise ValueError(f"{name} must be an integer of at least 1; got {value!r}")
+        check_count(name, value)
     if not _is_integer(seed) or not 0 <= seed < 2**63:
         raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
-    if max_seconds is not None and not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive; got {max_seconds!r}")
+    if max_seconds is not None:
+        check_positive("max_seconds", max_seconds)
 
 
 def check_search(problem: Any, search: Any) -> Search:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.text import format_percent
+
 SAMPLES = 65_536
 BLOCK = 4096
 ENOUGH = 1000
@@ -45,8 +47,8 @@ def acceptance_rate(space: Any, seed: Any = 0) -> float:
     if not accepted:
         most = -np.log(0.05) / tried
         raise ValueError(
-            f"where accepted none of {tried} samples of the space, so fewer than {100 * most:.2g} "
-            "% of it are allowed (95 % confidence): make the domains narrower, or check the "
-            "condition"
+            f"where accepted none of {tried} samples of the space, so fewer than "
+            f"{format_percent(most)} of it are allowed (95 % confidence): make the domains "
+            "narrower, or check the condition"
         )
     return accepted / tried

@@ -44,18 +44,18 @@ from verifai_jax.mtl.semantics import smooth as smooth
 from verifai_jax.mtl.smoothing_error import Certificate as Certificate
 
 __all__ = [
+    "FALSE",
+    "TRUE",
     "Certificate",
     "End",
     "Explanation",
     "Expression",
-    "FALSE",
     "Formula",
     "FormulaSyntaxError",
     "HorizonError",
     "IntervalError",
     "Online",
     "Semantics",
-    "TRUE",
     "always",
     "anneal",
     "boolean",

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from verifai_jax.core.text import format_percent
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, tidy
 
@@ -39,7 +40,7 @@ def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
 
 
 def _draw_interval(axes: Axes, estimate: Estimate) -> None:
-    sure = f"{100 * estimate.confidence:g} %"
+    sure = format_percent(estimate.confidence)
     rows: list[Any] = [("bound by the prior alone", None, 0.0, estimate.upper_bound, BOUND)]
     if estimate.probability is not None:
         rows.append(("estimate", estimate.probability, estimate.low, estimate.high, FAILING))

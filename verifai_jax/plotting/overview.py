@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.core.text import format_percent
 from verifai_jax.plotting.bars import draw_bars
 from verifai_jax.plotting.panels import draw_rule, draw_samples, places, two_features
 from verifai_jax.plotting.style import BOUND, new_figure, show_or_save
@@ -45,7 +46,7 @@ def plot_overview(found: "Analysis", path: str | Path | None = None) -> Any:
     lines = [f"{found.name}: {title}"]
     if rules is not None and rules.rules:
         first = rules.rules[0]
-        lines.append(f"rule 1: {first.words} ({100 * first.coverage:.0f} % of the failures)")
+        lines.append(f"rule 1: {first.words} ({format_percent(first.coverage)} of the failures)")
     figure.suptitle("\n".join(line[:130] for line in lines), fontsize=9.5)
     return show_or_save(figure, path)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from verifai_jax.analysis._pca import Components
 from verifai_jax.core.figure import Figure
-from verifai_jax.core.text import shorten
+from verifai_jax.core.text import format_percent, shorten
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 DOTS = 3000
@@ -34,7 +34,11 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
         places = places[:: max(1, len(places) // DOTS)]
         cloud.scatter(along[0][places], along[1][places], c=color, s=9, alpha=0.55, linewidths=0)
     for i, axis in ((0, cloud.xaxis), (1, cloud.yaxis)):
-        share = f" ({components.shares[i]:.0%} of variance)" if i < len(directions) else " (none)"
+        share = (
+            f" ({format_percent(components.shares[i])} of variance)"
+            if i < len(directions)
+            else " (none)"
+        )
         axis.set_label_text(f"component {i + 1}{share}")
     tidy(cloud)
     height = 0.8 / max(1, min(3, len(directions)))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.text import shorten
+from verifai_jax.core.text import format_percent, shorten
 from verifai_jax.plotting.style import (
     BOUND,
     FAILING,
@@ -17,7 +17,7 @@ from verifai_jax.plotting.style import (
 )
 from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import chosen_first, is_safe, last_snapshots, least_full_return
-from verifai_jax.sweeps.summary import failures, lead, percent
+from verifai_jax.sweeps.summary import failures, lead
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,10 +100,10 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
     axes.set_yscale("symlog", linthresh=least, linscale=0.6)
     axes.set_ylim(-0.25 * least, 1.6)
     ticks = [0.0, *(10.0**k for k in range(-6, 1) if 10.0**k >= least * 0.999)]
-    axes.set_yticks(ticks, [percent(tick) for tick in ticks])
+    axes.set_yticks(ticks, [format_percent(tick) for tick in ticks])
     axes.set_yticks([], minor=True)
     if sweep.p is not None:
-        label = f"wanted: below {percent(sweep.p)}"
+        label = f"wanted: below {format_percent(sweep.p)}"
         axes.axhline(sweep.p, color=BOUND, linewidth=0.9, linestyle="--", zorder=0, label=label)
     axes.set_xlabel("nominal return of the policy")
     axes.set_ylabel("failure probability")
@@ -227,7 +227,7 @@ def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
 def _failures(row: Any) -> str:
     if row["simulations"] > 0:
         return failures(row)
-    return f"fails in {percent(row['failure_rate'])}"
+    return f"fails in {format_percent(row['failure_rate'])}"
 
 
 def draw_importance(axes: Any, found: HyperparameterImportance) -> None:

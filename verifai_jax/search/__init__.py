@@ -34,11 +34,11 @@ from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
 
 __all__ = [
+    "CMAES",
     "Annealing",
     "Bandit",
     "Bayes",
     "CECompat",
-    "CMAES",
     "CrossEntropy",
     "Cube",
     "Diverse",

@@ -22,15 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    check_positive,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 
 # More ordered cells than this are stepped over as if continuous.
 MOST_CELLS = 8
@@ -76,14 +70,14 @@ class Annealing(Search[AnnealingState]):
 
     def __post_init__(self) -> None:
         check_count("chains", self.chains, 2)
-        check_positive("hottest", self.hottest)
-        check_positive("coldest", self.coldest)
+        check_positive("hottest", self.hottest, finite=True)
+        check_positive("coldest", self.coldest, finite=True)
         if self.coldest > self.hottest:
             raise ValueError(
                 "coldest must not be above hottest; got "
                 f"coldest={self.coldest!r}, hottest={self.hottest!r}"
             )
-        check_fraction("exploration", self.exploration)
+        check_fraction("exploration", self.exploration, one=True)
         check_count("patience", self.patience)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> AnnealingState:

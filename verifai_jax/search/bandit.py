@@ -27,14 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    check_positive,
-)
+from verifai_jax.search.base import Observations, Search
 
 BISECTIONS = 20
 
@@ -74,10 +69,10 @@ class Bandit(Search[BanditState]):
     def __post_init__(self) -> None:
         check_count("buckets", self.buckets, 2)
         check_count("depth", self.depth)
-        check_positive("optimism", self.optimism)
-        check_fraction("best", self.best)
+        check_positive("optimism", self.optimism, finite=True)
+        check_fraction("best", self.best, one=True)
         check_count("window", self.window)
-        check_fraction("exploration", self.exploration)
+        check_fraction("exploration", self.exploration, one=True)
         if self.buckets**self.depth > 10_000:
             raise ValueError(
                 "buckets**depth must be at most 10000; got "

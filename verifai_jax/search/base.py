@@ -9,7 +9,6 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 """
 
 import abc
-import math
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -18,9 +17,6 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-
-CLAUSES = 4
-"""Number of clauses that `Observations` distinguishes."""
 
 
 class Observations(NamedTuple):
@@ -133,24 +129,3 @@ class Search(abc.ABC, Generic[State]):
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Map uniform numbers in `[0, 1)` to standard normal ones, finite at 0."""
     return ndtri(jnp.maximum(uniform, np.float32(2**-25)))
-
-
-def check_positive(name: str, value: object) -> None:
-    """Raise `ValueError` unless `value` is a positive finite number."""
-    number = math.nan if isinstance(value, bool) else value
-    if not (isinstance(number, int | float) and 0 < number < math.inf):
-        raise ValueError(f"{name} must be positive and finite; got {value!r}")
-
-
-def check_fraction(name: str, value: object, *, or_zero: bool = False) -> None:
-    """Raise `ValueError` unless `value` is a number in `(0, 1]`, or in `[0, 1]`."""
-    number = math.nan if isinstance(value, bool) else value
-    within = isinstance(number, int | float) and (0 < number <= 1 or (or_zero and number == 0))
-    if not within:
-        raise ValueError(f"{name} must be in {'[' if or_zero else '('}0, 1]; got {value!r}")
-
-
-def check_count(name: str, value: object, least: int = 1) -> None:
-    """Raise `ValueError` unless `value` is an integer of at least `least`."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} must be an integer of at least {least}; got {value!r}")

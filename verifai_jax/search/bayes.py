@@ -23,14 +23,9 @@ import numpy as np
 from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 from verifai_jax.search.gaussian_process import (
     GaussianProcess,
     Hyper,
@@ -99,7 +94,7 @@ class Bayes(Search[BayesState]):
         check_count("capacity", self.capacity, 16)
         check_count("candidates", self.candidates, 32)
         check_count("initial", self.initial, 2)
-        check_fraction("exploration", self.exploration)
+        check_fraction("exploration", self.exploration, one=True)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BayesState:
         return BayesState(

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, check_count, check_fraction
+from verifai_jax.search.base import Observations, Search
 
 MOST_COMBINATIONS = 1024
 MOST_BINS = 2**22
@@ -53,7 +54,7 @@ class CECompat(Search[CECompatState]):
 
     def __post_init__(self) -> None:
         check_count("buckets", self.buckets)
-        check_fraction("alpha", self.alpha, or_zero=True)
+        check_fraction("alpha", self.alpha, zero=True, one=True)
         number = isinstance(self.threshold, int | float) and not isinstance(self.threshold, bool)
         if not (number and math.isfinite(self.threshold)):
             raise ValueError(f"threshold must be a finite number; got {self.threshold!r}")

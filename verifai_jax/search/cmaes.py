@@ -27,14 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 
@@ -96,7 +91,7 @@ class CMAES(Search[CMAESState]):
 
     def __post_init__(self) -> None:
         for name in ("step", "small_step", "exploration", "least_std"):
-            check_fraction(name, getattr(self, name))
+            check_fraction(name, getattr(self, name), one=True)
         check_count("full_up_to", self.full_up_to, 0)
         check_count("patience", self.patience)
         check_count("failures", self.failures)

@@ -22,15 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    check_positive,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 from verifai_jax.search.halton import halton_points
 
 # More cells than this are an ordered quantity: a batch cannot fill a histogram of them.
@@ -71,13 +65,13 @@ class CrossEntropy(Search[CrossEntropyState]):
     patience: int = 6
 
     def __post_init__(self) -> None:
-        check_fraction("elite", self.elite)
+        check_fraction("elite", self.elite, one=True)
         check_count("least_elite", self.least_elite, 2)
-        check_fraction("focus", self.focus, or_zero=True)
-        check_fraction("exploration", self.exploration)
-        check_fraction("least_std", self.least_std)
+        check_fraction("focus", self.focus, zero=True, one=True)
+        check_fraction("exploration", self.exploration, one=True)
+        check_fraction("least_std", self.least_std, one=True)
         check_count("patience", self.patience)
-        check_positive("widening", self.widening)
+        check_positive("widening", self.widening, finite=True)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CrossEntropyState:
         k = max(self.least_elite, int(np.ceil(self.elite * batch)))

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, check_count, check_fraction
+from verifai_jax.search.base import Observations, Plan, Search
 
 AT_ONCE = 16
 """Failures archived in a round at most."""
@@ -72,9 +73,9 @@ class Diverse(Search[DiverseState]):
     def __post_init__(self) -> None:
         if not isinstance(self.search, Search):
             raise TypeError(f"Diverse needs a search like CrossEntropy(); got {self.search!r}")
-        check_fraction("radius", self.radius)
-        check_fraction("least_radius", self.least_radius)
-        check_fraction("shrink", self.shrink)
+        check_fraction("radius", self.radius, one=True)
+        check_fraction("least_radius", self.least_radius, one=True)
+        check_fraction("shrink", self.shrink, one=True)
         check_count("patience", self.patience)
         check_count("capacity", self.capacity)
         if self.least_radius > self.radius:

@@ -18,15 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    check_positive,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 
 # More ordered cells than this are moved by noise, as if continuous.
 MOST_CELLS = 8
@@ -78,14 +72,14 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     doubt: float = 3.0
 
     def __post_init__(self) -> None:
-        check_fraction("epsilon", self.epsilon)
-        check_fraction("best", self.best)
+        check_fraction("epsilon", self.epsilon, one=True)
+        check_fraction("best", self.best, one=True)
         check_count("least_best", self.least_best, 2)
-        check_positive("reach", self.reach)
-        check_fraction("least_std", self.least_std)
+        check_positive("reach", self.reach, finite=True)
+        check_fraction("least_std", self.least_std, one=True)
         check_count("begin", self.begin)
         check_count("patience", self.patience)
-        check_positive("doubt", self.doubt)
+        check_positive("doubt", self.doubt, finite=True)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> EpsilonGreedyState:
         k = max(self.least_best, int(np.ceil(self.best * batch)))

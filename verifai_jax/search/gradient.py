@@ -23,16 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    CLAUSES,
-    Observations,
-    Plan,
-    Search,
-    check_count,
-    check_fraction,
-    check_positive,
-)
+from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
@@ -97,18 +91,18 @@ class Gradient(Search[GradientState]):
 
     def __post_init__(self) -> None:
         check_count("descents", self.descents)
-        check_fraction("shrinks", self.shrinks)
-        check_fraction("least_radius", self.least_radius)
+        check_fraction("shrinks", self.shrinks, one=True)
+        check_fraction("least_radius", self.least_radius, one=True)
         check_count("flips", self.flips, 0)
         check_count("patience", self.patience)
-        check_positive("coldest", self.coldest)
+        check_positive("coldest", self.coldest, finite=True)
         if self.shrinks == 1:
             raise ValueError("shrinks must be less than 1; got 1")
         object.__setattr__(self, "temperatures", tuple(self.temperatures))
         if not self.temperatures:
             raise ValueError("temperatures must have at least one entry; got none")
         for temperature in self.temperatures:
-            check_positive("temperatures", temperature)
+            check_positive("temperatures", temperature, finite=True)
 
     def check(self, cube: Cube) -> None:
         """Raise `ValueError` unless there is a continuous coordinate to move in."""

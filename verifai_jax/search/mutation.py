@@ -19,14 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import (
-    Observations,
-    Search,
-    check_count,
-    check_fraction,
-    standard_normal,
-)
+from verifai_jax.search.base import Observations, Search, standard_normal
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before."""
@@ -76,8 +71,8 @@ class Mutation(Search[MutationState]):
     def __post_init__(self) -> None:
         check_count("kept", self.kept, 6)
         check_count("first", self.first)
-        check_fraction("exploration", self.exploration)
-        check_fraction("difference", self.difference, or_zero=True)
+        check_fraction("exploration", self.exploration, one=True)
+        check_fraction("difference", self.difference, zero=True, one=True)
         check_count("idle", self.idle)
         check_count("patience", self.patience)
 

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Diverse, Observations, Plan, Search
-from verifai_jax.search.base import CLAUSES
 
 TRIES = 32
 """Asks in one round at most until every row of a search that learns is accepted."""

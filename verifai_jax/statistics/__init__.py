@@ -1,1 +1,1 @@
-"""Pure numbers: intervals of rates, stopping rules, Pareto fronts, least-distance steps."""
+"""Statistics and small programs over plain numbers: intervals, stopping rules, Pareto fronts."""

@@ -1,136 +1,174 @@
-"""Bounds on many failure rates at once, for samples whose outcomes decide how many there are.
+"""Failure rates with intervals that hold at all sample sizes together, for one rate or many.
 
-    rate = bounded(failures=0, simulations=768, confidence=0.95, among=32)
-    verdict(rate, p=0.01)                               # "safe@0.01"
+    anytime_interval(failures=3, simulations=512)                    # one rate, stopped at any time
+    simultaneous_interval(0, 768, confidence=0.95, among=32)         # one of 32 such rates
+    verdict(rate, p=0.01)                                            # "safe@0.01"
 
-The allocation looks at every policy again and again, and goes on with those whose decision is open.
-A Clopper-Pearson bound of the final number of samples would be wrong then: who looks often enough
-sees it exclude the truth. A ladder of sample sizes with the error spent over its rungs would be
-right, but pays `ln(rungs)` on each and wastes up to a whole rung between two.
+Sampling that is stopped, or shared out among policies, by its own outcomes needs such intervals: a
+Clopper-Pearson bound of the final number of samples would be wrong, because who looks often enough
+sees it exclude the truth.
 
-Instead, the rate `q` is rejected once a likelihood ratio against it, mixed over rates on one side
-of it, has grown to the reciprocal of the error allowed. For another rate `t`, the factor of one
-sample, `t/q` for a failure and `(1-t)/(1-q)` for none, has expectation 1 if `q` is the true rate.
-So a mixture over any fixed distribution of `t` is a nonnegative martingale that starts at 1, and by
-Ville's inequality it ever reaches `1 / error` with probability `error` at most. The bound holds at
-all sample sizes together, whatever decided them, be it other policies' outcomes in the very samples
-to come (Robbins, Statistical methods related to the law of the iterated logarithm, Annals of
-Mathematical Statistics 41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Time-uniform, nonparametric,
-nonasymptotic confidence sequences, Annals of Statistics 49, 2021).
+A rate `q` is rejected once a likelihood ratio against it, mixed over other rates, has grown to the
+reciprocal of the error allowed. For another rate `t`, the factor of one sample, `t/q` for a failure
+and `(1-t)/(1-q)` for none, has expectation 1 if `q` is the true rate. So a mixture over any fixed
+distribution of `t` is a nonnegative martingale that starts at 1, and by Ville's inequality it ever
+reaches `1 / error` with probability `error` at most. The bound holds at all sample sizes together,
+whatever decided them, be it other policies' outcomes in the very samples to come (Robbins,
+Statistical methods related to the law of the iterated logarithm, Annals of Mathematical Statistics
+41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Time-uniform, nonparametric, nonasymptotic
+confidence sequences, Annals of Statistics 49, 2021).
 
-The mixture for upper bounds has an atom at rate 0, which safe policies often have: without a
+`anytime_interval` mixes over all rates at once. `simultaneous_interval` has a mixture for each
+side, and that for upper bounds has an atom at rate 0, which safe policies often have: without a
 failure it costs `ln(1/ATOM) / q` samples more than the exact bound of a fixed number of samples,
-29 at 0.01. `rates.at_any_time`, with one mixture for all rates and no atom, costs hundreds.
-
-For N policies each side of each interval has error `(1 - confidence) / (2 N)`, so that all of them
-hold together with probability `confidence` (Bonferroni), however the samples depend on each other:
-policies share their features.
+29 at 0.01, where a mixture without an atom costs hundreds.
 """
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Real
 
-from verifai_jax.statistics.binomial import Rate
+from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.statistics.binomial import Rate, check_counts
 
 ATOM = 0.75
 """Weight of rate 0 in the mixture for upper bounds."""
 
 UNDECIDED = "undecided"
+"""Verdict of a policy whose interval contains the failure rate that is allowed."""
+
 UNSAFE = "unsafe"
+"""Verdict of a policy that fails more often than is allowed."""
+
+Counts = Real[np.ndarray, "*n"] | float
+"""Numbers of samples, one or many; fractions where they are expectations."""
 
 
-def bounded(failures: int, simulations: int, confidence: float = 0.95, among: int = 1) -> Rate:
-    """A failure rate with an interval that holds at any time, together with `among - 1` others.
+def anytime_interval(failures: int, simulations: int, confidence: float = 0.95) -> Rate:
+    """Compute an interval that holds at all times, for samples stopped by their own outcomes.
+
+    The rates at which a mixture of binomial likelihoods over a Beta(1/2, 1/2) prior has not grown
+    to `1 / (1 - confidence)` times that of the rate itself. Wider than `clopper_pearson`, by a
+    factor of 1.5 to 2.
+
+    **Arguments:** as `clopper_pearson`, but anything may have decided the number of simulations.
+
+    **Returns:** the `Rate`.
+
+    **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
+    `0 < confidence < 1`.
+    """
+    check_counts(failures, simulations)
+    check_fraction("confidence", confidence)
+    k, n = failures, simulations
+    mixture = (
+        math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1) - math.log(math.pi)
+    )
+    limit = mixture + math.log(1 - confidence)
+
+    def inside(rate: float) -> bool:
+        return _log_power(rate, k) + _log_power(1 - rate, n - k) >= limit
+
+    low, high = (_border(k / n, end, inside) for end in (0.0, 1.0))
+    return Rate(k, n, low, high, confidence, at_any_time=True)
+
+
+def simultaneous_interval(
+    failures: int, simulations: int, confidence: float = 0.95, among: int = 1
+) -> Rate:
+    """Compute an interval that holds at all times, together with those of other rates.
+
+    Each side of each of N intervals has error `(1 - confidence) / (2 N)`, so that all of them hold
+    together with probability `confidence` (Bonferroni), however the samples depend on each other:
+    policies share their features.
+
+    **Arguments:**
+
+    - `failures`: samples that failed.
+    - `simulations`: samples in all; anything may have decided their number.
+    - `confidence`: probability with which all intervals are to hold.
+    - `among`: number of rates, this one included.
+
+    **Returns:** the `Rate`.
 
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1`,
     `0 < confidence < 1` and `among >= 1`.
     """
-    if simulations < 1 or not 0 <= failures <= simulations:
-        raise ValueError(
-            "a rate needs 0 <= failures <= simulations and at least one simulation; "
-            f"got (failures={failures}, simulations={simulations})"
-        )
-    limit = needed(confidence, among)
+    check_counts(failures, simulations)
+    limit = required_evidence(confidence, among)
 
-    def border(outside: float, evidence: Any) -> float:
-        """Where the evidence reaches the limit, between the estimate and an end of [0, 1]."""
-        within = failures / simulations
-        if within == outside or float(evidence(failures, simulations, outside)) < limit:
-            return outside
-        for _ in range(60):
-            middle = (within + outside) / 2
-            if float(evidence(failures, simulations, middle)) < limit:
-                within = middle
-            else:
-                outside = middle
-        return outside
+    def not_too_low(rate: float) -> bool:
+        return float(evidence_above(failures, simulations, rate)) < limit
 
-    low, high = border(0.0, evidence_above), border(1.0, evidence_below)
+    def not_too_high(rate: float) -> bool:
+        return float(evidence_below(failures, simulations, rate)) < limit
+
+    estimate = failures / simulations
+    low, high = _border(estimate, 0.0, not_too_low), _border(estimate, 1.0, not_too_high)
     return Rate(failures, simulations, low, high, confidence, at_any_time=True)
 
 
-def needed(confidence: float, among: int) -> float:
-    """Logarithm of the likelihood ratio at which a rate is rejected on one side.
+def required_evidence(confidence: float, among: int) -> float:
+    """Compute the logarithm of the likelihood ratio at which a rate is rejected on one side.
 
     **Raises:** `ValueError` unless `0 < confidence < 1` and `among >= 1`.
     """
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
-    if among < 1:
-        raise ValueError(f"among must be at least 1; got {among}")
-    return math.log(2 * among / (1 - confidence))
+    check_fraction("confidence", confidence)
+    return math.log(2 * check_count("among", among) / (1 - confidence))
 
 
-def evidence_below(
-    failures: Int[np.ndarray, " n"] | float,
-    simulations: Int[np.ndarray, " n"] | int,
-    rate: Float[np.ndarray, " n"] | float,
-) -> Float[np.ndarray, " n"]:
-    """Logarithm of the likelihood ratio against `rate` of the mixture over the rates below it.
+def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float[np.ndarray, "*n"]:
+    """Compute the logarithm of the likelihood ratio of the lower rates against `rate`.
 
-    The mixture is an atom at 0 and, above it, a density proportional to `t^(-1/2)`. `failures` may
-    be fractions, for what is expected of samples to come.
+    The mixture is an atom at 0 and, above it, a density proportional to `t^(-1/2)`.
+
+    **Arguments:**
+
+    - `failures`, `simulations`: numbers of samples, which broadcast; `failures` may be fractions,
+      for what is expected of samples to come.
+    - `rate`: rates to reject from above.
+
+    **Returns:** the logarithms.
     """
     from scipy.special import betainc, betaln
 
-    k, n, q = _floats(failures, simulations, rate)
+    k, n, q = (np.asarray(value, np.float64) for value in (failures, simulations, rate))
     with np.errstate(divide="ignore", invalid="ignore"):
-        null = _likelihood(k, n, q)
+        null = _log_likelihood(k, n, q)
         part = np.log(betainc(k + 0.5, n - k + 1, q)) + betaln(k + 0.5, n - k + 1)
         spread = math.log(1 - ATOM) + part - np.log(2 * np.sqrt(q))
         atom = np.where(k == 0, math.log(ATOM), -np.inf)
-        found = np.logaddexp(atom, spread) - null
-    # Nothing is below 0; a rate of 1 is refuted by a single success.
-    found = np.where(q <= 0, -np.inf, found)
-    return np.where((q >= 1) & (k < n), np.inf, np.where((q >= 1) & (k >= n), -np.inf, found))
+        evidence = np.logaddexp(atom, spread) - null
+    # Nothing is below 0; a rate of 1 is rejected by a single success.
+    evidence = np.where(q <= 0, -np.inf, evidence)
+    return np.where((q >= 1) & (k < n), np.inf, np.where((q >= 1) & (k >= n), -np.inf, evidence))
 
 
-def evidence_above(
-    failures: Int[np.ndarray, " n"] | float,
-    simulations: Int[np.ndarray, " n"] | int,
-    rate: Float[np.ndarray, " n"] | float,
-) -> Float[np.ndarray, " n"]:
-    """Logarithm of the likelihood ratio against `rate` of the mixture over the rates above it.
+def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float[np.ndarray, "*n"]:
+    """Compute the logarithm of the likelihood ratio of the higher rates against `rate`.
 
     The mixture has a density proportional to `t^(-1/2) (1-t)^(-1/2)` there.
+
+    **Arguments:** as `evidence_below`, with rates to reject from below.
+
+    **Returns:** the logarithms.
     """
     from scipy.special import betaincc, betaln
 
-    k, n, q = _floats(failures, simulations, rate)
+    k, n, q = (np.asarray(value, np.float64) for value in (failures, simulations, rate))
     with np.errstate(divide="ignore", invalid="ignore"):
-        null = _likelihood(k, n, q)
+        null = _log_likelihood(k, n, q)
         part = np.log(betaincc(k + 0.5, n - k + 0.5, q)) + betaln(k + 0.5, n - k + 0.5)
         whole = np.log(betaincc(0.5, 0.5, q)) + betaln(0.5, 0.5)
-        found = part - whole - null
-    found = np.where(q >= 1, -np.inf, found)
-    return np.where((q <= 0) & (k > 0), np.inf, np.where((q <= 0) & (k <= 0), -np.inf, found))
+        evidence = part - whole - null
+    evidence = np.where(q >= 1, -np.inf, evidence)
+    return np.where((q <= 0) & (k > 0), np.inf, np.where((q <= 0) & (k <= 0), -np.inf, evidence))
 
 
 def verdict(rate: Rate | None, p: float) -> str:
-    """`"safe@p"` if the whole interval is below `p`, `"unsafe"` if it is above, or `"undecided"`.
+    """Return `"safe@p"`, `"unsafe"` or `"undecided"`: the interval below `p`, above it, or neither.
 
     So "unsafe" is a statement about the probability of failure. A counterexample alone is none: a
     policy that fails once in a million is safe at 0.01.
@@ -143,16 +181,29 @@ def verdict(rate: Rate | None, p: float) -> str:
 
 
 def safe_at(p: float) -> str:
-    """The verdict of a policy whose failure rate is below `p`."""
+    """Write the verdict of a policy whose failure rate is below `p`."""
     return f"safe@{p:g}"
 
 
-def _floats(*values: Any) -> tuple[np.ndarray, ...]:
-    return tuple(np.asarray(value, np.float64) for value in values)
+def _border(within: float, outside: float, inside: Callable[[float], bool]) -> float:
+    """Find where an interval ends, between the estimate, which is inside, and an end of [0, 1]."""
+    if inside(outside):
+        return outside
+    for _ in range(60):
+        middle = (within + outside) / 2
+        within, outside = (middle, outside) if inside(middle) else (within, middle)
+    return outside
 
 
-def _likelihood(k: np.ndarray, n: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Logarithm of the probability of one sequence with `k` failures."""
+def _log_power(base: float, exponent: int) -> float:
+    """Compute the logarithm of `base ** exponent`, for a base in [0, 1]."""
+    if exponent == 0:
+        return 0.0
+    return exponent * math.log(base) if base > 0 else -math.inf
+
+
+def _log_likelihood(k: np.ndarray, n: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Compute the logarithm of the probability of one sequence with `k` failures."""
     from scipy.special import xlog1py, xlogy
 
     return xlogy(k, q) + xlog1py(n - k, -q)

@@ -1,73 +1,97 @@
-"""The next parameters, from robustness and its slopes in several environments: two small problems.
+"""Least distance programming: the shortest vector that satisfies linear inequalities.
 
-`uphill` raises the least of the linearised robustnesses as far as a box allows (a linear program);
-`least_change` is the point nearest to the nominal parameters at which all of them reach a target (a
-quadratic one). Both are exact for their linear model; who takes the step checks it by simulation.
+    shortest(np.array([[1.0, 1.0]]), np.array([2.0]))                # [1, 1]: x + y >= 2
+
+Solved by non-negative least squares on the dual problem: Lawson and Hanson, Solving least squares
+problems (1974), chapter 23.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 
-def uphill(
-    theta: Float[np.ndarray, " p"],
-    rho: Float[np.ndarray, " n"],
-    slopes: Float[np.ndarray, "n p"],
-    radius: float,
-    *,
-    free: Bool[np.ndarray, " p"],
-    bounded: bool,
-) -> Float[np.ndarray, " p"]:
-    """The step within `radius` a coordinate that raises `min(rho + slopes @ step)` most.
+def shortest(
+    matrix: Float[np.ndarray, "m k"], bound: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " k"] | None:
+    """Compute the shortest `z` with `matrix @ z >= bound`.
 
-    - `free`: coordinates that may move; `bounded`: whether they stay in the unit cube.
+    **Arguments:**
+
+    - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
+    - `bound`: least value of each row.
+
+    **Returns:** the vector; None where the inequalities contradict each other.
     """
-    step = np.zeros_like(theta)
-    places = np.flatnonzero(free & np.any(slopes != 0, axis=0))
-    rows = np.flatnonzero(np.isfinite(rho))
-    if not len(places) or not len(rows):
-        return step
-    low, high = np.full(len(places), -radius), np.full(len(places), radius)
-    if bounded:
-        low, high = np.maximum(low, -theta[places]), np.minimum(high, 1 - theta[places])
-    linear = slopes[np.ix_(rows, places)]
-    if len(rows) == 1:
-        step[places] = np.where(linear[0] > 0, high, np.where(linear[0] < 0, low, 0.0))
-        return step
-    from scipy.optimize import linprog
+    if np.all(bound <= 0):
+        return np.zeros(matrix.shape[1])
+    from scipy.optimize import nnls
 
-    # In units of the radius and of the largest slope, which a solver's tolerances are made for.
-    scale = np.abs(linear).max() * radius
-    least = rho[rows].min()
-    found = linprog(
-        np.append(np.zeros(len(places)), -1.0),
-        A_ub=np.hstack([-linear * radius / scale, np.ones((len(rows), 1))]),
-        b_ub=(rho[rows] - least) / scale,
-        bounds=[*zip(low / radius, high / radius, strict=True), (None, None)],
+    size = np.abs(bound).max()
+    dual = np.vstack([matrix.T, bound / size])
+    right = np.append(np.zeros(matrix.shape[1]), 1.0)
+    try:
+        weights, _ = nnls(dual, right)
+    except RuntimeError:
+        return None  # It has not converged.
+    residual = dual @ weights - right
+    if residual @ residual < 1e-14:
+        return None
+    return -residual[:-1] / residual[-1] * size
+
+
+def shortest_in_box(
+    rows: Float[np.ndarray, "m k"],
+    most: Float[np.ndarray, " m"],
+    low: Float[np.ndarray, " k"],
+    high: Float[np.ndarray, " k"],
+) -> Float[np.ndarray, " k"] | None:
+    """Compute the shortest `z` with `rows @ z <= most` and `low <= z <= high`.
+
+    **Arguments:**
+
+    - `rows`, `most`: linear inequalities; rows of zeros are left out.
+    - `low`, `high`: the box.
+
+    **Returns:** the vector; None where there is none.
+    """
+    sizes = np.linalg.norm(rows, axis=1)
+    rows, most, sizes = rows[sizes > 0], most[sizes > 0], sizes[sizes > 0]
+    identity = np.eye(rows.shape[1])
+    z = shortest(
+        np.concatenate([-rows / sizes[:, None], identity, -identity]),
+        np.concatenate([-most / sizes, low, -high]),
     )
-    if found.status == 0:
-        step[places] = np.clip(found.x[:-1] * radius, low, high)
-    return step
+    return None if z is None else np.clip(z, low, high)
 
 
 def least_change(
     theta: Float[np.ndarray, " p"],
     nominal: Float[np.ndarray, " p"],
     rho: Float[np.ndarray, " n"],
-    slopes: Float[np.ndarray, "n p"],
+    gradients: Float[np.ndarray, "n p"],
     target: float,
     *,
     free: Bool[np.ndarray, " p"],
     bounded: bool,
 ) -> Float[np.ndarray, " p"] | None:
-    """The step to the point nearest to `nominal` with `rho + slopes @ step >= target`.
+    """Compute the step to the point nearest to `nominal` with `rho + gradients @ step >= target`.
 
-    None where the linear model has no such point. Least distance programming by non-negative least
-    squares: Lawson and Hanson, Solving least squares problems (1974), chapter 23.
+    Exact for this linear model; the caller checks the step by simulation.
+
+    **Arguments:**
+
+    - `theta`: present parameters, from which the step is taken.
+    - `nominal`: parameters to stay near to.
+    - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
+    - `target`: robustness to reach in every environment.
+    - `free`: coordinates that may move.
+    - `bounded`: whether they stay in the unit cube.
+
+    **Returns:** the step; None where the linear model has no such point.
     """
     places = np.flatnonzero(free)
     rows = np.flatnonzero(np.isfinite(rho))
-    linear = slopes[np.ix_(rows, places)]
+    linear = gradients[np.ix_(rows, places)]
     gap = (theta - nominal)[places]
     # With z = theta + step - nominal: linear @ z >= bound.
     bound = target - rho[rows] + linear @ gap
@@ -80,20 +104,9 @@ def least_change(
         identity = np.eye(len(places))
         matrix = np.vstack([matrix, identity, -identity])
         bound = np.concatenate([bound, -nominal[places], nominal[places] - 1])
-    step = np.zeros_like(theta)
-    if np.all(bound <= 0):
-        step[places] = -gap
-        return step
-    from scipy.optimize import nnls
-
-    size = np.abs(bound).max()
-    right = np.append(np.zeros(len(places)), 1.0)
-    try:
-        weights, _ = nnls(np.vstack([matrix.T, bound / size]), right)
-    except RuntimeError:
-        return None  # It has not converged.
-    residual = np.vstack([matrix.T, bound / size]) @ weights - right
-    if residual @ residual < 1e-14:
+    z = shortest(matrix, bound)
+    if z is None:
         return None
-    step[places] = -residual[:-1] / residual[-1] * size - gap
+    step = np.zeros_like(theta)
+    step[places] = z - gap
     return step

@@ -1,4 +1,4 @@
-"""Exact non-dominated sorting: which points no other point outdoes, then which of the rest, ...
+"""Exact non-dominated sorting: the points that no other dominates, then those of the rest, ...
 
     fronts([[0.0, 5.0], [1.0, 1.0], [2.0, 6.0]])      # 0, 0, 1: all objectives are minimised
 
@@ -9,35 +9,38 @@ elitist multiobjective genetic algorithm: NSGA-II, IEEE Transactions on Evolutio
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 _MOST_PAIRS = 2**24
 """Comparisons made in one go."""
 
 
-def fronts(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
-    """The front of each point: 0 for those that none dominates, 1 once these are gone, and so on.
+def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
+    """Number the front of each point: 0 for those that none dominates, 1 once these are gone, ...
 
-    - `points`: one row a point, one column an objective, all to be minimised. Infinite entries
-      compare as numbers do.
+    **Arguments:**
 
-    A point with a NaN takes no part; its front is -1.
+    - `points`: `[n, objectives]`, all objectives to be minimised. Infinite entries compare as
+      numbers do.
+
+    **Returns:** the numbers; -1 for a point with a NaN, which takes no part.
 
     **Raises:** `ValueError` for points that are no matrix.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2:
         raise ValueError(f"points must have shape [n, objectives]; got {list(points.shape)}")
-    found = np.full(len(points), -1, np.int64)
+    numbers = np.full(len(points), -1, np.int64)
     places = np.flatnonzero(~np.isnan(points).any(axis=1))
     # Equal points share a front: the distinct ones are enough, and there are often few.
     distinct, which = np.unique(points[places], axis=0, return_inverse=True)
-    found[places] = _of_distinct(distinct)[which.ravel()]
-    return found
+    numbers[places] = _fronts_of_distinct(distinct)[which.ravel()]
+    return numbers
 
 
-def _of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
-    """Fronts of points that differ and are sorted by their first objective, then their second."""
-    found = np.full(len(points), -1, np.int64)
+def _fronts_of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
+    """Number the fronts of points that differ and are sorted by their first objective."""
+    numbers = np.full(len(points), -1, np.int64)
     left, front = np.arange(len(points)), 0
     while len(left):
         some = points[left]
@@ -48,6 +51,6 @@ def _of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, "
             # Distinct points: nowhere worse means somewhere better, but for the point itself.
             least = (some[None] <= part[:, None]).all(axis=2).sum(axis=1)
             dominated[begin : begin + together] = least > 1
-        found[left[~dominated]] = front
+        numbers[left[~dominated]] = front
         left, front = left[dominated], front + 1
-    return found
+    return numbers

@@ -1,16 +1,11 @@
-"""The clock of a sweep: what its time goes to, how much is left, and a bar for each stage.
-
-Drawn by rich on the error stream, on a terminal or in a notebook that has ipywidgets; nothing
-elsewhere.
-"""
+"""The clock of a sweep: what its time goes to, how much is left, and a bar for each stage."""
 
 import contextlib
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
 
-from verifai_jax.core.progress import _watched
+from verifai_jax.core.progress import ProgressBar
 
 TRAINING, COMPILING, CERTIFYING = "training", "compiling", "certifying"
 
@@ -23,41 +18,24 @@ class Watch:
     """A context manager around a sweep.
 
     - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
-    - `show`: whether to draw; None and True decide by where the output goes.
+    - `show`: whether to draw; None decides by where the error stream goes.
 
     `seconds` is what was spent in each stage; compiling is taken out of training.
     """
 
     def __init__(self, name: str, max_seconds: float | None, show: bool | None) -> None:
-        self.name, self.show = name, show is not False and _watched()
+        self.name, self._bar = name, ProgressBar(show)
         self.seconds: dict[str, float] = defaultdict(float)
         self._began = time.perf_counter()
         self._until = None if max_seconds is None else self._began + max_seconds
         self._limit = self._until
-        self._bar: Any = None
-        self._task: Any = None
 
     def __enter__(self) -> "Watch":
-        if self.show:
-            from rich.console import Console
-            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bar
-
-            self._bar = Bar(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}"),
-                TextColumn("{task.fields[figures]}"),
-                TimeRemainingColumn(),
-                console=Console(stderr=True),
-                transient=True,
-            )
-            self._bar.start()
+        self._bar.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        self._bar.__exit__()
 
     @property
     def elapsed(self) -> float:
@@ -73,27 +51,21 @@ class Watch:
         began, inner = time.perf_counter(), self.seconds[COMPILING]
         if self._until is not None:
             self._limit = self._began + share * (self._until - self._began)
-        if self._bar is not None:
-            words = f"{self.name}: {name}"
-            self._task = self._bar.add_task(words, total=total, unit=unit, figures="compiling")
+        self._bar.begin(f"{self.name}: {name}", total, unit)
         try:
             yield
         finally:
             compiled = self.seconds[COMPILING] - inner
             self.seconds[name] += time.perf_counter() - began - compiled
-            if self._bar is not None:
-                self._bar.remove_task(self._task)
-                self._task = None
+            self._bar.end()
 
     def advance(self, amount: float, figures: str = "") -> None:
         """Tell that so much more is done."""
-        if self._task is not None:
-            self._bar.update(self._task, advance=amount, figures=figures)
+        self._bar.advance(amount, figures)
 
     def told(self, done: float, total: float, figures: str) -> None:
         """Tell that `done` of `total` are done; the total may have changed."""
-        if self._task is not None:
-            self._bar.update(self._task, completed=done, total=total, figures=figures)
+        self._bar.update(done, total, figures)
 
     def compiled(self, seconds: float) -> None:
         """Tell that so much of the present stage went into compiling."""

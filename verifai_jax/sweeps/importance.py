@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis._pca import Components, pca
+from verifai_jax.core.text import format_percent
 from verifai_jax.features import Constant, FeatureSpace
 from verifai_jax.sweeps.fanova import boxes_of, variance_shares
 from verifai_jax.sweeps.trends import trends
@@ -118,7 +119,7 @@ class HyperparameterImportance:
             order = [j for j in np.argsort(-losses, kind="stable") if losses[j] >= LEAST_LOSS]
             shares = self.table[f"{target}_total"].to_numpy(float)
             listed = ", ".join(
-                f"{self.table.index[j]} ({shares[j]:.0%} of the variance)"
+                f"{self.table.index[j]} ({format_percent(float(shares[j]))} of the variance)"
                 for j in order[:MOST_NAMED]
             )
             lines.append(f"{what} depends on {listed or 'no single one'}; {score}")
@@ -147,7 +148,7 @@ class HyperparameterImportance:
                 )
                 lines.append(
                     f"{what} configurations vary most along {parts} "
-                    f"({components.shares[0]:.0%} of their variance)"
+                    f"({format_percent(components.shares[0])} of their variance)"
                 )
         return lines
 

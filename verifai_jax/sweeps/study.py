@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula
@@ -77,10 +78,9 @@ class Study:
                 f"problem must be a function from a policy to a Problem; got {self.problem!r}"
             )
         object.__setattr__(self, "training_seeds", _seeds(self.seeds))
-        snapshots = tuple(_count(at, "a snapshot") for at in self.snapshots)
+        snapshots = tuple(check_count("a snapshot", at, error=StudyError) for at in self.snapshots)
         object.__setattr__(self, "snapshots", tuple(sorted(set(snapshots))))
-        if not 0 < self.p < 1:
-            raise StudyError(f"p must lie between 0 and 1; got {self.p}")
+        check_fraction("p", self.p, error=StudyError)
         if self.curve is not None:
             object.__setattr__(self, "curve_formula", check_curve(self.curve))
 
@@ -168,14 +168,8 @@ class Study:
 
 def _seeds(seeds: Any) -> tuple[int, ...]:
     if isinstance(seeds, Sequence) and not isinstance(seeds, str):
-        found = tuple(_count(seed, "a training seed", least=0) for seed in seeds)
+        found = tuple(check_count("a training seed", seed, 0, error=StudyError) for seed in seeds)
         if not found or len(set(found)) < len(found):
             raise StudyError(f"training seeds must be different, at least one; got {seeds!r}")
         return found
-    return tuple(range(_count(seeds, "seeds")))
-
-
-def _count(value: Any, what: str, least: int = 1) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise StudyError(f"{what} must be a whole number of at least {least}; got {value!r}")
-    return value
+    return tuple(range(check_count("seeds", seeds, error=StudyError)))

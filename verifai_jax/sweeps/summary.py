@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.core.text import format_features
+from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.sweeps.ranking import (
     chosen_first,
     is_safe,
@@ -97,7 +97,7 @@ def verdict_counts(rows: Any) -> str:
 
 def interval(row: Any) -> str:
     """The failures of a row and the ends of its failure probability."""
-    text = f"between {percent(row['failure_low'])} and {percent(row['failure_high'])}"
+    text = f"between {format_percent(row['failure_low'])} and {format_percent(row['failure_high'])}"
     if row["simulations"] > 0:
         return f"{failures(row)}: {text}"
     return f"failure probability {text}"
@@ -107,13 +107,6 @@ def failures(row: Any) -> str:
     """How many of the samples failed; those without a verdict count as failures, as in the rate."""
     failed = round(float(row["failure_rate"]) * float(row["simulations"]))
     return f"{failed:,} of {int(row['simulations']):,} simulations fail"
-
-
-def percent(probability: float) -> str:
-    """A probability for people, three digits at most."""
-    if not np.isfinite(probability):
-        return "unknown"
-    return f"{100 * probability:.3g} %" if probability < 0.9995 else "100 %"
 
 
 def number(value: float) -> str:
@@ -161,7 +154,7 @@ def _html_row(i: int, row: Any, names: list[str]) -> str:
     colour = SAFE if verdict.startswith("safe") else WITHOUT_VERDICT
     colour = FAILING if verdict == "unsafe" else colour
     shown = [
-        f"{percent(row['failure_low'])} to {percent(row['failure_high'])}",
+        f"{format_percent(row['failure_low'])} to {format_percent(row['failure_high'])}",
         number(row["nominal_return"]),
         f"{int(row['steps']):,}",
         *(format_features({name: row[name]}).partition("=")[2] for name in names),
@@ -224,7 +217,7 @@ def _lost(table: Any) -> str:
 
 
 def _below(sweep: "Sweep") -> str:
-    return "" if sweep.p is None else f" (failure probability below {percent(sweep.p)})"
+    return "" if sweep.p is None else f" (failure probability below {format_percent(sweep.p)})"
 
 
 def _evidence(sweep: "Sweep") -> str:
@@ -236,7 +229,7 @@ def _evidence(sweep: "Sweep") -> str:
     text = f"{total:,} fresh simulations"
     confidence = sweep.record.options.get("confidence")
     if confidence is not None:
-        text += f"; all intervals hold together at {100 * float(confidence):g} % confidence"
+        text += f"; all intervals hold together at {format_percent(float(confidence))} confidence"
     return text
 
 

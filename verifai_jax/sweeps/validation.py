@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.sweeps.halving import Halving
 from verifai_jax.sweeps.study import Study, StudyError
 from verifai_jax.sweeps.trainer import STEPS
@@ -33,13 +34,12 @@ def check_asked(
     if batch is not None:
         counts["batch"] = batch
     for name, value in counts.items():
-        _check_count(name, value, 1)
+        check_count(name, value)
     for name, value in {"seed": seed, "attack_simulations": attack_simulations}.items():
-        _check_count(name, value, 0)
-    if not 0 < confidence < 1:
-        raise ValueError(f"confidence must lie between 0 and 1; got {confidence}")
-    if max_seconds is not None and not max_seconds > 0:
-        raise ValueError(f"max_seconds must be positive; got {max_seconds}")
+        check_count(name, value, 0)
+    check_fraction("confidence", confidence)
+    if max_seconds is not None:
+        check_positive("max_seconds", max_seconds)
     if halving is not None:
         _check_halving(study, halving)
     if budget is not None:
@@ -60,11 +60,6 @@ def most_policies(study: Study, configurations: int, halving: Halving | None) ->
         total += going
         going = going if halving is None else halving.count(going)
     return total * len(study.training_seeds)
-
-
-def _check_count(name: str, value: Any, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}; got {value!r}")
 
 
 def _check_halving(study: Study, halving: Any) -> None:

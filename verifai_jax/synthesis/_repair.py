@@ -25,7 +25,8 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.least_distance import least_change, uphill
+from verifai_jax.statistics.least_distance import least_change
+from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis._synthesize import ATTACK, attacker, check_numbers, feature_loop
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.held_out import held_out
@@ -381,7 +382,7 @@ class _Repair:
         if np.min(rho, initial=np.inf) < self.enough:
             if loop.dim <= 64:
                 steps.append(
-                    uphill(theta, rho, slopes, radius, free=loop.free, bounded=loop.bounded)
+                    max_min_step(theta, rho, slopes, radius, free=loop.free, bounded=loop.bounded)
                 )
             else:
                 worst = slopes[int(np.argmin(rho))]

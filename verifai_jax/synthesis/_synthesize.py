@@ -19,13 +19,14 @@ import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax.core.budget import Limits, timed
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options, check_search, usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.least_distance import uphill
+from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.held_out import drawn, held_out
 from verifai_jax.synthesis.optimize import (
@@ -254,7 +255,9 @@ class _Search:
 
     def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
         def step(radius: float) -> Any:
-            moved = theta + uphill(theta, rho, slopes, radius, free=self.loop.free, bounded=True)
+            moved = theta + max_min_step(
+                theta, rho, slopes, radius, free=self.loop.free, bounded=True
+            )
             return np.clip(moved, 0.0, 1.0)
 
         return [step(radius), step(radius / 3), step(radius / 10)]
@@ -349,10 +352,7 @@ def check_numbers(margin: Any, **counts: Any) -> None:
     if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
         raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
     for name, count in counts.items():
-        least = 0 if name == "held_out" else 1
-        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
-        if not whole or count < least:
-            raise ValueError(f"{name} must be an integer of at least {least}; got {count!r}")
+        check_count(name, count, 0 if name == "held_out" else 1)
 
 
 def feature_loop(

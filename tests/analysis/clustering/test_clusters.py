@@ -172,7 +172,7 @@ def test_refused():
         clusters(frame, "kmodes", columns=["x"])
     with pytest.raises(ValueError, match="count must be from 1 to 3, the number of different rows"):
         clusters(frame, "kmodes", count=4)
-    with pytest.raises(ValueError, match="count must be a whole number of at least 1; got 0"):
+    with pytest.raises(ValueError, match="count must be an integer of at least 1; got 0"):
         clusters(frame, count=0)
     with pytest.raises(ValueError, match="dbscan finds the number of clusters itself; got count=3"):
         clusters(frame, "dbscan", count=3)

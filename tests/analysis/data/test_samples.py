@@ -244,7 +244,7 @@ def test_generators():
     assert draws[0] == draws[1] != draws[2]
     keyed = [generator(jax.random.key(seed)).uniform() for seed in (3, 3, 4)]
     assert keyed[0] == keyed[1] != keyed[2]
-    with pytest.raises(ValueError, match="the seed must be a whole number of at least 0; got -1"):
+    with pytest.raises(ValueError, match="the seed must be an integer of at least 0; got -1"):
         generator(-1)
 
 

@@ -197,7 +197,7 @@ def test_black_boxes_are_simulated_and_have_no_gradient():
 
 
 def test_refusals(mixed, ishigami):
-    with pytest.raises(ValueError, match="samples must be a whole number of at least 16; got 3"):
+    with pytest.raises(ValueError, match="samples must be an integer of at least 16; got 3"):
         sobol_indices(mixed, samples=3)
     with pytest.raises(ValueError, match="levels must be an even number of at least 2; got 5"):
         morris(mixed, levels=5)

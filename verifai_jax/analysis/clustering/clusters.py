@@ -28,10 +28,10 @@ from verifai_jax.analysis.data.samples import (
     beside,
     distances,
     generator,
-    whole,
 )
+from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.lazy import late
-from verifai_jax.core.text import format_features
+from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -151,8 +151,9 @@ class Clusters:
             where = format_features({name: self.centres.at[cluster, name] for name in features[:8]})
             size, share, typical, worst = (self.entry(cluster, name) for name in _OWN[:4])
             lines.append(
-                f"  {f'{cluster}:' if cluster >= 0 else 'noise:'} {size:,} rows ({share:.0%}) "
-                f"around {where}{more}; typical row {typical}, worst row {worst}"
+                f"  {f'{cluster}:' if cluster >= 0 else 'noise:'} {size:,} rows "
+                f"({format_percent(share)}) around {where}{more}; typical row {typical}, "
+                f"worst row {worst}"
             )
         return "\n".join(lines)
 
@@ -213,8 +214,8 @@ def clusters(
     placed = _place(samples, scale, weight)
     different = len(np.unique(np.concatenate(placed, axis=1), axis=0))
     if count is None:
-        count = _best_count(placed, min(whole(most, "most"), different), rng)
-    elif whole(count, "count") > different:
+        count = _best_count(placed, min(check_count("most", most), different), rng)
+    elif check_count("count", count) > different:
         raise ValueError(
             f"count must be from 1 to {different}, the number of different rows among "
             f"{samples.kind}; got {count}"
@@ -279,8 +280,8 @@ def _dense(
 ) -> Clusters:
     if count is not None:
         raise ValueError(f"dbscan finds the number of clusters itself; got count={count!r}")
-    if radius is not None and not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive and finite; got {radius!r}")
+    if radius is not None:
+        check_positive("radius", radius, finite=True)
     needed = max(4, 2 * len(samples.columns))
     found, radius = dbscan(samples.points(scale), needed, radius, rng)
     score = _silhouette(samples.place(scale), found, rng)

@@ -10,7 +10,6 @@ Results always speak of row numbers of the table (`samples.rows`), never of plac
 looked at.
 """
 
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.analysis.data.columns import Column, describe_columns, feature_columns
 from verifai_jax.analysis.data.verdicts import chosen, nothing, verdicts
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
@@ -312,17 +312,6 @@ def distances(
     return np.sqrt(squared)
 
 
-def whole(value: Any, what: str, least: int = 1) -> int:
-    """A whole number of at least `least`; `what` names it in the error."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool) or number < least:
-        raise ValueError(f"{what} must be a whole number of at least {least}; got {value!r}")
-    return number
-
-
 def beside(frame: "pd.DataFrame", own: "pd.DataFrame") -> "pd.DataFrame":
     """The columns of `frame` and, after them, `own` ones, `_` added to a name that is taken."""
     return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
@@ -339,7 +328,7 @@ def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.G
         keyed = jnp.issubdtype(seed.dtype, jax.dtypes.prng_key)
         data = np.asarray(jax.random.key_data(seed) if keyed else seed)
         return np.random.default_rng([int(word) for word in data.ravel()])
-    return np.random.default_rng(whole(seed, "the seed", least=0))
+    return np.random.default_rng(check_count("the seed", seed, 0))
 
 
 def _described(

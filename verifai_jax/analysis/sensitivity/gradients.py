@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from verifai_jax.analysis.data.samples import whole
 from verifai_jax.analysis.sensitivity.sensitivity import (
     RESAMPLES,
     Sensitivity,
@@ -12,6 +11,7 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     ranked,
     variance_of,
 )
+from verifai_jax.core.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 
@@ -46,7 +46,7 @@ def gradient_sensitivity(
             f"the system of problem {problem.name!r} is a black box, which has no gradient; "
             "use sobol_indices or morris"
         )
-    whole(samples, "samples", 16)
+    check_count("samples", samples, 16)
     space = coordinates_of(problem)
     continuous = np.array(space.levels) == 0
     if not continuous.any():

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.data.samples import whole
 from verifai_jax.analysis.sensitivity.sensitivity import (
     RESAMPLES,
     Coordinates,
@@ -17,6 +16,7 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     ranked,
     variance_of,
 )
+from verifai_jax.core.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 
@@ -49,7 +49,7 @@ def morris(
     of levels; where no simulation has a verdict or the robustness never varies.
     """
     check_problem(problem, "elementary effects", of)
-    whole(trajectories, "trajectories", 2)
+    check_count("trajectories", trajectories, 2)
     if not isinstance(levels, int) or levels < 2 or levels % 2:
         raise ValueError(f"levels must be an even number of at least 2; got {levels!r}")
     space = coordinates_of(problem)

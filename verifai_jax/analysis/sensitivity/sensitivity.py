@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.engine import engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -186,9 +187,9 @@ def ranked(names: tuple[str, ...], columns: dict[str, Any], by: str) -> "pd.Data
 
 def _words(method: str, row: Any) -> str:
     if "total" in row:
-        between = f"{100 * row['total_low']:.1f} to {100 * row['total_high']:.1f} %"
-        alone = f"{100 * max(row['first'], 0):5.1f} % alone"
-        return f"{100 * row['total']:5.1f} % of the variance in all ({between}), {alone}"
+        between = f"{format_percent(row['total_low'])} to {format_percent(row['total_high'])}"
+        alone = f"{format_percent(max(row['first'], 0))} alone"
+        return f"{format_percent(row['total'])} of the variance in all ({between}), {alone}"
     if "mu_star" in row:
         way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
         return (
@@ -200,5 +201,5 @@ def _words(method: str, row: Any) -> str:
     slope = f"typical slope {row['typical']:.3g}"
     if row["bound"] >= 1:
         return f"no bound below 100 %: mean squared slope {row['mean_squared']:.3g}, {slope}"
-    between = f"{100 * row['low']:.1f} to {100 * row['high']:.1f} %"
-    return f"at most {100 * row['bound']:.1f} % of the variance ({between}), {slope}"
+    between = f"{format_percent(row['low'])} to {format_percent(row['high'])}"
+    return f"at most {format_percent(row['bound'])} of the variance ({between}), {slope}"

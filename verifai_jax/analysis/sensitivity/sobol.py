@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.analysis.data.samples import whole
 from verifai_jax.analysis.sensitivity.sensitivity import (
     RESAMPLES,
     Sensitivity,
@@ -13,6 +12,7 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     ranked,
     variance_of,
 )
+from verifai_jax.core.checks import check_count
 from verifai_jax.problem.problem import Problem
 
 NOISE = "(simulation noise)"
@@ -45,7 +45,7 @@ def sobol_indices(
     fewer than 16 samples; where no simulation has a verdict or the robustness never varies.
     """
     check_problem(problem, "Sobol indices", of)
-    whole(samples, "samples", 16)
+    check_count("samples", samples, 16)
     names = coordinates_of(problem).names
     d = len(names)
     from scipy.stats import qmc

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.stepping import Shown, kept, vector
 from verifai_jax.rl.task.task import Continuous
@@ -86,8 +87,7 @@ def brax_task(
     backend; `ValueError` for one in a wrapper that resets, ends or batches episodes, and for
     observations that are no array.
     """
-    if isinstance(time_limit, bool) or not isinstance(time_limit, int) or time_limit < 1:
-        raise ValueError(f"time_limit must be an integer of at least 1; got {time_limit!r}")
+    check_count("time_limit", time_limit)
     chosen = tuple(sorted((options or {}).items()))
     made = (_known if isinstance(env, str) else _made)(env, backend, chosen)
     task = BraxTask(made.env, made.name, time_limit)

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, require, suggests_options
 from verifai_jax.rl.task.task import Action, Continuous
 from verifai_jax.systems.mujoco.model import load
@@ -152,8 +153,7 @@ def mjx_task(
             "control_period must be a positive multiple of the model's timestep "
             f"{timestep:g} s; got {control_period!r}"
         )
-    if isinstance(time_limit, bool) or not isinstance(time_limit, int) or time_limit < 1:
-        raise ValueError(f"time_limit must be an integer of at least 1; got {time_limit!r}")
+    check_count("time_limit", time_limit)
     if compiled.nu == 0:
         raise ValueError("the model has no actuator for an action to act on")
     chosen = Continuous(-1.0, 1.0, int(compiled.nu)) if action is None else action

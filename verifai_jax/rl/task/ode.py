@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.ode._ode import Ode
@@ -120,8 +121,7 @@ def ode_task(
             )
         control = _itself
     limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit
-    if isinstance(limit, bool) or not isinstance(limit, int) or limit < 1:
-        raise ValueError(f"time_limit must be an integer of at least 1; got {limit!r}")
+    check_count("time_limit", limit)
     given = features if callable(features) else _constant(dict(features or {}))
     task = OdeTask(loop, action, limit, reward, control, observe or _numbers, given)
     key = jax.eval_shape(lambda: jax.random.key(0))

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import FunctionSystem, Outcome, System, as_system
@@ -57,8 +58,8 @@ class TraceForm:
                     )
         if dt is not None and not (_is_number(dt) and 0 < dt < math.inf):
             raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
-        if length is not None and (not isinstance(length, int) or length < 1):
-            raise ValueError(f"length must be an integer of at least 1; got {length!r}")
+        if length is not None:
+            check_count("length", length)
 
     @property
     def widths(self) -> dict[str, int]:

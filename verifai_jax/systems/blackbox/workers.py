@@ -25,6 +25,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import Outcome
 
@@ -68,12 +69,10 @@ class Pool:
         timeout: float | None,
         retries: int,
     ) -> None:
-        if not isinstance(workers, int) or isinstance(workers, bool) or workers < 1:
-            raise ValueError(f"workers must be an integer of at least 1; got {workers!r}")
+        check_count("workers", workers)
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
             raise ValueError(f"timeout must be a positive number of seconds; got {timeout!r}")
-        if not isinstance(retries, int) or isinstance(retries, bool) or retries < 0:
-            raise ValueError(f"retries must be an integer of at least 0; got {retries!r}")
+        check_count("retries", retries, 0)
         if os.name != "posix":
             raise ValueError(
                 "workers need Linux or macOS; leave them out, or use a remote simulator"

@@ -16,6 +16,7 @@ from typing import Any, cast
 import jax
 import numpy as np
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound, is_waveform
@@ -238,8 +239,7 @@ def gymnasium(
     elif not callable(env):
         raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
     _policy_function(policy, compiled=False)
-    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
-        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
+    check_count("steps", steps)
     check_signals_option(signals)
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
     seconds = None if dt is None else sampling_period(dt)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
@@ -346,9 +347,7 @@ def step_count(
         steps = otherwise
     if steps is None:
         raise ValueError("give steps or duration; got neither")
-    if not isinstance(steps, int | np.integer) or isinstance(steps, bool) or steps < 1:
-        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
-    return int(steps)
+    return check_count("steps", steps)
 
 
 def sampling_period(seconds: Any) -> float:

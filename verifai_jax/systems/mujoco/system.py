@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
@@ -215,8 +216,8 @@ def mujoco(
         if part is not None and not callable(part):
             raise ValueError(f"{name} must be a function; got {part!r}")
     for name, count in (("solver_iterations", solver_iterations), ("ls_iterations", ls_iterations)):
-        if count is not None and (not isinstance(count, int) or count < 1):
-            raise ValueError(f"{name} must be an integer of at least 1; got {count!r}")
+        if count is not None:
+            check_count(name, count)
     if not (bind is None or isinstance(bind, Mapping)):
         raise ValueError(f"bind must be a dictionary of paths by feature; got {bind!r}")
     if not (signals is None or callable(signals) or isinstance(signals, Mapping)):

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
@@ -343,13 +344,11 @@ def ode(
     if steps is None:
         assert duration is not None
         steps = _whole(duration, dt, "duration")
-    if not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"steps must be an integer of at least 1; got {steps!r}")
+    check_count("steps", steps)
     integrator(method)
     if controller is None and (control_period is not None or controller_memory is not None):
         raise ValueError("control_period and controller_memory need a controller; got none")
-    if unroll < 1:
-        raise ValueError(f"unroll must be at least 1; got {unroll}")
+    check_count("unroll", unroll)
     return Ode(
         dynamics=dynamics,
         initial=initial,

@@ -18,6 +18,7 @@ import weakref
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar, Self
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Trace
 from verifai_jax.systems.base import Outcome, System
@@ -170,8 +171,7 @@ def remote(
     for name, value in (("timeout", timeout), ("patience", patience)):
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{name} must be a positive number of seconds; got {value!r}")
-    if not isinstance(retries, int) or isinstance(retries, bool) or retries < 0:
-        raise ValueError(f"retries must be an integer of at least 0; got {retries!r}")
+    check_count("retries", retries, 0)
     if not isinstance(most_bytes, int) or not 1024 <= most_bytes < 2**31:
         raise ValueError(f"most_bytes must be an integer from 1024 to 2**31 - 1; got {most_bytes}")
     if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):

@@ -1,0 +1,95 @@
+"""Checks of numbers that a user gives; each error names the argument, its range and its value.
+
+>>> check_fraction("confidence", 95)
+Traceback (most recent call last):
+ValueError: confidence must lie between 0 and 1; got 95
+"""
+
+import math
+import operator
+from typing import SupportsIndex, TypeGuard
+
+import numpy as np
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether this is a real number of Python or NumPy, and no truth value."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def check_fraction(
+    name: str,
+    value: object,
+    *,
+    zero: bool = False,
+    one: bool = False,
+    error: type[ValueError] = ValueError,
+) -> float:
+    """Check a probability or another share of one.
+
+    **Arguments:**
+
+    - `name`: name of the argument in the error message.
+    - `value`: value to check.
+    - `zero`: whether 0 itself is allowed.
+    - `one`: whether 1 itself is allowed.
+    - `error`: type of the error to raise.
+
+    **Returns:** the value, a number.
+
+    **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
+    """
+    if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
+        return value
+    allowed = "must lie between 0 and 1"
+    if zero or one:
+        allowed = f"must be in {'[' if zero else '('}0, 1{']' if one else ')'}"
+    raise error(f"{name} {allowed}; got {value!r}")
+
+
+def check_positive(
+    name: str, value: object, *, finite: bool = False, error: type[ValueError] = ValueError
+) -> float:
+    """Check a number above zero.
+
+    **Arguments:**
+
+    - `name`: name of the argument in the error message.
+    - `value`: value to check.
+    - `finite`: whether infinity is refused too.
+    - `error`: type of the error to raise.
+
+    **Returns:** the value, a number.
+
+    **Raises:** `error` unless `value > 0`.
+    """
+    if not (is_number(value) and value > 0 and not (finite and math.isinf(value))):
+        raise error(f"{name} must be positive{' and finite' if finite else ''}; got {value!r}")
+    return value
+
+
+def check_count(
+    name: str, value: object, least: int = 1, *, error: type[ValueError] = ValueError
+) -> int:
+    """Check an integer that counts something.
+
+    **Arguments:**
+
+    - `name`: name of the argument in the error message.
+    - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
+    - `least`: smallest value allowed.
+    - `error`: type of the error to raise.
+
+    **Returns:** the value as a Python integer.
+
+    **Raises:** `error` for anything but an integer of at least `least`.
+    """
+    count = None
+    if isinstance(value, SupportsIndex) and not isinstance(value, bool | np.bool_):
+        try:
+            count = operator.index(value)
+        except TypeError:  # An array of floats, or of several numbers.
+            count = None
+    if count is None or count < least:
+        raise error(f"{name} must be an integer of at least {least}; got {value!r}")
+    return count

@@ -1,0 +1,58 @@
+"""The step that raises the least of several linear functions most: a linear program.
+
+    max_min_step(theta, rho, gradients, radius=0.1, free=free, bounded=True)
+
+Exact for its linear model; the caller checks the step by simulation.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+
+def max_min_step(
+    theta: Float[np.ndarray, " p"],
+    rho: Float[np.ndarray, " n"],
+    gradients: Float[np.ndarray, "n p"],
+    radius: float,
+    *,
+    free: Bool[np.ndarray, " p"],
+    bounded: bool,
+) -> Float[np.ndarray, " p"]:
+    """Compute the step within `radius` a coordinate that raises `min(rho + gradients @ step)` most.
+
+    **Arguments:**
+
+    - `theta`: present parameters, from which the step is taken.
+    - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
+    - `radius`: greatest change of a coordinate.
+    - `free`: coordinates that may move.
+    - `bounded`: whether they stay in the unit cube.
+
+    **Returns:** the step; zero where nothing can be gained, or the solver finds nothing.
+    """
+    step = np.zeros_like(theta)
+    places = np.flatnonzero(free & np.any(gradients != 0, axis=0))
+    rows = np.flatnonzero(np.isfinite(rho))
+    if not len(places) or not len(rows):
+        return step
+    low, high = np.full(len(places), -radius), np.full(len(places), radius)
+    if bounded:
+        low, high = np.maximum(low, -theta[places]), np.minimum(high, 1 - theta[places])
+    linear = gradients[np.ix_(rows, places)]
+    if len(rows) == 1:
+        step[places] = np.where(linear[0] > 0, high, np.where(linear[0] < 0, low, 0.0))
+        return step
+    from scipy.optimize import linprog
+
+    # In units of the radius and of the largest derivative, which a solver's tolerances suit.
+    scale = np.abs(linear).max() * radius
+    least = rho[rows].min()
+    solution = linprog(
+        np.append(np.zeros(len(places)), -1.0),
+        A_ub=np.hstack([-linear * radius / scale, np.ones((len(rows), 1))]),
+        b_ub=(rho[rows] - least) / scale,
+        bounds=[*zip(low / radius, high / radius, strict=True), (None, None)],
+    )
+    if solution.status == 0:
+        step[places] = np.clip(solution.x[:-1] * radius, low, high)
+    return step

@@ -1,0 +1,79 @@
+"""Rules that end sampling once the failure rate is known well enough.
+
+    falsify(problem, "uniform", stop_when=Within(0.005))
+    falsify(problem, "uniform", stop_when=Decided(0.01))
+
+The outcomes decide when a rule is fulfilled, so the rules look at intervals that hold at all times
+together (`confidence_sequences`).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from verifai_jax.core.checks import check_fraction
+from verifai_jax.statistics.confidence_sequences import anytime_interval
+
+
+class StoppingRule(Protocol):
+    """A rule that ends a run of prior samples; `falsify(..., stop_when=rule)`."""
+
+    def done(self, failures: int, simulations: int) -> bool:
+        """Return whether to stop; called after every batch.
+
+        **Arguments:**
+
+        - `failures`: samples that failed so far.
+        - `simulations`: samples with a verdict so far.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Within:
+    """Stop when the failure rate is known to within `half_width`, such as 0.005 for half a percent.
+
+    - `half_width`: half of the length of the interval that is wanted.
+    - `confidence`: probability with which the interval is to hold.
+
+    **Raises:** `ValueError` unless `0 < half_width < 0.5` and `0 < confidence < 1`.
+    """
+
+    half_width: float
+    confidence: float = 0.95
+
+    def __post_init__(self) -> None:
+        if not 0 < self.half_width < 0.5:
+            raise ValueError(f"half_width must lie between 0 and 0.5; got {self.half_width}")
+        check_fraction("confidence", self.confidence)
+
+    def done(self, failures: int, simulations: int) -> bool:
+        """Return whether the interval is short enough."""
+        if simulations < 1:
+            return False
+        rate = anytime_interval(failures, simulations, self.confidence)
+        return rate.high - rate.low <= 2 * self.half_width
+
+
+@dataclass(frozen=True)
+class Decided:
+    """Stop when it is clear whether the failure rate is above or below `rate`.
+
+    - `rate`: failure rate to compare with.
+    - `confidence`: probability with which the answer is to be right.
+
+    **Raises:** `ValueError` unless `0 < rate < 1` and `0 < confidence < 1`.
+    """
+
+    rate: float
+    confidence: float = 0.95
+
+    def __post_init__(self) -> None:
+        check_fraction("rate", self.rate)
+        check_fraction("confidence", self.confidence)
+
+    def done(self, failures: int, simulations: int) -> bool:
+        """Return whether the interval excludes `rate`."""
+        if simulations < 1:
+            return False
+        interval = anytime_interval(failures, simulations, self.confidence)
+        return not interval.low <= self.rate <= interval.high
