@@ -4,8 +4,8 @@
     cartpole(linear(gains), duration=2.0, terminate=True)
     cartpole(neural())                                   # the trained network that is shipped
 
-Also the worked example of writing one's own environment: an `ode` needs a function for the slope
-of the state, one for the initial state, and a controller.
+Also the worked example of writing one's own environment: an `ode` needs the state's derivative,
+the initial state and a controller, each a function.
 
 Features, all optional, with CartPole-v1's values where missing: `x0` and `theta0` (initial
 position in m and angle in rad), `x_dot0`, `theta_dot0` (m/s, rad/s), `masscart`, `masspole` (kg),
@@ -83,7 +83,7 @@ def initial(features: Features, key: Any = None) -> State:
     return State(*(feature(features, name) for name in ("x0", "x_dot0", "theta0", "theta_dot0")))
 
 
-def dynamics(time: Scalar, state: State, force: Scalar, features: Features) -> State:
+def dynamics(time: Scalar | float, state: State, force: Scalar, features: Features) -> State:
     """Slope of the state under `force` (N) on the cart.
 
     Source: Florian, Correct equations for the dynamics of the cart-pole system (2007), eqs. 23-24
@@ -105,7 +105,7 @@ def dynamics(time: Scalar, state: State, force: Scalar, features: Features) -> S
     return State(state.x_dot, x_acc, state.theta_dot, theta_acc)
 
 
-def pushed(time: Scalar, push_time: Scalar | float) -> Scalar:
+def pushed(time: Scalar | float, push_time: Scalar | float) -> Scalar:
     """The part of the 0.02 s around `time` during which the push acts, in `[0, 1]`.
 
     Continuous in `push_time`, so that a gradient search can shift the push; the same push at any
@@ -132,7 +132,7 @@ def linear(gains: Sequence[float] = LQR_GAINS) -> Controller:
         raise ValueError(f"a linear controller needs 4 gains; got {list(gains)}")
     k_x, k_x_dot, k_theta, k_theta_dot = map(float, gains)
 
-    def control(time: Scalar, state: State, features: Features) -> Scalar:
+    def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         x, x_dot, theta, theta_dot = state
         force = k_x * x + k_x_dot * x_dot + k_theta * theta + k_theta_dot * theta_dot
         largest = feature(features, "force_mag")
@@ -168,7 +168,7 @@ def neural(
     small = sum(weight.size for weight, _ in policy.layers) <= 600
     layers = _preferring(policy) if small and _known(policy) else None
 
-    def control(time: Scalar, state: State, features: Features) -> Scalar:
+    def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         if layers is not None:
             (preference,) = written_out(layers, state, policy.activation)
         else:
@@ -187,7 +187,7 @@ def either(*controllers: Controller) -> Controller:
     if not controllers:
         raise ValueError("either needs at least one controller; got none")
 
-    def control(time: Scalar, state: State, features: Features) -> Scalar:
+    def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         forces = [one(time, state, features) for one in controllers]
         return jnp.select([features["controller"] == i for i in range(len(forces))], forces)
 

@@ -92,7 +92,7 @@ def initial(features: Features, key: Any = None) -> State:
     )
 
 
-def path_curvature(time: Scalar, state: State, features: Features) -> Scalar:
+def path_curvature(time: Scalar | float, state: State, features: Features) -> Scalar:
     """Curvature of the rear axle's path, 1/m: what the wheels ask for and the tyres can give."""
     wanted = jnp.tan(state.steer + feature(features, "bias", time)) / feature(features, "wheelbase")
     # The lateral acceleration is speed^2 times curvature, and at most friction times gravity.
@@ -100,7 +100,7 @@ def path_curvature(time: Scalar, state: State, features: Features) -> Scalar:
     return jnp.clip(wanted, -limit, limit)
 
 
-def dynamics(time: Scalar, state: State, command: Scalar, features: Features) -> State:
+def dynamics(time: Scalar | float, state: State, command: Scalar, features: Features) -> State:
     """Slope of the state under a steering `command` (rad).
 
     Source: the simple car of LaValle, Planning Algorithms (2006), eq. 13.15, whose reference is the
@@ -127,7 +127,9 @@ def steer_rate(state: State, command: Scalar, features: Features) -> Scalar:
     return (wanted - state.steer) / feature(features, "lag")
 
 
-def signals(time: Scalar, state: State, command: Scalar, features: Features) -> dict[str, Scalar]:
+def signals(
+    time: Scalar | float, state: State, command: Scalar, features: Features
+) -> dict[str, Scalar]:
     """What formulas see: the state, the command, and what the driver and the lane notice.
 
     - `left`, `right`: m between the car's body and the lane marking on that side, negative beyond.
@@ -168,7 +170,7 @@ class Seen(NamedTuple):
     curvature: Scalar
 
 
-def measured(time: Scalar, state: State, features: Features) -> Seen:
+def measured(time: Scalar | float, state: State, features: Features) -> Seen:
     """The state as sensors and the map give it."""
     return Seen(
         offset=state.offset + feature(features, "noise", time),
@@ -188,7 +190,7 @@ def lqr(gains: Sequence[float] = LQR_GAINS) -> Controller:
         raise ValueError(f"a lane-keeping LQR needs 3 gains; got {list(gains)}")
     k_offset, k_heading, k_steer = map(float, gains)
 
-    def control(time: Scalar, state: State, features: Features) -> Scalar:
+    def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         seen = measured(time, state, features)
         curve = jnp.arctan(NOMINAL["wheelbase"] * seen.curvature)
         away = k_offset * seen.offset + k_heading * seen.heading + k_steer * (seen.steer - curve)
@@ -223,7 +225,7 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
     layers = policy.layers
     small = sum(weight.size for weight, _ in layers) <= 600
 
-    def control(time: Scalar, state: State, features: Features) -> Scalar:
+    def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         sees = observation(measured(time, state, features))
         if small:
             (unit,) = written_out(layers, sees, policy.activation)

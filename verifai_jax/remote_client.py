@@ -28,7 +28,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,33 +37,40 @@ import numpy as np
 log = logging.getLogger("verifai_jax.remote_client")
 
 PROTOCOL = 1
-FLUSH_SECONDS = 0.005  # Results may wait for others that long.
+"""Version of the protocol that `docs/remote.md` describes."""
+FLUSH_SECONDS = 0.005
+"""Time for which a result may wait for others, to be sent with them."""
 FLUSH_BYTES = 1 << 18
-SHORTEST, LONGEST = 0.05, 2.0  # Seconds between two tries to connect.
+"""Size from which waiting results are sent at once."""
+SHORTEST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
+"""Seconds between two attempts to connect."""
 RESERVED = ("dt", "times", "valid")
+"""Names in a result that are no signals."""
 
 
 class Refused(ConnectionError):
-    """The server does not want this client, and will not another time."""
+    """An error of a server that does not want this client, and will not another time."""
 
 
 class Waveform:
-    """A function of time by its control points: what a `Signal` feature arrives as.
+    """A function of time by its control points: the form in which a `Signal` feature arrives.
 
     `wind(time)`, in seconds; `wind.over(4.0)(time)` where the feature has no duration. With `hold`
     `"linear"` the first control point is the value at 0 and the last that at the end; with
     `"constant"` each is held for an equal part of the duration.
     """
 
-    def __init__(self, knots: Any, hold: str, duration: float | None) -> None:
+    def __init__(
+        self, knots: Sequence[float] | np.ndarray, hold: str, duration: float | None
+    ) -> None:
         self.knots, self.hold, self.duration = np.asarray(knots, np.float64), hold, duration
 
     def over(self, duration: float) -> "Waveform":
-        """The same control points over so many seconds."""
+        """Return the same control points over so many seconds."""
         return Waveform(self.knots, self.hold, float(duration))
 
     def __call__(self, time: float) -> Any:
-        """The value at a time in seconds; the first and the last hold outside the duration."""
+        """Return the value at a time in seconds; the first and the last hold beyond the ends."""
         if self.duration is None:
             raise ValueError("this signal has no duration: call features[...].over(seconds)(time)")
         count = len(self.knots)
@@ -84,7 +91,7 @@ def serve(
     reconnect: bool | float = True,
     name: str | None = None,
 ) -> None:
-    """Simulate whatever the run at `host` and `port` asks for, until it is interrupted.
+    """Simulate the points of the run at `host` and `port` until interrupted.
 
     **Arguments:**
 
@@ -105,7 +112,7 @@ def serve(
     """
     token = os.environ.get("VERIFAI_JAX_TOKEN") if token is None else token
     patience = float("inf") if reconnect is True else float(reconnect)
-    since, pause, served = time.monotonic(), SHORTEST, False
+    since, pause, served = time.monotonic(), SHORTEST_PAUSE, False
     while True:
         connection = None
         try:
@@ -121,18 +128,18 @@ def serve(
             if connection is not None:
                 connection.socket.close()
         if connection is not None:
-            since, pause, served = time.monotonic(), SHORTEST, True
+            since, pause, served = time.monotonic(), SHORTEST_PAUSE, True
         if time.monotonic() - since + pause > patience:
             if served:
                 return
             raise ConnectionError(f"no run at {host}:{port} to simulate for: {reason}")
-        if pause == SHORTEST:
+        if pause == SHORTEST_PAUSE:
             log.info("no run at %s port %s (%s); it is tried again", host, port, reason)
         try:
             time.sleep(pause)
         except KeyboardInterrupt:
             return
-        pause = min(2 * pause, LONGEST)
+        pause = min(2 * pause, LONGEST_PAUSE)
 
 
 class _Connection:
@@ -205,7 +212,7 @@ class _Connection:
             self.socket.sendall(data)
 
     def _receive(self) -> None:
-        """Wait for something to come, and take up what has."""
+        """Wait for messages, and take up those that have come."""
         self._read()
         while message := self._frame():
             match message.get("type"):
@@ -237,7 +244,7 @@ class _Connection:
 
 
 def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], Any]) -> bytes:
-    """Simulate one point of a `work` message: the frame to send back."""
+    """Simulate one point of a `work` message, and return the frame to send back."""
     try:
         return encoded(point["id"], simulate(features_of(point["features"]), point["seed"]))
     except Exception as error:
@@ -245,8 +252,8 @@ def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], A
         return _framed({"type": "result", "id": point["id"], "error": message})
 
 
-def features_of(value: Any) -> Any:
-    """Features from their JSON: lists are arrays, objects of control points `Waveform`s."""
+def features_of(value: object) -> Any:
+    """Return features from JSON: lists as arrays, objects of control points as `Waveform`s."""
     if isinstance(value, dict):
         if value.keys() == {"knots", "hold", "duration"}:
             return Waveform(**value)
@@ -254,8 +261,8 @@ def features_of(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, list) else value
 
 
-def encoded(number: int, result: Any) -> bytes:
-    """A result as a frame whose arrays are raw bytes.
+def encoded(number: int, result: object) -> bytes:
+    """Return a result as a frame whose arrays are raw bytes.
 
     **Raises:** `TypeError` for something that is no result.
     """
@@ -275,7 +282,7 @@ def encoded(number: int, result: Any) -> bytes:
     raw: list[bytes] = []
     at = 0
 
-    def place(name: str, value: Any) -> dict[str, Any]:
+    def place(name: str, value: object) -> dict[str, Any]:
         nonlocal at
         array = np.asarray(value)
         if array.dtype.kind not in "biuf":
@@ -306,7 +313,7 @@ def _framed(header: Mapping[str, Any]) -> bytes:
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """`HOST:PORT`, with an IPv6 address in brackets: `[::1]:4567`.
+    """Parse `HOST:PORT`, with an IPv6 address in brackets: `[::1]:4567`.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -317,7 +324,7 @@ def address_of(text: str) -> tuple[str, int]:
 
 
 def function_of(text: str) -> Callable[..., Any]:
-    """The function named by `MODULE:NAME` or `FILE.py:NAME`.
+    """Import the function named by `MODULE:NAME` or `FILE.py:NAME`.
 
     **Raises:** `ValueError` where there is none.
     """
@@ -339,7 +346,7 @@ def function_of(text: str) -> Callable[..., Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """The command line: `--address HOST:PORT MODULE:FUNCTION`."""
+    """Run the command line: `--address HOST:PORT MODULE:FUNCTION`."""
     parser = argparse.ArgumentParser(
         prog="remote_client", description="Simulate what a verifai_jax run asks for."
     )

@@ -13,15 +13,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int, PyTree
 
 MAX_PLAIN_STEPS = 512
-"""Steps up to which a scan is left whole: the way back then costs no second simulation."""
+"""Steps up to which a scan is left whole: its reverse sweep then costs no second simulation."""
 
 
 def checkpointed_scan(
-    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, length: int, *, unroll: int = 1
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: PyTree, length: int, *, unroll: int = 1
 ) -> tuple[Any, Any]:
-    """`lax.scan` of `step(carry, k)` over `k = 0 ... length - 1`, in segments where it is long.
+    """Scan `step(carry, k)` over `k = 0 ... length - 1`, in segments where it is long.
 
     Forward results are those of one scan.
     """
@@ -31,7 +32,7 @@ def checkpointed_scan(
     whole = length // each * each
 
     @jax.checkpoint
-    def segment(carry: Any, first: Any) -> Any:
+    def segment(carry: PyTree, first: Int[Array, ""]) -> Any:
         return jax.lax.scan(step, carry, first + jnp.arange(each), unroll=unroll)
 
     carry, parts = jax.lax.scan(segment, carry, jnp.arange(0, whole, each))
@@ -43,7 +44,7 @@ def checkpointed_scan(
 
 
 def _segment_length(length: int) -> int:
-    """A segment near the root of the length, that divides it if one does."""
+    """Return a length of segments near the root of the length, that divides it if one does."""
     root = math.isqrt(length)
     divisors = [n for n in range(root // 2, 2 * root) if length % n == 0]
     return min(divisors, key=lambda n: abs(n - root), default=root)

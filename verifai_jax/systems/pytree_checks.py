@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 
-def as_floating(tree: Any, origin: str) -> Any:
-    """The same pytree with every leaf an array of one common as_floating-point dtype.
+def as_floating(tree: PyTree, origin: str) -> Any:
+    """Return the same pytree with every leaf an array of one common floating-point dtype.
 
     **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is no real
     number.
@@ -27,7 +27,7 @@ def as_floating(tree: Any, origin: str) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
 
 
-def check_like(got: Any, wanted: Any, origin: str, role: str, note: str = "") -> None:
+def check_like(got: PyTree, wanted: PyTree, origin: str, role: str, note: str = "") -> None:
     """Refuse a pytree of shapes that differs from the `wanted` one in structure, shape or dtype.
 
     A weakly typed number (a Python literal) may stand for any dtype that it can turn into.
@@ -51,8 +51,8 @@ def check_like(got: Any, wanted: Any, origin: str, role: str, note: str = "") ->
             raise ValueError(f"{must}; {_name(path)} must be {want.dtype}, got {have.dtype}{note}")
 
 
-def default_signals(state: Any, control: Any) -> dict[str, Array]:
-    """Signals named after the state's own names, and the control's.
+def default_signals(state: PyTree, control: PyTree) -> dict[str, Array]:
+    """Return signals named after the state's own names, and the control's.
 
     A state without names (an array, a plain tuple) has no default. `(positions, velocities)` of
     two dictionaries has the names of both. A control without names is called `control`.
@@ -82,7 +82,7 @@ def default_signals(state: Any, control: Any) -> dict[str, Array]:
     return signals
 
 
-def check_signals(signals: Any) -> None:
+def check_signals(signals: object) -> None:
     """Refuse samples that no `Trace` can hold.
 
     **Raises:** `ValueError` for anything but a dictionary of scalars and vectors.
@@ -98,14 +98,14 @@ def check_signals(signals: Any) -> None:
             )
 
 
-def _named(tree: Any) -> dict[str, Any] | None:
+def _named(tree: PyTree) -> dict[str, Any] | None:
     if isinstance(tree, Mapping):
         return {str(name): value for name, value in tree.items()}
     fields = getattr(tree, "_fields", None)
     return None if fields is None else dict(zip(fields, tree, strict=True))
 
 
-def _is_real(leaf: Any) -> bool:
+def _is_real(leaf: object) -> bool:
     try:
         dtype = jnp.result_type(leaf)
     except TypeError:
@@ -113,12 +113,12 @@ def _is_real(leaf: Any) -> bool:
     return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
 
 
-def _name(path: Any) -> str:
+def _name(path: jax.tree_util.KeyPath) -> str:
     return jax.tree_util.keystr(path) or "it"
 
 
-def outline(tree: Any) -> str:
-    """The tree in one line, arrays by dtype and shape: `{'x': float32[]}`."""
+def outline(tree: PyTree) -> str:
+    """Write a tree in one line, arrays by dtype and shape: `{'x': float32[]}`."""
 
     def leaf(value: Any) -> str:
         if not hasattr(value, "shape"):

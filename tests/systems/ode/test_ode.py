@@ -265,7 +265,7 @@ def test_named_control_keeps_its_names():
         signals=None,
         terminate=None,
     )
-    with pytest.raises(ValueError, match="dynamics must return the state's slope"):
+    with pytest.raises(ValueError, match="dynamics must return the state's derivative"):
         trace({}, KEY)
     system = ode(
         lambda t, s, u, f: {"x": u["u"]},
@@ -325,7 +325,7 @@ def test_unknown_method_names_the_nearest():
     [
         (
             {"dynamics": lambda t, s, u, f: {"x": s["v"], "w": 0.0}},
-            r"dynamics must return the state's slope, in the form of the state: "
+            r"dynamics must return the state's derivative, in the form of the state: "
             r"\{'v': float32\[\], 'x': float32\[\]\}; got \{'w': float32\[\], 'x': float32\[\]\}",
         ),
         (

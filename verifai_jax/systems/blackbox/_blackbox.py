@@ -16,12 +16,13 @@ from typing import Any, ClassVar
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Key
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.systems.base import FunctionSystem, Outcome, System, as_system
+from verifai_jax.systems.base import Features, FunctionSystem, Outcome, Seed, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
 
 SignalNames = Sequence[str] | Mapping[str, int]
@@ -29,7 +30,7 @@ SignalNames = Sequence[str] | Mapping[str, int]
 
 @dataclass(frozen=True)
 class TraceForm:
-    """What every trace of a simulator must have; what is None may be anything.
+    """The form that every trace of a simulator must have; a part that is None may be anything.
 
     **Arguments:**
 
@@ -63,20 +64,20 @@ class TraceForm:
 
     @property
     def widths(self) -> dict[str, int]:
-        """Number of components of each declared signal."""
+        """The number of components of each signal."""
         signals = () if self.signals is None else self.signals
         return dict(signals) if isinstance(signals, Mapping) else dict.fromkeys(signals, 1)
 
     def abstract(self) -> Trace | None:
-        """Return the form of a trace; None unless all is declared."""
+        """Return a trace of this form as shapes; None where the form is incomplete."""
         if self.signals is None or self.dt is None or self.length is None:
             return None
         shapes = {n: (self.length, *([] if w == 1 else [w])) for n, w in self.widths.items()}
         signals: Any = {n: jax.ShapeDtypeStruct(s, np.float32) for n, s in shapes.items()}
         return Trace(signals, dt=self.dt)
 
-    def accept(self, trace: Any) -> Trace:
-        """What a simulator returned, its signals as NumPy arrays, if it is as declared.
+    def accept(self, trace: object) -> Trace:
+        """Return a simulator's trace with its signals as NumPy arrays, if it has this form.
 
         **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
         not as declared; both say what was expected and what came.
@@ -121,13 +122,13 @@ class TraceForm:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One simulation by a user's function, checked; what a worker process is given to run."""
+    """A user's function that simulates once, its trace checked; sent to worker processes."""
 
     function: Callable[..., Trace]
     seeded: bool
     declared: TraceForm
 
-    def __call__(self, features: Any, seed: int) -> Trace:
+    def __call__(self, features: Features, seed: int) -> Trace:
         return self.declared.accept(
             self.function(features, seed) if self.seeded else self.function(features)
         )
@@ -142,23 +143,25 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False)
 class BlackBox(System):
-    """A host-side system; made by `blackbox`. Simulated row by row, never traced by JAX."""
+    """A system on the host, simulated row by row and never traced by JAX; made by `blackbox`."""
 
     black_box: ClassVar[bool] = True
     simulation: Simulation
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, with features as plain Python and NumPy values.
 
-        `key`: a JAX random key, or an integer seed.
+        **Arguments:**
+
+        - `key`: a JAX random key, or an integer seed.
         """
         return self.simulation(plain_leaves(features), seed_of(key))
 
-    def abstract(self, features: Any) -> Trace | None:
-        """Return the form of the traces, if it is declared; see `Problem.check`."""
+    def abstract(self, features: Features) -> Trace | None:
+        """Return the form of the traces, if it is given."""
         return self.simulation.declared.abstract()
 
-    def check(self, features: Any) -> None:
+    def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
         as_system(self.simulation.function).check(features)
 
@@ -174,13 +177,13 @@ class BlackBox(System):
 
 @dataclass(frozen=True, eq=False)
 class PooledBlackBox(System):
-    """A host-side system that runs in processes of its own; made by `blackbox(..., workers=n)`."""
+    """A system on the host, in processes of its own; made by `blackbox(..., workers=n)`."""
 
     black_box: ClassVar[bool] = True
     simulation: Simulation
     pool: Pool
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, in a worker.
 
         **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
@@ -188,35 +191,35 @@ class PooledBlackBox(System):
         return single_trace(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
 
     def simulate_each(
-        self, features: Sequence[Any], seeds: Sequence[int]
+        self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Each index exactly once, as its simulation ends; see `simulations.Each`."""
+        """Simulate each row in a worker; see `System.simulate_each`."""
         return self.pool.outcomes(features, seeds)
 
-    def abstract(self, features: Any) -> Trace | None:
-        """Return the form of the traces, if it is declared; see `Problem.check`."""
+    def abstract(self, features: Features) -> Trace | None:
+        """Return the form of the traces, if it is given."""
         return self.simulation.declared.abstract()
 
-    def check(self, features: Any) -> None:
+    def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
         as_system(self.simulation.function).check(features)
 
     def close(self) -> None:
-        """End the workers. The next simulation starts new ones."""
+        """End the workers; the next simulation starts new ones."""
         self.pool.close()
 
 
 @dataclass(frozen=True, eq=False)
 class VectorisedBlackBox(System):
-    """A host-side system of many simulations at a time; made by `blackbox(vectorised=True)`."""
+    """A system on the host that simulates many rows at a time; made by `blackbox`."""
 
     black_box: ClassVar[bool] = True
     function: Callable[..., Trace]
     seeded: bool
     declared: TraceForm
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
-        """Simulate one, as a batch of one."""
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
+        """Simulate once, as a batch of one."""
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
         trace = self._simulate(batch, np.array([seed_of(key)], np.uint32), 1)
         return jax.tree.map(lambda leaf: leaf[0], trace)
@@ -230,18 +233,18 @@ class VectorisedBlackBox(System):
         """Return the same simulator with a `factor` times smaller step, if it has one."""
         return replace(self, function=_finer(self.function, factor))
 
-    def simulate_batch(self, features: Any, keys: Key[Array, " n"]) -> Trace:
-        """A trace whose leaves are `[n, ...]`; see `simulations.Batched`."""
+    def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
+        """Simulate many rows at a time; see `System.simulate_batch`."""
         seeds = np.zeros(len(keys), np.uint32)
         if self.seeded:
             seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
         return self._simulate(features, seeds, len(keys))
 
-    def abstract(self, features: Any) -> Trace | None:
-        """Return the form of one trace, if it is declared; see `Problem.check`."""
+    def abstract(self, features: Features) -> Trace | None:
+        """Return the form of one trace, if it is given."""
         return self.declared.abstract()
 
-    def _simulate(self, features: Any, seeds: np.ndarray, n: int) -> Trace:
+    def _simulate(self, features: Features, seeds: np.ndarray, n: int) -> Trace:
         trace = self.function(features, seeds) if self.seeded else self.function(features)
         if not isinstance(trace, Trace):
             raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
@@ -306,11 +309,14 @@ def blackbox(
     - `retries`: how often a simulation whose process dies is started again, in a new one.
     - `vectorised`: `function` simulates many at a time: arrays of features are `[n, ...]`, `seeds`
       is `[n]`, and so is every array of the trace; see `stack_traces`.
-    - `signals`, `dt`, `length`: what every trace must have; see `TraceForm`. One that differs is a
+    - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. One that differs is a
       row with status `error`.
 
-    **Raises:** `ValueError` for something that is not callable, or not importable by workers;
-    options that do not go together.
+    **Returns:** a `VectorisedBlackBox` with `vectorised`, a `PooledBlackBox` with `workers`, else a
+    `BlackBox`.
+
+    **Raises:** `ValueError` for a function that cannot be called, or that workers cannot import,
+    and for options that do not go together.
     """
     if not callable(function):
         raise ValueError(f"blackbox needs a function (features) -> Trace; got {function!r}")
@@ -333,20 +339,22 @@ def blackbox(
 
 
 def stack_traces(
-    signals: Mapping[str, Any],
+    signals: Mapping[str, np.ndarray | Array],
     dt: float | None = None,
-    times: Any = None,
-    valid: Any = None,
-    status: Any = None,
+    times: ArrayLike | None = None,
+    valid: ArrayLike | None = None,
+    status: ArrayLike | None = None,
     held: bool = False,
     finite: tuple[str, ...] = (),
 ) -> Trace:
-    """Many traces as one, as `jax.vmap` over a system would give them.
+    """Return many traces as one, as `jax.vmap` over a system would.
 
     **Arguments:** those of `Trace`, each array with a leading axis: `signals` are `[n, time]` or
     `[n, time, k]`, `times` `[n, time]`, `valid` and `status` `[n]`.
 
-    **Raises:** `ValueError` for what the first of them would be refused for.
+    **Returns:** a `Trace` whose leaves have a leading axis `[n]`.
+
+    **Raises:** as `Trace` does for the first of them.
     """
     first = None if times is None else np.asarray(times)[0]
     Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
@@ -359,7 +367,7 @@ def stack_traces(
 
 
 def single_trace(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
-    """The trace of the one simulation that was asked for.
+    """Return the trace of the only outcome.
 
     **Raises:** `TimeoutError` or `RuntimeError` with its message where there is none.
     """
@@ -370,8 +378,8 @@ def single_trace(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
     return outcome.trace
 
 
-def seed_of(key: Any) -> int:
-    """The integer seed of a simulation: a function of its JAX key, or the number itself."""
+def seed_of(key: Seed) -> int:
+    """Return the integer seed of a simulation: a function of its JAX key, or the number itself."""
     if isinstance(key, int | np.integer):
         return int(key)
     if key is None:
@@ -379,12 +387,12 @@ def seed_of(key: Any) -> int:
     return int(jax.random.bits(key))
 
 
-def plain_leaves(features: Any) -> Any:
-    """The same features with plain Python numbers and NumPy arrays."""
+def plain_leaves(features: Features) -> Any:
+    """Return the same features with plain Python numbers and NumPy arrays."""
     return jax.tree.map(_plain, features)
 
 
-def _plain(leaf: Any) -> Any:
+def _plain(leaf: object) -> Any:
     if not isinstance(leaf, jax.Array | np.ndarray | np.generic):
         return leaf
     return np.asarray(leaf).item() if np.ndim(leaf) == 0 else np.asarray(leaf)
@@ -395,5 +403,5 @@ def _finer(function: Callable[..., Trace], factor: int) -> Callable[..., Trace]:
     return finer.function if isinstance(finer, FunctionSystem) else finer
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -27,29 +27,33 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.systems.base import Outcome
+from verifai_jax.systems.base import Features, Outcome
 
 log = logging.getLogger("verifai_jax.workers")
 
-# One core and no GPU each: the workers are what is parallel. What the user has set is kept.
-QUIET = {
+WORKER_ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-GLANCE = 0.5  # Seconds between two looks at whether a silent worker still lives.
-PATIENCE = 30.0  # Seconds until it is said that a worker is still importing.
+"""Environment of a worker, unless the user has set it: one core and no GPU each, since the workers
+themselves run in parallel."""
+POLL_SECONDS = 0.5
+"""Time between two checks that a silent worker is alive."""
+SLOW_IMPORT_SECONDS = 30.0
+"""Time until the log says that a worker is still importing."""
 
-_preparing = False  # Whether this process is a worker that still imports what it is to run.
+# True in a worker that still imports the simulator.
+_preparing = False
 
 
 class StartError(RuntimeError):
-    """A worker could not start; no simulation of the pool can run."""
+    """An error of a worker that could not start, so that no simulation of its pool can run."""
 
 
 class Pool:
-    """`workers` processes that run one simulation at a time each; started when first needed.
+    """Processes that run one simulation at a time each; started when first needed.
 
     **Arguments:**
 
@@ -64,7 +68,7 @@ class Pool:
     def __init__(
         self,
         simulation: Callable[[Any, int], Trace],
-        function: Any,
+        function: Callable[..., object],
         workers: int,
         timeout: float | None,
         retries: int,
@@ -81,13 +85,13 @@ class Pool:
         self._setup = _setup(simulation, function)
         self._slots = threading.Semaphore(workers)
         self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
-        # When nobody can use it any more, and at the interpreter's exit.
+        # When the pool is garbage, and at the interpreter's exit.
         weakref.finalize(self, _end, self._idle)
 
     def outcomes(
-        self, features: Sequence[Any], seeds: Sequence[int]
+        self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Simulate all, and give each index with its outcome as soon as it has one.
+        """Simulate all rows, and yield each index with its outcome as soon as it has one.
 
         Workers go on while the caller looks at an outcome. When the caller stops, or is
         interrupted, the simulations that run are ended.
@@ -122,7 +126,7 @@ class Pool:
 
     def _work(self, batch: "_Batch") -> None:
         """Simulate what is left of the batch in one worker after the other; runs in a thread."""
-        while not self._slots.acquire(timeout=GLANCE):
+        while not self._slots.acquire(timeout=POLL_SECONDS):
             if batch.stopped:
                 return
         worker = None
@@ -162,7 +166,7 @@ class Pool:
             self._slots.release()
 
     def _worker(self, batch: "_Batch") -> "_Worker":
-        """An idle worker that lives, or a new one that is ready."""
+        """Return an idle worker that is alive, or a new one that is ready."""
         while True:
             try:
                 worker = self._idle.pop()
@@ -191,7 +195,7 @@ class Pool:
 
 
 def _end(idle: "list[_Worker]") -> None:
-    """Let these workers end, all at a time."""
+    """End these workers, all at a time."""
     ending = []
     while idle:
         ending.append(idle.pop())
@@ -201,9 +205,9 @@ def _end(idle: "list[_Worker]") -> None:
 
 
 class _Batch:
-    """What is left to simulate, what came of the rest, and who works on it."""
+    """The rows that are left to simulate, the results of the others, and the busy workers."""
 
-    def __init__(self, features: Sequence[Any], seeds: Sequence[int]) -> None:
+    def __init__(self, features: Sequence[Features], seeds: Sequence[int]) -> None:
         self.tasks = deque(enumerate(zip(features, seeds, strict=True)))
         self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.stopped = False
@@ -221,7 +225,7 @@ class _Batch:
             self._busy.discard(worker)
 
     def stop(self) -> None:
-        """End what runs, and begin nothing more."""
+        """End the running simulations, and begin no more."""
         with self._lock:
             self.stopped = True
             for worker in self._busy:
@@ -240,7 +244,7 @@ class _Worker:
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
-                env={**QUIET, **os.environ, "VERIFAI_JAX_CORES": "1"},
+                env={**WORKER_ENVIRONMENT, **os.environ, "VERIFAI_JAX_CORES": "1"},
             )
         except OSError as error:
             raise StartError(f"no worker process could start: {error}") from error
@@ -249,17 +253,17 @@ class _Worker:
         self._setup = setup
 
     def ready(self) -> bool:
-        """Whether it has imported what it is to run; False if it died.
+        """Return True once the worker has imported the simulator; False if its process died.
 
         **Raises:** `StartError` with what the import raised.
         """
         said = time.monotonic()
         try:
             self.pipe.send_bytes(self._setup)
-            while not self.pipe.poll(GLANCE):
+            while not self.pipe.poll(POLL_SECONDS):
                 if self.process.poll() is not None:
                     return False
-                if time.monotonic() - said > PATIENCE:
+                if time.monotonic() - said > SLOW_IMPORT_SECONDS:
                     said = time.monotonic()
                     log.warning("worker process %d is still importing", self.process.pid)
             problem = self.pipe.recv()
@@ -269,15 +273,15 @@ class _Worker:
             raise StartError(problem)
         return True
 
-    def simulate(self, task: Any, timeout: float | None) -> Outcome | None:
-        """What came of one simulation; None if the process died."""
+    def simulate(self, task: tuple[Features, int], timeout: float | None) -> Outcome | None:
+        """Return the outcome of one simulation; None if the process died."""
         begun = time.monotonic()
         try:
             self.pipe.send(task)
             while True:
                 left = math.inf if timeout is None else begun + timeout - time.monotonic()
                 # A process that it has started may hold the pipe open after its death.
-                if self.pipe.poll(min(max(left, 0.0), GLANCE)):
+                if self.pipe.poll(min(max(left, 0.0), POLL_SECONDS)):
                     return self.pipe.recv()
                 if self.process.poll() is not None:
                     return None
@@ -288,7 +292,7 @@ class _Worker:
             return None
 
     def kill(self) -> None:
-        """End the process, and those that it has started, now."""
+        """Kill the process, and those that it has started."""
         if self.process.poll() is None:
             try:
                 os.killpg(self.process.pid, signal.SIGKILL)
@@ -296,7 +300,7 @@ class _Worker:
                 self.process.kill()
 
     def end(self) -> str:
-        """End it, and say how it ended."""
+        """End the process, and return how it ended."""
         # One whose pipe is closed, here or there, is about to end by itself.
         ending = self.pipe.closed or self.pipe.poll(0)
         try:
@@ -325,8 +329,8 @@ _START = (
 )
 
 
-def _setup(simulation: Any, function: Any) -> bytes:
-    """Everything that a worker needs to know, pickled.
+def _setup(simulation: Callable[[Features, int], Trace], function: Callable[..., object]) -> bytes:
+    """Pickle everything that a worker needs to know.
 
     **Raises:** `ValueError` for a function that cannot be imported elsewhere.
     """
@@ -370,7 +374,7 @@ def _guard() -> str:
 
 
 def work(fd: int) -> None:
-    """Simulate what comes through the pipe until it closes; the life of a worker process."""
+    """Simulate the tasks that come through the pipe until it closes; a worker process runs this."""
     global _preparing
     os.set_inheritable(fd, False)
     pipe = Connection(fd)
@@ -410,7 +414,7 @@ def _text(error: BaseException) -> str:
 
 
 def _import(module: str, file: str | None) -> None:
-    """Import a module, by its file where its name is one that only the parent knows."""
+    """Import a module, by its file where only the parent process knows its name."""
     try:
         importlib.import_module(module)
     except ModuleNotFoundError as error:

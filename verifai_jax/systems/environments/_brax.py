@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.errors import (
     MissingExtra,
@@ -25,8 +25,9 @@ from verifai_jax.core.errors import (
 )
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
-from verifai_jax.systems.base import System
+from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.environments.brax_model import (
+    Env,
     Place,
     check_parts_are_read,
     explain_errors,
@@ -40,6 +41,7 @@ from verifai_jax.systems.environments.brax_model import (
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
+    Time,
     check_features,
     check_signals_option,
     features_at,
@@ -81,14 +83,14 @@ class Brax(System):
 
     @property
     def reverse_hint(self) -> str:
-        """Why derivatives in reverse may not exist."""
+        """A sentence on why derivatives in reverse mode may not exist."""
         return (
             f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges, "
             "unless the model asks for one iteration; the other backends have fixed loops"
         )
 
     def refined(self, factor: int) -> "Brax":
-        """The same episode, decided and sampled as before, with a `factor` times smaller step.
+        """Return the same episode, decided and sampled as before, at a `factor` times smaller step.
 
         **Raises:** `ValueError` for a factor that is not a positive integer, and for an
         environment that is another model at another step (backends spring and positional).
@@ -96,30 +98,35 @@ class Brax(System):
         check_factor(factor)
         return replace(self, env=with_finer_step(self.env, factor, self.name))
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate one episode, not reset at its end."""
         return rollout(self._episode(features), key)
 
     def fold(
-        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
-    ) -> tuple[Any, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+        self,
+        features: Features,
+        key: Seed,
+        carry: Carry,
+        update: Callable[[Carry, dict[str, Array]], Carry],
+    ) -> tuple[Carry, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
 
         Behind an early end the last valid sample comes again, until the last step.
-        Returns the carry and the status.
+
+        **Returns:** the last carry, and the status.
         """
         return fold(self._episode(features), key, carry, update)
 
-    def _episode(self, features: Any) -> Episode:
-        """The environment under these features, with the policy in the loop."""
+    def _episode(self, features: Features) -> Episode:
+        """Return the environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
         fixed = None if has_waveforms(features) else self._configure(features, 0.0)
 
-        def env_at(time: Any) -> Any:
+        def env_at(time: Time) -> Any:
             return self._configure(features, time) if fixed is None else fixed
 
-        def start(key: Any) -> Moment:
+        def start(key: Key[Array, ""]) -> Moment:
             env, now = env_at(0.0), features_at(features, 0.0)
             if callable(self.initial):
                 return _moment(self.initial(env, now, key), self.name)
@@ -128,12 +135,12 @@ class Brax(System):
             with explain_errors(self.env, self.name, "reset"):
                 return _moment(env.reset(key), self.name)
 
-        def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
+        def step(time: Time, state: Env, action: PyTree, key: Key[Array, ""]) -> Moment:
             env = env_at(time)
             with explain_errors(self.env, self.name, "step"):
                 return _moment(env.step(state, action), self.name)
 
-        def see(time: Any, moment: Moment, action: Any) -> Any:
+        def sample(time: Time, moment: Moment, action: PyTree) -> Any:
             now = features_at(features, time)
             return read_signals(
                 self.signals, moment, action, now, _named_parts(moment.state), self.name
@@ -141,16 +148,16 @@ class Brax(System):
 
         decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
 
-        def fitting(observation: Any, memory: Any, key: Any) -> Any:
+        def decide_checked(observation: PyTree, memory: PyTree, key: Key[Array, ""]) -> Any:
             action, memory = decide(observation, memory, key)
             return vector_action(action, size, self.name), memory
 
         return Episode(
-            self.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
+            self.name, start, step, decide_checked, self.policy_memory, sample, self.steps, self.dt
         )
 
-    def _configure(self, features: Any, time: Any) -> Any:
-        """The environment under the features of an instant."""
+    def _configure(self, features: Features, time: Time) -> Any:
+        """Return the environment under the features of an instant."""
         now, env = features_at(features, time), self.env
         if self.features:
             sys = env.unwrapped.sys
@@ -175,7 +182,7 @@ class Brax(System):
             )
         return with_system(env, sys)
 
-    def check(self, features: Any) -> None:
+    def check(self, features: Features) -> None:
         """Refuse features that do not exist, or that nothing would read.
 
         **Raises:** `UnknownNameError`, `ValueError`.
@@ -192,8 +199,8 @@ class Brax(System):
 
 @suggests_options
 def brax(
-    env: Any,
-    policy: Any,
+    env: Env,
+    policy: object,
     *,
     steps: int | None = None,
     duration: float | None = None,
@@ -203,10 +210,10 @@ def brax(
     initial: Mapping[str, str] | Callable[..., Any] | None = None,
     signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
     dt: float | None = None,
-    policy_memory: Any = None,
-    options: Mapping[str, Any] | None = None,
+    policy_memory: PyTree = None,
+    options: Mapping[str, object] | None = None,
 ) -> Brax:
-    """A system `(features, key) -> Trace` from an environment of Brax and a policy.
+    """Make a system `(features, key) -> Trace` from an environment of Brax and a policy.
 
     **Arguments:**
 
@@ -237,6 +244,8 @@ def brax(
     - `options`: keyword arguments of an environment by name.
 
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
+
+    **Returns:** a `Brax` system, one episode of which is one simulation.
 
     **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
     unknown environment, backend or part; `ValueError` for a part that the backend does not read,
@@ -289,7 +298,7 @@ def brax(
 
 
 def _import(module: str) -> Any:
-    """A module of Brax, without what it and its packages say of themselves at each import."""
+    """Import a module of Brax, without the messages that it and its packages print."""
     require("brax", extra="brax")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -306,8 +315,8 @@ def _check_version() -> None:
         )
 
 
-def _make(name: str, backend: str | None, options: dict[str, Any]) -> Any:
-    """An environment of Brax's own, by its name."""
+def _make(name: str, backend: str | None, options: dict[str, object]) -> Any:
+    """Make one of Brax's own environments, by its name."""
     envs = _import("brax.envs")
     known = getattr(envs, "_envs", {})
     if known and name not in known:
@@ -320,7 +329,7 @@ def _make(name: str, backend: str | None, options: dict[str, Any]) -> Any:
         return envs.get_environment(name, **options)
 
 
-def _check_env(env: Any, name: str) -> None:
+def _check_env(env: Env, name: str) -> None:
     """Refuse what is no environment, or one that resets itself."""
     for part in ("reset", "step", "action_size"):
         if not hasattr(type(env), part) and not hasattr(env, part):
@@ -344,7 +353,7 @@ def _check_env(env: Any, name: str) -> None:
         inner = vars(inner).get("env") if hasattr(inner, "__dict__") else None
 
 
-def _moment(state: Any, name: str) -> Moment:
+def _moment(state: Env, name: str) -> Moment:
     missing = [part for part in ("obs", "reward", "done") if not hasattr(state, part)]
     if missing:
         raise ValueError(
@@ -353,8 +362,8 @@ def _moment(state: Any, name: str) -> Moment:
     return Moment(state, state.obs, state.reward, state.done)
 
 
-def _named_parts(state: Any) -> dict[str, Any]:
-    """The parts of a brax State that have names of their own."""
+def _named_parts(state: Env) -> dict[str, Any]:
+    """Return the parts of a Brax State that have names of their own."""
     physics = getattr(state, "pipeline_state", None)
     parts = {part: getattr(physics, part, None) for part in ("q", "qd")}
     return {

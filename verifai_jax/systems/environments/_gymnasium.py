@@ -11,7 +11,7 @@ One trace is one episode: it is never reset within.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -28,6 +28,9 @@ from verifai_jax.systems.environments.episode import (
     sampling_period,
 )
 
+Env: TypeAlias = Any
+"""A `gymnasium.Env`; Gymnasium is an optional package, so its types cannot be imported here."""
+
 # What environments compute once from their attributes, and would not follow a feature.
 DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
     "CartPoleEnv": {
@@ -39,7 +42,7 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 @dataclass(eq=False)
 class EpisodeFunction:
-    """One episode of an environment as a function `(features, seed) -> Trace`.
+    """A function `(features, seed) -> Trace` of one episode of an environment.
 
     The environment is made once in each process, and does not travel to workers.
     """
@@ -65,10 +68,10 @@ class EpisodeFunction:
 
     @property
     def name(self) -> str:
-        """What errors call the environment."""
+        """The name of the environment in errors."""
         return self.make if isinstance(self.make, str) else getattr(self.make, "__name__", "env")
 
-    def __call__(self, features: Any, seed: int) -> Trace:
+    def __call__(self, features: Mapping[str, Any], seed: int) -> Trace:
         env, dt = self.environment, self.period
         features = bound(features, self.steps * dt)
         self._set(features, 0.0)
@@ -148,7 +151,7 @@ class EpisodeFunction:
         for attribute, derived in DERIVED.get(type(env.unwrapped).__name__, {}).items():
             setattr(env.unwrapped, attribute, derived(env.unwrapped))
 
-    def _start(self, env: Any, features: Any, seed: int) -> Any:
+    def _start(self, env: Env, features: Mapping[str, Any], seed: int) -> Any:
         started = env.reset(seed=seed) if self.reset is None else self.reset(env, features, seed)
         if isinstance(started, tuple) and len(started) == 2 and isinstance(started[1], dict):
             started = started[0]
@@ -160,7 +163,7 @@ class EpisodeFunction:
             )
         return started
 
-    def _act(self, env: Any, observation: Any) -> Any:
+    def _act(self, env: Env, observation: object) -> Any:
         if self._decide is None:
             self._decide = _policy_function(self.policy)
         action, space = self._decide(observation), env.action_space
@@ -180,11 +183,16 @@ class EpisodeFunction:
         return array.reshape(space.shape).astype(space.dtype)
 
     def _sample(
-        self, env: Any, observation: Any, action: Any, reward: Any, features: Any
+        self,
+        env: Env,
+        observation: object,
+        action: object,
+        reward: float | np.number,
+        features: Mapping[str, Any],
     ) -> dict[str, np.ndarray]:
         now: Any = (env, _arrays(observation), np.asarray(reward, float), np.array(False))
-        seen = Moment(*now)
-        samples = read_signals(self.signals, seen, np.asarray(action), features, {}, self.name)
+        moment = Moment(*now)
+        samples = read_signals(self.signals, moment, np.asarray(action), features, {}, self.name)
         # Copied: an environment may write its next observation into the same array.
         return {name: np.array(value) for name, value in samples.items()}
 
@@ -192,7 +200,7 @@ class EpisodeFunction:
 @suggests_options
 def gymnasium(
     env: str | Callable[[], Any],
-    policy: Any,
+    policy: object,
     *,
     steps: int,
     signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
@@ -204,7 +212,7 @@ def gymnasium(
     timeout: float | None = None,
     retries: int = 1,
 ) -> BlackBox | PooledBlackBox:
-    """A black box of an environment of Gymnasium and a policy.
+    """Make a black box from an environment of Gymnasium and a policy.
 
     **Arguments:**
 
@@ -229,6 +237,9 @@ def gymnasium(
     - `dt`: seconds of a step; the environment's attribute `dt` or `tau` when left out, or 1.
     - `workers`, `timeout`, `retries`: see `blackbox`.
 
+    **Returns:** a black box, with `workers` one in processes of its own; one episode is one
+    simulation.
+
     **Raises:** `MissingExtra` without Gymnasium; `ValueError` for options that do not fit; when the
     problem is checked, `UnknownNameError` for an attribute that the environment lacks.
     """
@@ -250,14 +261,15 @@ def gymnasium(
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
 
 
-def _arrays(observation: Any) -> Any:
+def _arrays(observation: object) -> Any:
     if isinstance(observation, Mapping):
         return {name: np.asarray(value) for name, value in observation.items()}
     return np.asarray(observation)
 
 
-def _policy_function(policy: Any, compiled: bool = True) -> Callable[[Any], Any]:
-    function = policy.act if callable(getattr(policy, "act", None)) else policy
+def _policy_function(policy: object, compiled: bool = True) -> Callable[[Any], Any]:
+    act = getattr(policy, "act", None)
+    function = act if callable(act) else policy
     if not callable(function):
         raise ValueError(
             f"policy must be a function of the observation, or have a method act; got {policy!r}"

@@ -11,11 +11,11 @@ import importlib.metadata
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.errors import (
     MissingExtra,
@@ -26,10 +26,11 @@ from verifai_jax.core.errors import (
 )
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
-from verifai_jax.systems.base import System
+from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
+    Time,
     check_features,
     check_signals_option,
     features_at,
@@ -46,6 +47,13 @@ from verifai_jax.systems.environments.episode import (
 from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)
+
+Env: TypeAlias = Any
+"""A `gymnax` Environment; gymnax is an optional package, so its types cannot be imported here."""
+Params: TypeAlias = Any
+"""The parameters of an environment, a dataclass of its own."""
+Space: TypeAlias = Any
+"""A space of `gymnax.environments.spaces`."""
 
 # Parameters that gymnax stores but that follow from others; it does not recompute them.
 DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
@@ -77,30 +85,35 @@ class Gymnax(System):
         """Simulated seconds."""
         return self.steps * self.dt
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate one episode, not reset at its end."""
         return rollout(self._episode(features), key)
 
     def fold(
-        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
-    ) -> tuple[Any, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+        self,
+        features: Features,
+        key: Seed,
+        carry: Carry,
+        update: Callable[[Carry, dict[str, Array]], Carry],
+    ) -> tuple[Carry, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
 
         Behind an early end the last valid sample comes again, until the last step.
-        Returns the carry and the status.
+
+        **Returns:** the last carry, and the status.
         """
         return fold(self._episode(features), key, carry, update)
 
-    def _episode(self, features: Any) -> Episode:
-        """The environment under these features, with the policy in the loop."""
+    def _episode(self, features: Features) -> Episode:
+        """Return the environment under these features, with the policy in the loop."""
         features = bound(features, self.duration)
         self.check(features)
         fixed = None if has_waveforms(features) else self._configure(features, 0.0)
 
-        def params_at(time: Any) -> Any:
+        def params_at(time: Time) -> Any:
             return self._configure(features, time) if fixed is None else fixed
 
-        def start(key: Any) -> Moment:
+        def start(key: Key[Array, ""]) -> Moment:
             params = params_at(0.0)
             observation, state = self.env.reset_env(key, params)
             if self.initial is not None:
@@ -108,7 +121,7 @@ class Gymnax(System):
                 observation = self.env.observe(key, state, None, params)
             return Moment(state, observation, 0.0, False)
 
-        def step(time: Any, state: Any, action: Any, key: Any) -> Moment:
+        def step(time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
             params = params_at(time)
             state, params = _differentiable(self.env, state, action, key, params)
             observation, state, reward, over, _ = self.env.step_env(key, state, action, params)
@@ -116,23 +129,30 @@ class Gymnax(System):
                 over = over | self.env.is_truncated(state, params)
             return Moment(state, observation, reward, over)
 
-        def see(time: Any, moment: Moment, action: Any) -> Any:
+        def sample(time: Time, moment: Moment, action: PyTree) -> Any:
             named = {n: v for n, v in _fields(moment.state).items() if n != "time"}
             now = features_at(features, time)
             return read_signals(self.signals, moment, action, now, named, self.env.name)
 
         decide = policy_function(self.policy, self.policy_memory)
 
-        def fitting(observation: Any, memory: Any, key: Any) -> Any:
+        def decide_checked(observation: PyTree, memory: PyTree, key: Key[Array, ""]) -> Any:
             action, memory = decide(observation, memory, key)
             return _as_action(action, self.env.action_space(self.params), self.env.name), memory
 
         return Episode(
-            self.env.name, start, step, fitting, self.policy_memory, see, self.steps, self.dt
+            self.env.name,
+            start,
+            step,
+            decide_checked,
+            self.policy_memory,
+            sample,
+            self.steps,
+            self.dt,
         )
 
-    def _configure(self, features: Any, time: Any) -> Any:
-        """The environment's parameters under the features of an instant."""
+    def _configure(self, features: Features, time: Time) -> Any:
+        """Return the environment's parameters under the features of an instant."""
         now, params = features_at(features, time), self.params
         if self.features:
             fields = {field: now[name] for name, field in self.features.items()}
@@ -150,8 +170,8 @@ class Gymnax(System):
                 )
         return params
 
-    def _initial_state(self, state: Any, features: Any, key: Any) -> Any:
-        """The state to start from."""
+    def _initial_state(self, state: PyTree, features: Features, key: Key[Array, ""]) -> Any:
+        """Return the state to start from."""
         if not isinstance(self.initial, Mapping):
             assert self.initial is not None
             placed = self.initial(state, features, key)
@@ -163,7 +183,7 @@ class Gymnax(System):
         check_names(f"part of {self.env.name}'s state", self.initial.values(), known)
         return state.replace(**{part: features[name] for name, part in self.initial.items()})
 
-    def check(self, features: Any) -> None:
+    def check(self, features: Features) -> None:
         """Refuse features that do not exist, or that nothing would read.
 
         **Raises:** `UnknownNameError`, `ValueError`.
@@ -180,8 +200,8 @@ class Gymnax(System):
 
 @suggests_options
 def gymnax(
-    env: Any,
-    policy: Any,
+    env: Env,
+    policy: object,
     *,
     steps: int | None = None,
     duration: float | None = None,
@@ -190,11 +210,11 @@ def gymnax(
     initial: Mapping[str, str] | Callable[..., Any] | None = None,
     signals: Mapping[str, Any] | Sequence[str] | Callable[..., Mapping[str, Any]] | None = None,
     dt: float | None = None,
-    params: Any = None,
-    policy_memory: Any = None,
+    params: Params | None = None,
+    policy_memory: PyTree = None,
     truncate: bool = False,
 ) -> Gymnax:
-    """A system `(features, key) -> Trace` from an environment of gymnax and a policy.
+    """Make a system `(features, key) -> Trace` from an environment of gymnax and a policy.
 
     **Arguments:**
 
@@ -221,6 +241,8 @@ def gymnax(
 
     A `Signal` feature reaches parameters and functions as its value at the beginning of the step.
     Environments that support gradients are asked for them; differentiating any other raises.
+
+    **Returns:** a `Gymnax` system, one episode of which is one simulation.
 
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
     an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the
@@ -292,19 +314,19 @@ def _check_version() -> None:
         )
 
 
-def _fields(value: Any) -> dict[str, Any]:
+def _fields(value: object) -> dict[str, Any]:
     return {name: getattr(value, name) for name in getattr(value, "__dataclass_fields__", ())}
 
 
-def _check_choices(policy: Any, space: Any, name: str) -> None:
-    """Refuse a policy that says itself that it chooses among another number of actions."""
+def _check_choices(policy: object, space: Space, name: str) -> None:
+    """Refuse a policy that states itself that it chooses among another number of actions."""
     chosen, offered = getattr(getattr(policy, "action", None), "n", None), getattr(space, "n", None)
     if chosen is not None and chosen != offered:
         raise ValueError(f"policy chooses one of {chosen} actions; {name} takes {space!r}")
 
 
-def _as_action(action: Any, space: Any, name: str) -> Array:
-    """A policy's output as an action of the space.
+def _as_action(action: PyTree, space: Space, name: str) -> Array:
+    """Return a policy's output as an action of the space.
 
     **Raises:** `ValueError` for another shape, or numbers of another kind.
     """
@@ -329,8 +351,10 @@ _STOPS = (
 )
 
 
-def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) -> tuple[Any, Any]:
-    """State and parameters as they are, but not differentiable if the step stops gradients.
+def _differentiable(
+    env: Env, state: PyTree, action: PyTree, key: Key[Array, ""], params: Params
+) -> tuple[Any, Any]:
+    """Return state and parameters, not differentiable if the step stops gradients.
 
     A gradient that is silently zero would mislead a search worse than none.
     """
@@ -342,7 +366,9 @@ def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) ->
     moving = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     shapes = jax.eval_shape(lambda: (leaves, action, key))
 
-    def stepped(values: Any, others: Any, action: Any, key: Any) -> Any:
+    def stepped(
+        values: Sequence[Array], others: Sequence[Array], action: PyTree, key: Key[Array, ""]
+    ) -> Any:
         whole = list(others)
         for i, value in zip(moving, values, strict=True):
             whole[i] = value
@@ -350,7 +376,13 @@ def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) ->
         after = jax.tree.leaves(env.step_env(key, state, action, params)[1])
         return [leaf for leaf in after if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
 
-    def tangents(values: Any, directions: Any, others: Any, action: Any, key: Any) -> Any:
+    def tangents(
+        values: Sequence[Array],
+        directions: Sequence[Array],
+        others: Sequence[Array],
+        action: PyTree,
+        key: Key[Array, ""],
+    ) -> Any:
         return jax.jvp(lambda v: stepped(v, others, action, key), (values,), (directions,))[1]
 
     def stops() -> bool:
@@ -360,11 +392,11 @@ def _differentiable(env: Any, state: Any, action: Any, key: Any, params: Any) ->
         return bool(values) and not any(used[len(values) : 2 * len(values)])
 
     @jax.custom_jvp
-    def same(*values: Any) -> Any:
+    def same(*values: Sequence[Array]) -> Any:
         return values
 
     @same.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> Any:
         if stops():
             raise ValueError(f"{env.name}: {_STOPS}")
         return primals, tangents

@@ -10,15 +10,22 @@ import difflib
 import importlib.metadata
 import re
 import warnings
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.errors import UnknownNameError, require, unknown_name
 from verifai_jax.systems.environments.episode import used_inputs
+
+Env: TypeAlias = Any
+"""A `brax.envs.Env`; Brax is an optional package, so its types cannot be imported here."""
+BraxSystem: TypeAlias = Any
+"""A `brax.System`, or a part of one."""
 
 # Arrays of MuJoCo by the beginnings of their names, and what their rows are called after.
 _ROWS = {
@@ -31,7 +38,7 @@ _ROWS = {
 
 
 class Place(NamedTuple):
-    """An array somewhere in a system, or one entry of it."""
+    """An array somewhere in a Brax system, or one entry of it."""
 
     parts: tuple[str, ...]
     index: int | None
@@ -41,8 +48,8 @@ class Place(NamedTuple):
 
 
 @contextlib.contextmanager
-def explain_errors(env: Any, name: str, what: str, backend: str | None = None) -> Iterator[None]:
-    """Say which environment, backend and versions an error within Brax belongs to."""
+def explain_errors(env: Env, name: str, what: str, backend: str | None = None) -> Iterator[None]:
+    """Raise errors from within Brax again, with the environment, the backend and the versions."""
     try:
         with warnings.catch_warnings():
             # Brax still uses names that MuJoCo has moved, and nobody can do anything about it.
@@ -61,8 +68,8 @@ def explain_errors(env: Any, name: str, what: str, backend: str | None = None) -
         ) from e
 
 
-def system_place(env: Any, path: str, name: str) -> Place:
-    """Where a path such as `link.inertia.mass[pole]` leads.
+def system_place(env: Env, path: str, name: str) -> Place:
+    """Return the place of a path such as `link.inertia.mass[pole]`.
 
     **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
     environment without `sys`, or a part that holds no numbers.
@@ -97,15 +104,15 @@ def system_place(env: Any, path: str, name: str) -> Place:
     return Place(parts, _row(text, parts, np.shape(leaf)[0], _row_names(sys, parts), name))
 
 
-def _paths(sys: Any) -> list[str]:
+def _paths(sys: BraxSystem) -> list[str]:
     return [
         ".".join(getattr(key, "name", str(key)) for key in path)
         for path, _ in jax.tree.leaves_with_path(sys)
     ]
 
 
-def _row_names(sys: Any, parts: tuple[str, ...]) -> dict[str, int]:
-    """What the rows of an array are called, where they are called anything."""
+def _row_names(sys: BraxSystem, parts: tuple[str, ...]) -> dict[str, int]:
+    """Return the names of an array's rows and their indices, where they have names."""
     if parts[0] == "link":
         return {link: i for i, link in enumerate(sys.link_names)}
     kind = next((kind for start, kind in _ROWS.items() if parts[-1].startswith(start)), None)
@@ -132,8 +139,8 @@ def _row(text: str, parts: tuple[str, ...], length: int, named: dict[str, int], 
     return int(text) % length
 
 
-def joint_place(env: Any, path: str, name: str) -> Place:
-    """Which entry of `q` or `qd` a path such as `q[hinge]` means."""
+def joint_place(env: Env, path: str, name: str) -> Place:
+    """Return the place of a path such as `q[hinge]` in the initial `q` or `qd`."""
     match = re.fullmatch(r"(\w+)\[([^\]]+)\]", path.strip())
     part = match.group(1) if match else path
     if part not in ("q", "qd") or match is None:
@@ -153,8 +160,8 @@ def joint_place(env: Any, path: str, name: str) -> Place:
     return Place((part,), _row(match.group(2), (part,), length, named, name))
 
 
-def with_value(sys: Any, place: Place, value: Any, feature: str) -> Any:
-    """The system with one array, or one entry of it, set."""
+def with_value(sys: BraxSystem, place: Place, value: ArrayLike, feature: str) -> Any:
+    """Return the system with one array, or one entry of it, set."""
     old: Any = sys
     for part in place.parts:
         old = getattr(old, part)
@@ -172,15 +179,15 @@ def with_value(sys: Any, place: Place, value: Any, feature: str) -> Any:
     return _replaced(sys, place.parts, new)
 
 
-def _replaced(node: Any, parts: tuple[str, ...], value: Any) -> Any:
+def _replaced(node: BraxSystem, parts: tuple[str, ...], value: ArrayLike) -> Any:
     if not parts:
         return value
     child = _replaced(getattr(node, parts[0]), parts[1:], value)
     return node.replace(**{parts[0]: child})
 
 
-def with_system(env: Any, sys: Any) -> Any:
-    """A copy of the environment, within its wrappers, with another `sys`."""
+def with_system(env: Env, sys: BraxSystem) -> Any:
+    """Return a copy of the environment, within its wrappers, with another `sys`."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
         other.env = with_system(other.env, sys)
@@ -189,8 +196,8 @@ def with_system(env: Any, sys: Any) -> Any:
     return other
 
 
-def with_finer_step(env: Any, factor: int, name: str) -> Any:
-    """A copy of the environment with a `factor` times smaller step of its physics.
+def with_finer_step(env: Env, factor: int, name: str) -> Any:
+    """Return a copy of the environment with a `factor` times smaller step of its physics.
 
     **Raises:** `ValueError` for one whose physics is another at another step.
     """
@@ -212,15 +219,17 @@ def with_finer_step(env: Any, factor: int, name: str) -> Any:
     return other
 
 
-def with_start(env: Any, values: Mapping[Place, Any]) -> Any:
-    """A copy whose reset starts from these entries of `q` and `qd`, and observes what they give."""
+def with_start(env: Env, values: Mapping[Place, ArrayLike]) -> Any:
+    """Return a copy whose reset starts from, and observes, these entries of `q` and `qd`."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
         other.env = with_start(other.env, values)
         return other
     begin = other.pipeline_init
 
-    def pipeline_init(q: Any, qd: Any, *rest: Any, **options: Any) -> Any:
+    def pipeline_init(
+        q: Float[Array, " q"], qd: Float[Array, " qd"], *rest: Any, **options: Any
+    ) -> Any:
         for place, value in values.items():
             if place.parts == ("q",):
                 q = jnp.asarray(q).at[place.index].set(value)
@@ -232,8 +241,8 @@ def with_start(env: Any, values: Mapping[Place, Any]) -> Any:
     return other
 
 
-def check_parts_are_read(env: Any, name: str, places: Mapping[str, Place]) -> None:
-    """Refuse a part of the system that neither reset nor step looks at: it would change nothing.
+def check_parts_are_read(env: Env, name: str, places: Mapping[str, Place]) -> None:
+    """Refuse a part of the system that neither reset nor step reads: it would change nothing.
 
     Each backend reads its own copies of masses, gains and the like.
     """
@@ -247,7 +256,7 @@ def check_parts_are_read(env: Any, name: str, places: Mapping[str, Place]) -> No
             value = getattr(value, part)
         return jnp.asarray(value)
 
-    def play(values: Any, key: Any, action: Any) -> Any:
+    def play(values: Sequence[Array], key: Key[Array, ""], action: Float[Array, " action"]) -> Any:
         changed = sys
         for place, value in zip(places.values(), values, strict=True):
             changed = _replaced(changed, place.parts, value)

@@ -9,26 +9,34 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
+from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 
-Time = Float[Array, ""]
-Decide = Callable[[Any, Any, Any], tuple[Any, Any]]
+Time: TypeAlias = Float[Array, ""] | float
+"""Seconds since the start of an episode."""
+Decide: TypeAlias = Callable[[PyTree, PyTree, Key[Array, ""]], tuple[PyTree, PyTree]]
+"""A function `(observation, memory, key) -> (action, memory)`."""
+SignalsOption: TypeAlias = (
+    Mapping[str, int | str] | Sequence[str] | Callable[..., Mapping[str, Any]] | None
+)
+"""The option `signals` of an environment; see `read_signals`."""
 
 
 class Moment(NamedTuple):
-    """What an environment shows after its reset or a step: one reward, and whether it is over."""
+    """The state after the reset or a step, its observation and reward, and whether it is over."""
 
     state: Any
     observation: Any
@@ -38,7 +46,7 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """How an environment is started, stepped and seen, with its features in place.
+    """An environment with its features in place: its start, its step and its signals.
 
     - `start(key) -> Moment`
     - `step(time, state, action, key) -> Moment`: from the sample at `time` seconds to the next.
@@ -52,31 +60,31 @@ class Episode:
     step: Callable[..., Moment]
     decide: Decide
     memory: Any
-    signals: Callable[..., Mapping[str, Any]]
+    signals: Callable[..., dict[str, Array]]
     steps: int
     dt: float
 
-    def next_moment(self, time: Any, state: Any, action: Any, key: Any) -> Moment:
-        """The moment that a step leads to, `over` as a truth value."""
+    def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
+        """Return the moment after a step, `over` as a truth value."""
         moment = self.step(time, state, action, key)
         return moment._replace(over=jnp.asarray(moment.over, bool))
 
 
 class _Keys(NamedTuple):
-    """Random keys of a simulation: its start, and where those of steps and decisions begin."""
+    """Random keys of a simulation: for the start, and the roots of those of steps and decisions."""
 
     start: Key[Array, ""]
     step: Key[Array, ""]
     decide: Key[Array, ""]
 
 
-def episode_keys(key: Any) -> _Keys:
-    """The keys of one simulation; step `k` has `fold_in(keys.step, k)`, decision `k` likewise."""
+def episode_keys(key: Seed) -> _Keys:
+    """Split a simulation's key; step `k` has `fold_in(keys.step, k)`, decision `k` likewise."""
     return _Keys(*jax.random.split(jax.random.key(0) if key is None else key, 3))
 
 
-def rollout(episode: Episode, key: Any) -> Trace:
-    """One episode: a sample after the reset and after each step, with the action taken there.
+def rollout(episode: Episode, key: Seed) -> Trace:
+    """Simulate one episode: a sample after the reset and after each step, with its action.
 
     The reward of a sample is that of the step which led to it. The first sample at which the
     episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
@@ -84,44 +92,52 @@ def rollout(episode: Episode, key: Any) -> Trace:
 
     **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
     """
-    last, age, _, samples = _run(episode, key, None, lambda _, seen: (None, seen))
+    last, age, _, samples = _run(episode, key, None, lambda _, sample: (None, sample))
     return Trace(samples, dt=episode.dt, valid=age + 1, status=_status(last), held=True)
 
 
 def fold(
-    episode: Episode, key: Any, carry: Any, update: Callable[[Any, Any], Any]
-) -> tuple[Any, Int[Array, ""]]:
-    """`carry = update(carry, sample)` over the samples of `rollout`, of which none is kept.
+    episode: Episode,
+    key: Seed,
+    carry: Carry,
+    update: Callable[[Carry, dict[str, Array]], Carry],
+) -> tuple[Carry, Int[Array, ""]]:
+    """Apply `carry = update(carry, sample)` to the samples of `rollout`, of which none is stored.
 
-    Behind the end the last valid sample comes again. Returns the carry and the status.
+    Behind the end the last valid sample comes again. **Returns:** the last carry, and the status.
     """
-    last, _, carry, _ = _run(episode, key, carry, lambda c, seen: (update(c, seen), None))
+    last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
     return carry, _status(last)
 
 
-def _run(episode: Episode, key: Any, kept: Any, keep: Any) -> tuple[Moment, Any, Any, Any]:
-    """The last moment, how many steps were lived, and what `keep` made of the samples."""
+def _run(
+    episode: Episode,
+    key: Seed,
+    collected: PyTree,
+    collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
+) -> tuple[Moment, Any, Any, Any]:
+    """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
     first, memory = _first_moment(episode, episode.start(keys.start), keys)
 
-    def sample(carry: Any, k: Any) -> Any:
-        (moment, memory, age), kept = carry
+    def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
+        (moment, memory, age), collected = carry
         frozen = (k >= episode.steps) | moment.over
-        # Time, and with it randomness, stops with the state: what is seen behind the end repeats.
+        # Time, and with it randomness, stops with the state: the samples behind the end repeat.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
         action, after = episode.decide(moment.observation, memory, decide_key)
-        kept, output = keep(kept, episode.signals(time, moment, action))
+        collected, output = collect(collected, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.next_moment(time, state, action, step_key), moment)
-        return (_where(frozen, carry[0], (following, after, age + 1)), kept), output
+        return (_where(frozen, carry[0], (following, after, age + 1)), collected), output
 
     # One iteration more than there are steps samples the end and moves nothing.
-    ((last, _, age), kept), outputs = checkpointed_scan(
-        sample, ((first, memory, jnp.int32(0)), kept), episode.steps + 1
+    ((last, _, age), collected), outputs = checkpointed_scan(
+        sample, ((first, memory, jnp.int32(0)), collected), episode.steps + 1
     )
-    return last, age, kept, outputs
+    return last, age, collected, outputs
 
 
 def _status(last: Moment) -> Int[Array, ""]:
@@ -134,7 +150,7 @@ def _status(last: Moment) -> Int[Array, ""]:
 
 
 def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:
-    """The first moment and memory in the types that they keep; refuses parts that do not fit."""
+    """Return the first moment and memory in the types that they keep, checked to fit together."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
     memory = jax.tree.map(jnp.asarray, episode.memory)
     action, after = jax.eval_shape(episode.decide, first.observation, memory, keys.decide)
@@ -165,8 +181,8 @@ def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment,
     return first, memory
 
 
-def policy_function(policy: Any, memory: Any = None) -> Decide:
-    """A user's policy as `decide(observation, memory, key) -> (action, memory)`.
+def policy_function(policy: object, memory: PyTree = None) -> Decide:
+    """Return a user's policy as `decide(observation, memory, key) -> (action, memory)`.
 
     **Arguments:**
 
@@ -178,7 +194,8 @@ def policy_function(policy: Any, memory: Any = None) -> Decide:
 
     **Raises:** `ValueError` for something that cannot be called so.
     """
-    function = policy.act if callable(getattr(policy, "act", None)) else policy
+    act = getattr(policy, "act", None)
+    function = act if callable(act) else policy
     given = ("observation",) if memory is None else ("observation", "memory")
     forms = f"({', '.join(given)}) or ({', '.join(given)}, key)"
     if not callable(function):
@@ -188,7 +205,7 @@ def policy_function(policy: Any, memory: Any = None) -> Decide:
         raise ValueError(f"policy must be a function of {forms}; got one of {needed} arguments")
     random = needed == len(given) + 1
 
-    def decide(observation: Any, remembered: Any, key: Any) -> tuple[Any, Any]:
+    def decide(observation: PyTree, remembered: PyTree, key: Key[Array, ""]) -> tuple[Any, Any]:
         last = (key,) if random else ()
         if memory is None:
             return function(observation, *last), remembered
@@ -201,7 +218,7 @@ def policy_function(policy: Any, memory: Any = None) -> Decide:
 
 
 def _count_required(function: Callable[..., Any]) -> int | None:
-    """How many arguments it needs; None for one that does not say, or takes any number."""
+    """Count the arguments without a default; None for any number, or an unknown one."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -212,8 +229,8 @@ def _count_required(function: Callable[..., Any]) -> int | None:
     return sum(p.kind in places and p.default is p.empty for p in parameters)
 
 
-def vector_action(action: Any, size: int, name: str) -> Float[Array, " size"]:
-    """A policy's output as the vector that the environment takes; a number may stand for one.
+def vector_action(action: ArrayLike, size: int, name: str) -> Float[Array, " size"]:
+    """Return a policy's output as the vector of an action; a number may stand for one entry.
 
     **Raises:** `ValueError` for anything else than `size` real numbers.
     """
@@ -231,9 +248,14 @@ def vector_action(action: Any, size: int, name: str) -> Float[Array, " size"]:
 
 
 def read_signals(
-    signals: Any, moment: Moment, action: Any, features: Any, named: Mapping[str, Any], name: str
+    signals: SignalsOption,
+    moment: Moment,
+    action: PyTree,
+    features: Features,
+    named: Mapping[str, Any],
+    name: str,
 ) -> Any:
-    """The samples of the signals that were asked for.
+    """Return one sample of the signals that the option `signals` names.
 
     - `signals`: a function `(state, observation, action, reward, features) -> dict`; names of the
       observation's entries, in their order; or `{name: index or key of the observation}`. The last
@@ -261,7 +283,7 @@ def read_signals(
     return {entry: moment.observation[i] for i, entry in enumerate(signals)} | loop
 
 
-def check_signals_option(signals: Any) -> None:
+def check_signals_option(signals: object) -> None:
     """Refuse a `signals=` option that `read_signals` could not use.
 
     **Raises:** `ValueError`.
@@ -280,7 +302,7 @@ def check_signals_option(signals: Any) -> None:
         )
 
 
-def _entry(observation: Any, at: Any, signal: str, name: str) -> Any:
+def _entry(observation: PyTree, at: int | str, signal: str, name: str) -> Any:
     if isinstance(observation, Mapping):
         if at not in observation:
             raise unknown_name(f"entry of {name}'s observation", at, observation)
@@ -294,13 +316,13 @@ def _entry(observation: Any, at: Any, signal: str, name: str) -> Any:
     return observation[at]
 
 
-def _plain(value: Any) -> Any:
-    """A vector of one entry as that entry, so that formulas need no index."""
+def _plain(value: PyTree) -> Any:
+    """Return a vector of one entry as that entry, so that formulas need no index."""
     return value[0] if getattr(value, "shape", None) == (1,) else value
 
 
 def check_features(
-    features: Any, bound: Sequence[str], functions: Sequence[Any], name: str, how: str
+    features: Features, bound: Sequence[str], functions: Sequence[Any], name: str, how: str
 ) -> None:
     """Refuse names of features that do not exist, and features that nothing would read.
 
@@ -321,20 +343,20 @@ def check_features(
             raise ValueError(f"feature {feature!r} changes nothing in {name}: bind it by {how}")
 
 
-def features_at(features: Any, time: Any) -> Any:
-    """The same features, each waveform by its value at a time in seconds."""
+def features_at(features: Features, time: Time) -> Any:
+    """Return the same features, each waveform by its value at a time in seconds."""
     return jax.tree.map(lambda v: v(time) if is_waveform(v) else v, features, is_leaf=is_waveform)
 
 
-def has_waveforms(features: Any) -> bool:
-    """Whether any of the features is a function of time."""
+def has_waveforms(features: Features) -> bool:
+    """Return True where any of the features is a function of time."""
     return any(map(is_waveform, jax.tree.leaves(features, is_leaf=is_waveform)))
 
 
 def step_count(
     steps: int | None, duration: float | None, dt: float, otherwise: int | None = None
 ) -> int:
-    """How many steps an episode has; refuses what is no positive number of them."""
+    """Return the number of steps of an episode; refuse anything but a positive one."""
     if steps is not None and duration is not None:
         raise ValueError(f"give either duration or steps; got (duration={duration}, steps={steps})")
     if duration is not None:
@@ -350,20 +372,21 @@ def step_count(
     return check_count("steps", steps)
 
 
-def sampling_period(seconds: Any) -> float:
-    """A sampling period, checked; one that comes from a float32 is the number that was meant."""
+def sampling_period(seconds: object) -> float:
+    """Check a sampling period; one from a float32 becomes the decimal number that was meant."""
+    value: Any = seconds
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():
         number = True
-    if not number or not (math.isfinite(seconds) and seconds > 0):
+    if not number or not (math.isfinite(value) and value > 0):
         raise ValueError(f"dt must be a positive number of seconds; got {seconds!r}")
     if getattr(seconds, "dtype", None) == np.float32:
-        return float(str(np.float32(seconds)))
-    return float(seconds)
+        return float(str(np.float32(value)))
+    return float(value)
 
 
 def used_inputs(function: Callable[..., Any], *arguments: Any) -> list[bool]:
-    """For each leaf of the arguments, whether any result of the function depends on it.
+    """Return, for each leaf of the arguments, True if a result of the function depends on it.
 
     Abstract: nothing is computed or compiled.
     """
@@ -374,17 +397,17 @@ def used_inputs(function: Callable[..., Any], *arguments: Any) -> list[bool]:
     return list(used)
 
 
-def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+def _where(condition: Bool[Array, ""], yes: PyTree, no: PyTree) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def _cast(tree: Any, like: Any) -> Any:
-    def cast(leaf: Any, wanted: Any) -> Any:
+def _cast(tree: PyTree, like: PyTree) -> Any:
+    def cast(leaf: ArrayLike, wanted: Array) -> Any:
         leaf = jnp.asarray(leaf)
         return leaf if leaf.dtype == wanted.dtype else leaf.astype(wanted.dtype)
 
     return jax.tree.map(cast, tree, like)
 
 
-def _floats(tree: Any) -> list[Any]:
+def _floats(tree: PyTree) -> list[Any]:
     return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]

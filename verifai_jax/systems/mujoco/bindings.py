@@ -7,7 +7,7 @@
 Everything here is pure JAX on one row of features; the native backend runs it on a batch.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -59,7 +59,7 @@ class Binding:
 
 @dataclass(frozen=True, eq=False)
 class Bindings:
-    """All bindings of a system, sorted by what they set; made by `resolve_bindings`."""
+    """All bindings of a system, grouped by what they set; made by `resolve_bindings`."""
 
     model: Model
     parameters: tuple[Binding, ...]
@@ -67,7 +67,7 @@ class Bindings:
     applied: tuple[Binding, ...]
     # The bodies whose mass and inertia come from geoms that features change.
     solids: tuple[SolidBody, ...]
-    # What a backend has made of the model, by whatever it depends on.
+    # MJX models and blank data, by their precision: True in float64.
     models: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -77,7 +77,7 @@ class Bindings:
 
     @cached_property
     def arrays(self) -> frozenset[str]:
-        """The model's arrays that differ between rows, those that follow included."""
+        """The model's arrays that differ between rows, derived ones included."""
         changed = {binding.place.array for binding in self.parameters}
         if changed & {"geom_size", "geom_pos", "geom_quat"} and self.solids:
             changed |= {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
@@ -87,11 +87,11 @@ class Bindings:
 
     @cached_property
     def moves_constants(self) -> bool:
-        """Whether constants that MuJoCo derives from the model differ between rows."""
+        """True where constants that MuJoCo derives from the model differ between rows."""
         return bool(self.arrays & _DERIVED_FROM)
 
     def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
-        """The model's arrays for this row of features, in the shapes that the model has them.
+        """Return the model's arrays for this row of features, in the model's shapes.
 
         Geometry comes first, then masses, along which inertia scales, then what is bound itself.
         """
@@ -114,7 +114,7 @@ class Bindings:
         return _set(leaves, groups[2], features, self._base)
 
     def start(self, features: Mapping[str, Any]) -> dict[str, Float[Array, " k"]]:
-        """`qpos`, `qvel` and `act` at time 0."""
+        """Return `qpos`, `qvel` and `act` at time 0."""
         compiled = self.model.compiled
         values = {
             "qpos": jnp.asarray(compiled.qpos0, _float()),
@@ -126,7 +126,7 @@ class Bindings:
     def applied_at(
         self, features: Mapping[str, Any], time: Float[Array, ""]
     ) -> dict[str, Float[Array, "..."]]:
-        """Forces and controls that features apply from `time` on, by the array's name."""
+        """Return forces and controls that features apply from `time` on, by the array's name."""
         compiled = self.model.compiled
         shapes = {"ctrl": (compiled.nu,), "xfrc_applied": (compiled.nbody, 6)}
         shapes["qfrc_applied"] = (compiled.nv,)
@@ -175,7 +175,7 @@ class Bindings:
 def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
     """Resolve the `bind` argument of a system.
 
-    **Raises:** what `mujoco_model.place` raises; `ValueError` for two features on one number, or a
+    **Raises:** as `model.place` does; `ValueError` for two features on one number, or a
     factor on what the model has no value of.
     """
     sorted_: dict[str, list[Binding]] = {"parameters": [], "state": [], "applied": []}
@@ -200,7 +200,7 @@ def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
 
 
 def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
-    """Which elements features change in these arrays."""
+    """Return the rows of these arrays that features change."""
     return {
         int(i) // (4 if binding.place.array.endswith("quat") else 3)
         for binding in parameters
@@ -212,7 +212,7 @@ def _rows(parameters: Iterable[Binding], *arrays: str) -> set[int]:
 def _moving_bodies(
     model: Model, parameters: Iterable[Binding], solids: Iterable[SolidBody]
 ) -> set[int]:
-    """The bodies whose centre of mass or axes features move."""
+    """Return the bodies whose centre of mass or axes features move."""
     joints = _rows(parameters, "jnt_pos", "jnt_axis")
     placed = _rows(parameters, "geom_pos", "geom_quat")
     moving = _rows(parameters, "body_ipos", "body_iquat")
@@ -228,7 +228,10 @@ def _claim(taken: dict[tuple[str, int], str], where: Place, feature: str) -> Non
 
 
 def _set(
-    arrays: dict[str, Any], bound: Iterable[Binding], features: Mapping[str, Any], base: Any
+    arrays: dict[str, Any],
+    bound: Iterable[Binding],
+    features: Mapping[str, Any],
+    base: Callable[[str], np.ndarray],
 ) -> dict[str, Any]:
     arrays = dict(arrays)
     for binding in bound:
@@ -254,7 +257,7 @@ def _float() -> Any:
 
 
 class RecordingFeatures(dict[str, Any]):
-    """Features that note which of them are read."""
+    """Features that record which of them are read."""
 
     def __init__(self, features: Mapping[str, Any], read: set[str]) -> None:
         super().__init__(features)
@@ -264,8 +267,8 @@ class RecordingFeatures(dict[str, Any]):
         self.read.add(name)
         return super().__getitem__(name)
 
-    def get(self, name: str, default: Any = None) -> Any:
-        """As a dictionary's."""
+    def get(self, name: str, default: object = None) -> Any:
+        """Return as a dictionary does."""
         if name in self:
             self.read.add(name)
         return super().get(name, default)
@@ -280,16 +283,16 @@ class RecordingFeatures(dict[str, Any]):
         return super().__iter__()
 
     def keys(self) -> Any:
-        """As a dictionary's; whoever asks for all may read all."""
+        """Return all names, and record all as read."""
         self.read.update(super().keys())
         return super().keys()
 
     def values(self) -> Any:
-        """As a dictionary's."""
+        """Return all values, and record all as read."""
         self.read.update(super().keys())
         return super().values()
 
     def items(self) -> Any:
-        """As a dictionary's."""
+        """Return all items, and record all as read."""
         self.read.update(super().keys())
         return super().items()

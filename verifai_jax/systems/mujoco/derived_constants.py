@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from verifai_jax.systems.mujoco.model import Model, mjx_module
+from verifai_jax.systems.mujoco.model import MjModel, MjxModel, Model, mjx_module
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
@@ -27,7 +27,7 @@ Leaves = dict[str, Float[Array, "..."]]
 
 @dataclass(frozen=True)
 class SolidBody:
-    """A body that is made of its geoms.
+    """A body whose mass and inertia come from its geoms.
 
     - `geoms`: their numbers; `kinds`: their MuJoCo types.
     - `masses`: in kg where the model states a geom's mass, else None.
@@ -42,7 +42,7 @@ class SolidBody:
 
 
 def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[SolidBody, ...]:
-    """The bodies whose inertia comes from their geoms, among those with a `changed` geom.
+    """Return the bodies with a `changed` geom whose inertia comes from their geoms.
 
     A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
 
@@ -75,8 +75,8 @@ def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[SolidBody, 
     return tuple(solids)
 
 
-def _check_solid(compiled: Any, solid: SolidBody) -> None:
-    """Refuse what does not come out as MuJoCo compiled it."""
+def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
+    """Refuse a body whose recomputed inertia is not the one that MuJoCo compiled."""
     name = compiled.body(solid.body).name
     advice = f"give body {name!r} an <inertial>, which then stays as it is"
     if not set(solid.kinds) <= set(_SHAPES):
@@ -100,8 +100,8 @@ def _check_solid(compiled: Any, solid: SolidBody) -> None:
         )
 
 
-def recompute_inertia(compiled: Any, solids: Collection[SolidBody], leaves: Leaves) -> Leaves:
-    """The leaves with mass, centre and inertia of the `solids` as their geoms have them."""
+def recompute_inertia(compiled: MjModel, solids: Collection[SolidBody], leaves: Leaves) -> Leaves:
+    """Return the leaves with mass, centre and inertia of the `solids` as their geoms have them."""
     leaves = dict(leaves)
     for solid in solids:
         parts = [
@@ -122,9 +122,9 @@ def recompute_inertia(compiled: Any, solids: Collection[SolidBody], leaves: Leav
 
 
 def _geom(
-    leaves: Leaves, compiled: Any, geom: int, kind: int, mass: float | None, density: float
+    leaves: Leaves, compiled: MjModel, geom: int, kind: int, mass: float | None, density: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Mass, centre, principal inertia and its orientation of one geom, in its body's frame."""
+    """Return mass, centre, principal inertia and its orientation of a geom, in its body's frame."""
 
     def leaf(name: str) -> Array:
         if name in leaves:
@@ -148,7 +148,7 @@ def _volume(kind: int, size: Float[Array, "3"]) -> Float[Array, ""]:
 
 
 def _inertia(kind: int, size: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Principal moments for unit mass, in the geom's frame."""
+    """Return the principal moments for unit mass, in the geom's frame."""
     a, b, _c = size
     if kind == _SPHERE:
         return jnp.full(3, 0.4, size.dtype) * a**2
@@ -193,7 +193,7 @@ def _rotation(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
 
 
 def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
-    """Of a rotation; the largest of four ways to write it, so that none divides by nothing."""
+    """Return the quaternion of a rotation, by the one of four formulas that divides by the most."""
     m = matrix
     signs = jnp.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], m.dtype)
     squares = 1 + signs @ jnp.diag(m)
@@ -209,8 +209,8 @@ def _quaternion(matrix: Float[Array, "3 3"]) -> Float[Array, "4"]:
     return best / jnp.linalg.norm(best)
 
 
-def recompute_constants(model: Any) -> Any:
-    """An MJX model with the constants that `mj_setConst` computes from its other leaves.
+def recompute_constants(model: MjxModel) -> Any:
+    """Return an MJX model with the constants that `mj_setConst` computes from its other leaves.
 
     Source: MuJoCo, engine_setconst.c (set0 and setFixed); see "Computation: Model" in its manual.
     """
@@ -255,8 +255,8 @@ def recompute_constants(model: Any) -> Any:
     )
 
 
-def _bounds(model: Any) -> Float[Array, " ngeom"]:
-    """The radius of the ball around each geom, where features can change it."""
+def _bounds(model: MjxModel) -> Float[Array, " ngeom"]:
+    """Return the radius of the ball around each geom, where features can change it."""
     bounds = model.geom_rbound
     for geom, kind in enumerate(model.geom_type):
         size = model.geom_size[geom]

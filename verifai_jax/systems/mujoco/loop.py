@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.systems.base import Seed
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Place, names, reading
 from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
@@ -21,13 +22,12 @@ from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 Features = Mapping[str, Any]
 Signals = Mapping[str, str | Callable[..., Any]] | Callable[..., Mapping[str, Any]]
 
-
-# MuJoCo's mjMAXVAL: what is larger it calls unstable, and a control that is it takes for zero.
 HUGE = 1e10
+"""MuJoCo's `mjMAXVAL`: it calls a larger state unstable, and takes a larger control for zero."""
 
 
 class State(NamedTuple):
-    """What controller, signals and terminate see of a simulation, on both backends.
+    """The state of a simulation for controller, signals and terminate, on both backends.
 
     All of it is current but the sensors of acceleration and force (accelerometer, force, torque,
     touch, actuatorfrc): they describe the last physics step before the sample, and are zero at
@@ -50,7 +50,7 @@ class State(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What one sample decides for the control period that begins there.
+    """The signals at one sample, and the inputs of the control period that begins there.
 
     - `inputs`: `ctrl`, and the forces that features apply.
     - `frozen`: the state stays as it is from here on.
@@ -62,7 +62,7 @@ class Sample(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What goes from sample to sample beside the physics: memory, periods simulated, all finite."""
+    """The carry from sample to sample beside the physics."""
 
     memory: Any
     age: Int[Array, ""]
@@ -71,7 +71,7 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Everything of a system but its engine; `mujoco` says what the parts are."""
+    """Everything of a system but its engine; `mujoco` documents the parts."""
 
     bindings: Bindings
     controller: Callable[..., Any] | None
@@ -114,32 +114,32 @@ class Loop:
 
     @cached_property
     def places(self) -> dict[str, Place]:
-        """Where signals that are named by a path are."""
+        """The places of signals that are named by a path."""
         if callable(self.signals):
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals
         places = {}
-        hidden = list(self.bindings.model.contact_sensors)
+        added = list(self.bindings.model.contact_sensors)
         for name, path in chosen.items():
             if callable(path):
                 continue
             if isinstance(path, str) and path.startswith("contact/"):
-                path = f"sensor/{hidden.pop(0)}"
+                path = f"sensor/{added.pop(0)}"
             places[name] = reading(self.compiled, path)
         return places
 
     def _default_signals(self) -> dict[str, str]:
-        found: dict[str, str] = {}
+        paths: dict[str, str] = {}
         for joint in names(self.compiled, "joint"):
-            found |= {joint: f"joint/{joint}/qpos", f"{joint}_vel": f"joint/{joint}/qvel"}
-        found |= {sensor: f"sensor/{sensor}" for sensor in names(self.compiled, "sensor")}
-        if not found:
+            paths |= {joint: f"joint/{joint}/qpos", f"{joint}_vel": f"joint/{joint}/qvel"}
+        paths |= {sensor: f"sensor/{sensor}" for sensor in names(self.compiled, "sensor")}
+        if not paths:
             raise ValueError("the model names no joint or sensor: give signals={'x': 'joint/...'}")
-        return found
+        return paths
 
     @cached_property
     def delayed_sensors(self) -> np.ndarray:
-        """Which of `sensordata` come from the last physics step."""
+        """A mask of the `sensordata` that describe the last physics step, `[nsensordata]`."""
         late = np.zeros(self.compiled.nsensordata, bool)
         for i in range(self.compiled.nsensor):
             if self.compiled.sensor_needstage[i] >= 3:
@@ -147,8 +147,8 @@ class Loop:
                 late[start : start + int(self.compiled.sensor_dim[i])] = True
         return late
 
-    def start(self, features: Features, key: Any) -> dict[str, Array]:
-        """`qpos`, `qvel` and `act` at time 0."""
+    def start(self, features: Features, key: Seed) -> dict[str, Array]:
+        """Return `qpos`, `qvel` and `act` at time 0."""
         start = self.bindings.start(features)
         if self.initial is None:
             return start
@@ -166,7 +166,7 @@ class Loop:
         return start
 
     def initial_progress(self) -> Progress:
-        """Before the first sample."""
+        """Return the progress before the first sample."""
         return Progress(
             jax.tree.map(jnp.asarray, self.controller_memory), jnp.int32(0), jnp.array(True)
         )
@@ -174,7 +174,7 @@ class Loop:
     def sample(
         self, k: Int[Array, ""], arrays: Mapping[str, Array], progress: Progress, features: Features
     ) -> tuple[Sample, Progress]:
-        """Look at the state at sample `k`, and decide what happens until the next.
+        """Read the state at sample `k`, and decide the inputs until the next.
 
         `arrays`: of the state, those that `reads` names at least.
         """
@@ -190,12 +190,12 @@ class Loop:
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
             finite &= jnp.all(jnp.abs(value) <= HUGE)
         after = Progress(memory, progress.age + 1, finite)
-        kept = Progress(progress.memory, progress.age, finite)
-        after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, kept)
+        unchanged = Progress(progress.memory, progress.age, finite)
+        after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, unchanged)
         return Sample(inputs, signals, frozen), after
 
     def state(self, time: Array, arrays: Mapping[str, Array]) -> tuple[State, Array]:
-        """The state as users see it, and all sensors. What is not given is zero."""
+        """Return the state as users see it, and all sensors; an array that is not given is zero."""
         full = {
             name: arrays.get(name, jnp.zeros(shape, time.dtype))
             for name, shape in self.shapes.items()
@@ -205,8 +205,8 @@ class Loop:
         own = sensors[: self.compiled.nsensordata - len(self.bindings.model.contact_sensors)]
         return State(time, **{**full, "sensordata": own}), sensors
 
-    def control(self, state: State, memory: Any, features: Features) -> tuple[Any, Any]:
-        """What the controller says, as `[nu]`, and what it then remembers."""
+    def control(self, state: State, memory: PyTree, features: Features) -> tuple[Any, Any]:
+        """Return the controller's output as `[nu]`, and its memory."""
         nu = self.compiled.nu
         if self.controller is None:
             return jnp.zeros(nu, state.time.dtype), memory
@@ -220,31 +220,31 @@ class Loop:
     def signal_values(
         self, state: State, sensors: Array, ctrl: Array, features: Features
     ) -> dict[str, Any]:
-        """The signals at one sample."""
+        """Return the signals at one sample."""
         if callable(self.signals):
             return dict(self.signals(state.time, state, ctrl, features))
         arrays = {**state._asdict(), "sensordata": sensors, "ctrl": ctrl}
-        seen = {}
+        values = {}
         for name, chosen in (self.signals or self.places).items():
             if callable(chosen):
-                seen[name] = chosen(state.time, state, ctrl, features)
+                values[name] = chosen(state.time, state, ctrl, features)
             else:
                 where = self.places[name]
-                seen[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
-        return seen
+                values[name] = jnp.ravel(arrays[where.array])[where.index].reshape(where.shape)
+        return values
 
     def finite_signals(self) -> tuple[str, ...]:
-        """Signals that are parts of the state, whose finiteness is the state's."""
+        """Return the signals that are parts of the state, whose finiteness is the state's."""
         parts = ("qpos", "qvel", "act", "ctrl")
         return tuple(name for name, place in self.places.items() if place.array in parts)
 
     def arrays_read(self, features: Features) -> frozenset[str]:
-        """The arrays of the state that something looks at."""
+        """Return the names of the state's arrays that a function or a signal reads."""
         fields = [name for name in State._fields if name != "time"]
         zero = jnp.zeros(())
         state, _ = jax.eval_shape(lambda: self.state(zero, {}))
 
-        def everything(state: State, features: Features, memory: Any) -> Any:
+        def everything(state: State, features: Features, memory: PyTree) -> Any:
             control, memory = self.control(state, memory, features)
             ended = () if self.terminate is None else self.terminate(state, features)
             if callable(self.signals):
@@ -277,7 +277,7 @@ class Loop:
         used = {binding.feature for binding in self.bindings.all}
         key = jax.eval_shape(lambda: jax.random.key(0))
 
-        def everything(features: Features, key: Any) -> Any:
+        def everything(features: Features, key: Key[Array, ""]) -> Any:
             watched = RecordingFeatures(features, used)
             start = self.start(watched, key)
             state, sensors = self.state(jnp.zeros((), jnp.result_type(float)), start)
@@ -303,7 +303,7 @@ class Loop:
                     f"it in controller, initial, signals or terminate (nu={nu})"
                 )
 
-    def _check_controller(self, state: State, memory: Any, features: Features) -> None:
+    def _check_controller(self, state: State, memory: PyTree, features: Features) -> None:
         nu = self.compiled.nu
         assert self.controller is not None
         if self.controller_memory is None:

@@ -1,32 +1,35 @@
 """MuJoCo in JAX: one simulation as a pure function, to be vmapped, jitted and differentiated.
 
 A physics step is MuJoCo's, cut in two: kinematics, contacts and sensors of the present state, then
-forces and integration. Between the two the controller looks, so nothing that it sees lags behind
+forces and integration. The controller runs between the two, so nothing that it reads lags behind
 but accelerations and forces.
 """
 
 import copy
+from collections.abc import Callable, Iterable
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, PyTree
 
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.mujoco.bindings import Bindings
 from verifai_jax.systems.mujoco.derived_constants import recompute_constants
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
-from verifai_jax.systems.mujoco.model import mjx_module
+from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, mjx_module
 
-# What MJX decides once from the model's values, and features may change: it has to see that there
-# is something there.
+# Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
-LEAST = 1e-9  # MJX takes a row of friction without friction for an equality.
+LEAST = 1e-9
+"""Friction instead of zero: MJX takes a row of friction without friction for an equality."""
 
 
 class Physics(NamedTuple):
-    """What one physics step leaves to the next."""
+    """The carry from one physics step to the next."""
 
     qpos: Array
     qvel: Array
@@ -35,7 +38,7 @@ class Physics(NamedTuple):
     sensordata: Array
 
 
-def rollout(loop: Loop, features: Any, key: Any) -> Trace:
+def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
     """Simulate once."""
     mjx = mjx_module()
     model, blank = prepare_model(loop.bindings, features)
@@ -55,7 +58,11 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0],
     )
 
-    def step(physics: Physics, time: Array, decide: Any) -> tuple[Physics, Any]:
+    def step(
+        physics: Physics,
+        time: Array,
+        decide: Callable[[MjxData], tuple[Iterable[tuple[str, Array]], PyTree]],
+    ) -> tuple[Physics, Any]:
         data = blank.replace(time=time, **physics._asdict())
         data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
         data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))
@@ -77,10 +84,10 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
         before, progress = carry
         time = progress.age.astype(before.qpos.dtype) * loop.control_period
 
-        def substep(carry: Any, j: Int[Array, ""]) -> Any:
+        def substep(carry: PyTree, j: Int[Array, ""]) -> Any:
             physics, sampled, after = carry
 
-            def decide(data: Any) -> Any:
+            def decide(data: MjxData) -> Any:
                 def look() -> Any:
                     arrays = {name: getattr(data, name) for name in loop.shapes}
                     return loop.sample(k, arrays, progress, features)
@@ -124,21 +131,21 @@ def rollout(loop: Loop, features: Any, key: Any) -> Trace:
     )
 
 
-def _is_one(count: Any) -> bool:
+def _is_one(count: int | Int[Array, ""]) -> bool:
     return isinstance(count, int) and count == 1
 
 
 @jax.custom_jvp
 def _with_derivative_of(value: Array, other: Array) -> Array:
-    """`value`, with the derivative of `other`; which is not even computed without derivatives."""
+    """Return `value` with the derivative of `other`, which is not computed without derivatives."""
     return value
 
 
 _with_derivative_of.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
 
 
-def solve_constraints(model: Any, data: Any) -> Any:
-    """The data after MJX's constraint solver, with derivatives in forward and in reverse mode.
+def solve_constraints(model: MjxModel, data: MjxData) -> Any:
+    """Return the data after MJX's constraint solver, differentiable in forward and reverse mode.
 
     The accelerations minimise a convex cost, so their derivative is that of one Newton step from
     the minimum (implicit function theorem). The iterations themselves, a loop of unknown length,
@@ -147,22 +154,22 @@ def solve_constraints(model: Any, data: Any) -> Any:
     mjx = mjx_module()
     create, update = _solver()
     constant_model, constant = jax.lax.stop_gradient((model, data))
-    found = mjx.solve(constant_model, constant)
+    solution = mjx.solve(constant_model, constant)
     newton = model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
     constant_newton = constant_model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
-    start = data.replace(qacc=found.qacc)
+    start = data.replace(qacc=solution.qacc)
     here = create(newton, start, grad=False)
     residual = here.Ma - data.qfrc_smooth - here.qfrc_constraint
     zero = jnp.zeros_like(residual)
     curved = jax.lax.stop_gradient(here).replace(Ma=residual, qfrc_constraint=zero)
     step = update(constant_newton, constant.replace(qfrc_smooth=zero), curved).Mgrad
-    qacc = _with_derivative_of(found.qacc, -step)
+    qacc = _with_derivative_of(solution.qacc, -step)
     there = create(newton, start.replace(qacc=qacc), grad=False)
     return data.tree_replace(
         {
             "qacc": qacc,
-            "qfrc_constraint": _with_derivative_of(found.qfrc_constraint, there.qfrc_constraint),
-            "_impl.efc_force": _with_derivative_of(found._impl.efc_force, there.efc_force),
+            "qfrc_constraint": _with_derivative_of(solution.qfrc_constraint, there.qfrc_constraint),
+            "_impl.efc_force": _with_derivative_of(solution._impl.efc_force, there.efc_force),
         }
     )
 
@@ -173,8 +180,8 @@ def _solver() -> tuple[Any, Any]:
     return solver.Context.create, solver._update_gradient
 
 
-def prepare_model(bindings: Bindings, features: Any) -> tuple[Any, Any]:
-    """The MJX model of one row of features, and blank MJX data.
+def prepare_model(bindings: Bindings, features: Features) -> tuple[Any, Any]:
+    """Return the MJX model of one row of features, and blank MJX data.
 
     **Raises:** `NotImplementedError` for a model that MJX cannot do.
     """
@@ -195,7 +202,7 @@ def prepare_model(bindings: Bindings, features: Any) -> tuple[Any, Any]:
 
 
 def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
-    """The model as it is compiled, on the device, in the present precision; made once."""
+    """Return the compiled model on the device, in the present precision; made once."""
     mjx = mjx_module()
     precision = bool(jax.config.read("jax_enable_x64"))
     if precision not in bindings.models:
@@ -215,7 +222,7 @@ def _mjx_model(bindings: Bindings) -> tuple[Any, Any]:
 
 
 def why_not(bindings: Bindings) -> str | None:
-    """Why MJX cannot simulate a model; None where it can."""
+    """Return the reason why MJX cannot simulate a model; None where it can."""
     try:
         _mjx_model(bindings)
     except NotImplementedError as error:
@@ -229,21 +236,21 @@ def why_not(bindings: Bindings) -> str | None:
     return None
 
 
-def _leaf(model: Any, name: str) -> Any:
+def _leaf(model: MjxModel, name: str) -> Any:
     for part in name.split("."):
         model = getattr(model, part)
     return model
 
 
-def _integrator(mjx: Any, model: Any) -> Any:
+def _integrator(mjx: ModuleType, model: MjxModel) -> Any:
     kind = mjx.IntegratorType
     return {kind.EULER: mjx.euler, kind.RK4: mjx.rungekutta4, kind.IMPLICITFAST: mjx.implicit}[
         model.opt.integrator
     ]
 
 
-def reverse_hint(compiled: Any) -> str | None:
-    """Why reverse mode does not work on a model, and what makes it work; None where it does."""
+def reverse_hint(compiled: MjModel) -> str | None:
+    """Return why reverse mode does not work, and what makes it work; empty where it works."""
     if compiled.opt.integrator != 1 or not has_constraints(compiled):  # 1: Runge-Kutta
         return None
     return (
@@ -252,7 +259,7 @@ def reverse_hint(compiled: Any) -> str | None:
     )
 
 
-def has_constraints(compiled: Any) -> bool:
-    """Whether a model can have active constraints: contacts, limits, friction, equalities."""
+def has_constraints(compiled: MjModel) -> bool:
+    """Return True for a model that can have contacts, limits, friction or equalities."""
     data = mjx_module().make_data(compiled, impl="jax")
     return bool(data._impl.efc_J.size)

@@ -15,11 +15,23 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from verifai_jax.core.errors import require, unknown_name
+
+MjModel: TypeAlias = Any
+"""A `mujoco.MjModel`; MuJoCo is an optional package, so its types cannot be imported here."""
+ModelSource: TypeAlias = Any
+"""The path of an MJCF file, its text, a `mujoco.MjSpec` or a `mujoco.MjModel`."""
+MjSpec: TypeAlias = Any
+"""A `mujoco.MjSpec`."""
+MjxModel: TypeAlias = Any
+"""A `mujoco.mjx.Model`."""
+MjxData: TypeAlias = Any
+"""A `mujoco.mjx.Data`."""
 
 # Where the numbers of one element lie in an array: at its id, its degrees of freedom, its part of
 # qpos, or in some columns of its row.
@@ -78,7 +90,7 @@ _PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$
 
 @dataclass(frozen=True)
 class Place:
-    """Some numbers of one array.
+    """The place of some numbers in one array.
 
     - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
     - `index`: flat indices `[k]` into it.
@@ -106,7 +118,7 @@ class Model:
     contact_sensors: tuple[str, ...] = ()
 
 
-def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
+def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
     """Read and compile a model.
 
     **Arguments:**
@@ -142,7 +154,7 @@ def load(source: Any, contacts: tuple[str, ...] = (), **options: int | None) -> 
 
 
 def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
-    """The same model, in which the centre of mass of these bodies can move away from their origin.
+    """Return the same model, in which these bodies' centre of mass can leave their origin.
 
     MuJoCo leaves out parts of the mass matrix that are zero as compiled ("simple" bodies).
 
@@ -175,7 +187,7 @@ def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
 
 
 def mjx_module() -> Any:
-    """The module `mujoco.mjx`, imported without what it prints about packages it can do without.
+    """Import the module `mujoco.mjx`, without what it prints about optional packages.
 
     **Raises:** `MissingExtra`.
     """
@@ -183,7 +195,7 @@ def mjx_module() -> Any:
         return require("mujoco.mjx", extra="mujoco")
 
 
-def _spec(mujoco: Any, source: Any) -> Any:
+def _spec(mujoco: ModuleType, source: ModelSource) -> Any:
     if isinstance(source, mujoco.MjSpec):
         return source.copy()
     if not isinstance(source, str | Path):
@@ -202,21 +214,23 @@ def _spec(mujoco: Any, source: Any) -> Any:
         raise ValueError(f"{where} is no MuJoCo model: {error}") from error
 
 
-def _add_contact_sensor(mujoco: Any, spec: Any, model: Any, path: str, name: str) -> None:
+def _add_contact_sensor(
+    mujoco: ModuleType, spec: MjSpec, model: MjModel, path: str, name: str
+) -> None:
     first, second = _contact_geoms(model, path)
-    geom, found = mujoco.mjtObj.mjOBJ_GEOM, 1
+    geom, count = mujoco.mjtObj.mjOBJ_GEOM, 1
     pair = {} if second is None else {"reftype": geom, "refname": second}
     spec.add_sensor(
         name=name,
         type=mujoco.mjtSensor.mjSENS_CONTACT,
         objtype=geom,
         objname=first,
-        intprm=[found, 0, 1],  # How many contacts match; not which.
+        intprm=[count, 0, 1],  # The number of contacts that match.
         **pair,
     )
 
 
-def _contact_geoms(model: Any, path: str) -> tuple[str, str | None]:
+def _contact_geoms(model: MjModel, path: str) -> tuple[str, str | None]:
     parts, known = path.split("/")[1:], names(model, "geom")
     if "/".join(parts) in known:
         return "/".join(parts), None
@@ -229,8 +243,8 @@ def _contact_geoms(model: Any, path: str) -> tuple[str, str | None]:
     raise unknown_name(f"geom in {path!r}: geom", wrong, known)
 
 
-def names(model: Any, kind: str) -> list[str]:
-    """The names of all elements of a kind that have one."""
+def names(model: MjModel, kind: str) -> list[str]:
+    """Return the names of all elements of a kind that have one."""
     mujoco = require("mujoco", extra="mujoco")
     code = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
     count = {
@@ -244,12 +258,12 @@ def names(model: Any, kind: str) -> list[str]:
         "pair": "npair",
         "sensor": "nsensor",
     }[kind]
-    found = (mujoco.mj_id2name(model, code, i) for i in range(getattr(model, count)))
-    return [name for name in found if name]
+    every = (mujoco.mj_id2name(model, code, i) for i in range(getattr(model, count)))
+    return [name for name in every if name]
 
 
-def place(model: Any, path: str) -> list[Place]:
-    """Which numbers a bound path sets.
+def place(model: MjModel, path: str) -> list[Place]:
+    """Return the places that a bound path sets.
 
     **Raises:** `UnknownNameError` for an unknown kind, element or field, with the nearest ones;
     `ValueError` for an index outside the field.
@@ -272,7 +286,7 @@ def place(model: Any, path: str) -> list[Place]:
 
 
 def _place_input(
-    model: Any, kind: str, field: str, element: int, path: str, index: str | None
+    model: MjModel, kind: str, field: str, element: int, path: str, index: str | None
 ) -> list[Place]:
     if kind == "body":
         start = 6 * element + (3 if field == "torque" else 0)
@@ -301,8 +315,8 @@ def _place_input(
     return places
 
 
-def reading(model: Any, path: str) -> Place:
-    """Which numbers of a state a signal's path names.
+def reading(model: MjModel, path: str) -> Place:
+    """Return the place of a signal's path in the state.
 
     **Raises:** as `place`.
     """
@@ -326,8 +340,8 @@ def reading(model: Any, path: str) -> Place:
     return _pick(path, array, where, index)
 
 
-def sensor_addresses(model: Any, name: str, path: str) -> np.ndarray:
-    """The places `[k]` of a sensor in `sensordata`."""
+def sensor_addresses(model: MjModel, name: str, path: str) -> np.ndarray:
+    """Return the indices `[k]` of a sensor in `sensordata`."""
     known = names(model, "sensor")
     if name not in known:
         raise unknown_name(f"sensor in {path!r}: sensor", name, known)
@@ -352,24 +366,24 @@ def _split(path: str, kinds: tuple[str, ...]) -> tuple[str, str, str, str | None
     return kind, name, field, index
 
 
-def _element(model: Any, kind: str, name: str, path: str) -> int:
+def _element(model: MjModel, kind: str, name: str, path: str) -> int:
     known = names(model, kind)
     if name not in known:
         raise unknown_name(f"{kind} in {path!r}: {kind}", name, known)
     return int(getattr(model, kind)(name).id)
 
 
-def _positions(model: Any, joint: int) -> np.ndarray:
+def _positions(model: MjModel, joint: int) -> np.ndarray:
     width = (7, 4, 1, 1)[model.jnt_type[joint]]
     return int(model.jnt_qposadr[joint]) + np.arange(width)
 
 
-def _dofs(model: Any, joint: int) -> np.ndarray:
+def _dofs(model: MjModel, joint: int) -> np.ndarray:
     width = (6, 3, 1, 1)[model.jnt_type[joint]]
     return int(model.jnt_dofadr[joint]) + np.arange(width)
 
 
-def _activations(model: Any, actuator: int, path: str) -> np.ndarray:
+def _activations(model: MjModel, actuator: int, path: str) -> np.ndarray:
     if model.actuator_actnum[actuator] < 1:
         raise ValueError(f"{path!r}: this actuator has no activation state")
     start = int(model.actuator_actadr[actuator])
@@ -381,7 +395,7 @@ def _flat(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _pick(path: str, array: str, where: np.ndarray, index: str | None) -> Place:
-    """The part of an element's numbers that an index or a slice leaves."""
+    """Return the place of those numbers of an element that an index or a slice selects."""
     if index is None:
         return Place(array, where, () if where.size == 1 else (where.size,), path)
     try:

@@ -17,13 +17,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.errors import require
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.systems.base import Features
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
 
-BLOCK = 64  # Rows whose policy is evaluated together.
-HALVED = 64  # Rows from which two halves are worth their overhead.
+BLOCK = 64
+"""Rows whose policy is evaluated together."""
+HALVED = 64
+"""Rows from which two halves are worth their overhead."""
 
 
 @dataclass(eq=False)
@@ -34,8 +38,8 @@ class Native:
     batches: dict[Any, Any] = field(default_factory=dict)
     programs: dict[Any, Any] = field(default_factory=dict)
 
-    def simulate(self, features: Any, keys: Any) -> Trace:
-        """A batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
+    def simulate(self, features: Features, keys: Key[Array, " n"]) -> Trace:
+        """Simulate a batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
         count = len(keys)
         # Few sizes, for which programs are compiled; the rows that fill one up are never stepped.
         size = 1 << (count - 1).bit_length()
@@ -67,7 +71,7 @@ class Native:
         trace = self._trace([part.results() for part in parts])
         return jax.tree.map(lambda leaf: leaf[:count], trace)
 
-    def _program(self, features: Any) -> "_Program":
+    def _program(self, features: Features) -> "_Program":
         leaves, form = jax.tree.flatten(features)
         key = (form, tuple((np.shape(leaf)[1:], np.result_type(leaf)) for leaf in leaves))
         key = (*key, bool(jax.config.read("jax_enable_x64")))
@@ -80,7 +84,7 @@ class Native:
         return self.programs[key]
 
     def batch(self, size: int, number: int) -> Any:
-        """A `mujoco.batch.Batch` of this many rows; the one that there is already."""
+        """Return a `mujoco.batch.Batch` of this many rows, made once."""
         if (size, number) not in self.batches:
             module = require("mujoco.batch", extra="mujoco")
             # Batches of other sizes are not needed again, or not soon.
@@ -116,7 +120,7 @@ class Native:
 
 
 class _Program:
-    """What is compiled for features of one form."""
+    """The compiled functions for features of one form."""
 
     def __init__(self, loop: Loop, reads: frozenset[str]) -> None:
         self.loop = loop
@@ -131,7 +135,7 @@ class _Program:
         )
 
     def _stage(self) -> int:
-        """How much MuJoCo has to compute at a sample, beside the steps."""
+        """Return the stage up to which MuJoCo must compute at a sample, beside the steps."""
         derived = set(self.names) - {"qpos", "qvel", "act"}
         if not derived:
             return 0
@@ -141,7 +145,11 @@ class _Program:
         return needed
 
     def _sample(
-        self, k: Any, packed: Any, progress: Progress, features: Any
+        self,
+        k: Int[Array, ""],
+        packed: Float[Array, " packed"],
+        progress: Progress,
+        features: Features,
     ) -> tuple[Sample, Progress]:
         parts = jnp.split(packed, np.cumsum(self.sizes)[:-1])
         arrays = {
@@ -172,8 +180,8 @@ class _Part:
         native: Native,
         program: _Program,
         number: int,
-        features: Any,
-        keys: Any,
+        features: Features,
+        keys: Key[Array, " n"],
         alive: np.ndarray,
     ) -> None:
         self.alive, self.failed = alive, np.zeros(len(alive), bool)
@@ -215,7 +223,7 @@ class _Part:
         )
 
     def advance(self) -> None:
-        """Step to the next sample what has not ended, under the control that was decided."""
+        """Step the rows that have not ended to the next sample, under their new control."""
         self.samples.append(self.sampled.signals)
         ended = np.asarray(self.sampled.frozen) | ~np.asarray(self.progress.finite)
         for name, value in self.sampled.inputs.items():
@@ -234,7 +242,7 @@ class _Part:
             self.failed[error.ids] = True
 
     def results(self) -> "_Results":
-        """What came of these rows."""
+        """Return the results of these rows."""
         signals = {
             name: np.stack([np.asarray(sample[name]) for sample in self.samples], axis=1)
             for name in self.samples[0]
@@ -244,7 +252,7 @@ class _Part:
 
 
 def _in_blocks(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`jax.vmap` whose results for a row do not depend on how many other rows there are.
+    """Apply `jax.vmap` so that a row's results do not depend on the number of other rows.
 
     XLA sums in another order in products of other sizes, and through contacts a last digit becomes
     another fall: a row that is simulated again must be the same simulation.
@@ -271,13 +279,13 @@ def _split(size: int) -> list[slice]:
     return [slice(0, size // 2), slice(size // 2, size)]
 
 
-def _kind(leaf: Any) -> Any:
+def _kind(leaf: np.ndarray | Array) -> Any:
     return jax.dtypes.canonicalize_dtype(np.result_type(leaf))
 
 
 @contextlib.contextmanager
 def _no_warnings() -> Iterator[None]:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT: what is not finite is reported by the status."""
+    """Keep MuJoCo from writing MUJOCO_LOG.TXT: the status reports what is not finite."""
     mujoco = require("mujoco", extra="mujoco")
     before = mujoco.get_mju_user_warning()
     # The threads that step call it without Python: a C function that takes a text and does nothing.

@@ -16,16 +16,17 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
-from verifai_jax.systems.base import System
+from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
 from verifai_jax.systems.mujoco.mjx_rollout import has_constraints, reverse_hint, rollout, why_not
-from verifai_jax.systems.mujoco.model import load
+from verifai_jax.systems.mujoco.model import ModelSource, load
 from verifai_jax.systems.mujoco.native_rollout import Native
 from verifai_jax.systems.ode.integrators import check_factor
 
@@ -34,7 +35,7 @@ BACKENDS = ("native", "mjx")
 
 @dataclass(frozen=True, eq=False)
 class MuJoCo(System):
-    """A closed loop `(features, key) -> Trace`; made by `mujoco`, which says what its parts are.
+    """A closed loop `(features, key) -> Trace`; made by `mujoco`, which documents its parts.
 
     - `backend`: `"native"`, `"mjx"`, or `"auto"` until a run chooses.
     """
@@ -70,13 +71,13 @@ class MuJoCo(System):
         return "native" if has_constraints(self.loop.compiled) else "mjx"
 
     def why_not(self, backend: str) -> str | None:
-        """Why an engine cannot simulate this model; None where it can."""
+        """Return the reason why an engine cannot simulate this model; None where it can."""
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
         return None if backend == "native" else why_not(self.loop.bindings)
 
     def with_backend(self, name: str) -> "MuJoCo":
-        """The same system on one engine, or on `"auto"`.
+        """Return the same system on one engine, or on `"auto"`.
 
         **Raises:** `UnknownNameError`; `ValueError` with the reason where the engine cannot.
         """
@@ -86,11 +87,11 @@ class MuJoCo(System):
 
     @property
     def traced_factor(self) -> bool:
-        """Whether `refined` takes a factor that JAX traces."""
+        """True where JAX may trace the factor of `refined`."""
         return not self.black_box
 
     def refined(self, factor: int) -> "MuJoCo":
-        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+        """Return the same loop, sampled, decided and ended as before, at a finer step.
 
         Sensors of acceleration and force then describe the last of the smaller steps.
 
@@ -104,15 +105,15 @@ class MuJoCo(System):
 
     @property
     def black_box(self) -> bool:
-        """Whether JAX does not see into it: native, or a model that only native can do."""
+        """True where JAX does not see into it: native, or a model that only native can simulate."""
         return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
 
     @cached_property
     def reverse_hint(self) -> str:
-        """What makes reverse mode work, where it does not."""
+        """A sentence on what makes reverse mode work, where it does not."""
         return reverse_hint(self.loop.compiled) or ""
 
-    def check(self, features: Any) -> None:
+    def check(self, features: Features) -> None:
         """Refuse features that the system does not fit; nothing compiles.
 
         - `features`: as `jax.ShapeDtypeStruct`, or values.
@@ -121,11 +122,11 @@ class MuJoCo(System):
         """
         self.loop.check(bound(features, self.duration))
 
-    def abstract(self, features: Any) -> Trace:
-        """The trace of one simulation, as shapes alone."""
+    def abstract(self, features: Features) -> Trace:
+        """Return the trace of one simulation, as shapes alone."""
         loop, features = self.loop, bound(features, self.duration)
 
-        def trace(features: Any) -> Trace:
+        def trace(features: Features) -> Trace:
             zeros = {name: jnp.zeros(shape) for name, shape in loop.shapes.items()}
             sampled, progress = loop.sample(jnp.int32(0), zeros, loop.initial_progress(), features)
             signals = {
@@ -144,7 +145,7 @@ class MuJoCo(System):
 
         return jax.eval_shape(trace, features)
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once: traced by JAX unless the backend is native."""
         features = bound(features, self.duration)
         if not self.black_box:
@@ -156,7 +157,7 @@ class MuJoCo(System):
         )
         return jax.tree.map(lambda leaf: leaf[0], batch)
 
-    def simulate_batch(self, features: Any, keys: Any) -> Trace:
+    def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         """Simulate a batch natively; every leaf has a leading axis `[n]`."""
         return self._native.simulate(bound(features, self.duration), keys)
 
@@ -167,13 +168,13 @@ class MuJoCo(System):
 
 @suggests_options
 def mujoco(
-    model: Any,
+    model: ModelSource,
     *,
     duration: float,
     control_period: float,
     bind: Bound | None = None,
     controller: Callable[..., Any] | None = None,
-    controller_memory: Any = None,
+    controller_memory: PyTree = None,
     initial: Callable[..., Any] | None = None,
     signals: Signals | None = None,
     terminate: Callable[..., Any] | None = None,
@@ -181,7 +182,7 @@ def mujoco(
     solver_iterations: int | None = None,
     ls_iterations: int | None = None,
 ) -> MuJoCo:
-    """A system `(features, key) -> Trace` from a MuJoCo model and a controller.
+    """Make a system `(features, key) -> Trace` from a MuJoCo model and a controller.
 
     **Arguments:**
 
@@ -192,7 +193,7 @@ def mujoco(
     - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `Scaled(path)`
       for a factor on the model's value, or a list of these. See docs/mujoco.md for all paths.
     - `controller(time, state, features) -> control`: `[nu]`, or one number for one actuator;
-      `state` is a `mujoco_loop.State`.
+      `state` is a `systems.mujoco.loop.State`.
     - `controller_memory`: as in `ode`.
     - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
     - `signals`: for a signal's name a path (`"joint/slider/qpos"`, `"body/torso/xpos[2]"`,
@@ -204,6 +205,8 @@ def mujoco(
       needs them, else the faster.
     - `solver_iterations`, `ls_iterations`: of the constraint solver and its line search, instead
       of the model's.
+
+    **Returns:** a `MuJoCo` system.
 
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
     does not compile, times that do not fit, and paths that are not in the model.
@@ -249,18 +252,18 @@ def mujoco(
     return system if backend == "auto" else system.with_backend(backend)
 
 
-def mjx(model: Any, **options: Any) -> MuJoCo:
-    """A MuJoCo model stepped in JAX; the arguments are those of `mujoco`."""
+def mjx(model: ModelSource, **options: Any) -> MuJoCo:
+    """Make a system of a MuJoCo model that JAX steps; the arguments are those of `mujoco`."""
     return mujoco(model, backend="mjx", **options)
 
 
-def native(model: Any, **options: Any) -> MuJoCo:
-    """A MuJoCo model stepped in C on all cores; the arguments are those of `mujoco`."""
+def native(model: ModelSource, **options: Any) -> MuJoCo:
+    """Make a system of a MuJoCo model that C steps on all cores; arguments as `mujoco`."""
     return mujoco(model, backend="native", **options)
 
 
 def _whole(seconds: float, part: float, name: str, of: str) -> int:
-    """How many times `part` goes into `seconds`; refuses anything but a whole number >= 1."""
+    """Return how many times `part` goes into `seconds`; refuse anything but a whole number >= 1."""
     number = isinstance(seconds, int | float) and math.isfinite(seconds) and part > 0
     count = round(seconds / part) if number else 0
     if count < 1 or abs(count * part - seconds) > 1e-6 * part:

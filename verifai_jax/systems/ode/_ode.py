@@ -15,15 +15,15 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int, PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
-from verifai_jax.systems.base import System
+from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
-from verifai_jax.systems.ode.integrators import check_factor, integrator
+from verifai_jax.systems.ode.integrators import Time, check_factor, integrator
 from verifai_jax.systems.pytree_checks import (
     as_floating,
     check_like,
@@ -32,12 +32,10 @@ from verifai_jax.systems.pytree_checks import (
     outline,
 )
 
-Time = Float[Array, ""]
-
 
 @dataclass(frozen=True, eq=False)
 class Ode(System):
-    """A closed loop `(features, key) -> Trace`; made by `ode`, which says what its parts are.
+    """A closed loop `(features, key) -> Trace`; made by `ode`, which documents its parts.
 
     - `substeps`: integration steps between two samples; more than one in a `refined` loop.
     """
@@ -62,7 +60,7 @@ class Ode(System):
         return self.steps * self.dt
 
     def refined(self, factor: int) -> "Ode":
-        """The same loop, sampled, decided and ended as before, with a `factor` times smaller step.
+        """Return the same loop, sampled, decided and ended as before, at a finer step.
 
         The factor may be traced by JAX; the loop then has no derivative in reverse mode.
 
@@ -72,7 +70,7 @@ class Ode(System):
             check_factor(factor)
         return replace(self, substeps=self.substeps * factor)
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
 
         Only a waveform without a duration is given that of the simulation.
@@ -81,12 +79,17 @@ class Ode(System):
         return _Rollout(self, features).trace(as_floating(self.initial(features, key), "initial"))
 
     def fold(
-        self, features: Any, key: Any, carry: Any, update: Callable[[Any, Any], Any]
+        self,
+        features: Features,
+        key: Seed,
+        carry: Carry,
+        update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Any, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept.
+        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
 
         Behind an early end the last valid sample comes again, until the end of the duration.
-        Returns the carry and the status.
+
+        **Returns:** the last carry, and the status.
         """
         features = bound(features, self.duration)
         rollout = _Rollout(self, features)
@@ -95,16 +98,16 @@ class Ode(System):
 
 @dataclass(frozen=True, eq=False)
 class _Rollout:
-    """One simulation of a closed loop: what its steps share while JAX traces them."""
+    """One simulation of a closed loop: the values that its steps share while JAX traces them."""
 
     loop: Ode
     features: Any
 
-    def trace(self, state: Any) -> Trace:
+    def trace(self, state: PyTree) -> Trace:
         loop = self.loop
         memory = jax.tree.map(jnp.asarray, loop.controller_memory)
         finite = self.check(state, memory)
-        last, age, _, samples = self.run(state, memory, None, lambda _, seen: (None, seen))
+        last, age, _, samples = self.run(state, memory, None, lambda _, sample: (None, sample))
         ends = loop.terminate is not None
         return Trace(
             samples,
@@ -115,27 +118,37 @@ class _Rollout:
             finite=finite,
         )
 
-    def fold(self, state: Any, carry: Any, update: Any) -> Any:
+    def fold(
+        self, state: PyTree, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
+    ) -> Any:
         memory = jax.tree.map(jnp.asarray, self.loop.controller_memory)
         self.check(state, memory)
-        last, _, carry, _ = self.run(state, memory, carry, lambda c, seen: (update(c, seen), None))
+        last, _, carry, _ = self.run(
+            state, memory, carry, lambda c, sample: (update(c, sample), None)
+        )
         return carry, _status(last)
 
-    def run(self, state: Any, memory: Any, kept: Any, keep: Any) -> tuple[Any, Any, Any, Any]:
-        """The last state, how many steps were lived, and what `keep` made of the samples."""
+    def run(
+        self,
+        state: PyTree,
+        memory: PyTree,
+        collected: PyTree,
+        collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
+    ) -> tuple[Any, Any, Any, Any]:
+        """Return the last state, the number of steps, the last `collected` and the outputs."""
         loop, start = self.loop, state
 
-        def sample(carry: Any, k: Int[Array, ""]) -> Any:
-            (state, memory, held, age), kept = carry
+        def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
+            (state, memory, held, age), collected = carry
             time, frozen = self.clock(k, age, state)
             control, next_memory = self.decide(k, age, time, state, memory, held)
-            seen = self.signals(time, state, control)
+            signals = self.signals(time, state, control)
             next_state = self.step(time, self.safe_state(frozen, state, start), control)
             applied = None if held is None else control
             following = (next_state, next_memory, applied, age + 1)
             after = _where(frozen, (state, memory, applied, age), following)
-            kept, output = keep(kept, seen)
-            return (after, kept), output
+            collected, output = collect(collected, signals)
+            return (after, collected), output
 
         # A controller that runs at every sample holds nothing between samples.
         held = None
@@ -145,16 +158,24 @@ class _Rollout:
             held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
         # One iteration more than there are steps: it samples the final state and moves nothing,
         # which is cheaper than copying all samples to append one.
-        ((state, _, _, age), kept), outputs = checkpointed_scan(
+        ((state, _, _, age), collected), outputs = checkpointed_scan(
             sample,
-            ((state, memory, held, jnp.int32(0)), kept),
+            ((state, memory, held, jnp.int32(0)), collected),
             loop.steps + 1,
             unroll=loop.unroll,
         )
-        return state, age, kept, outputs
+        return state, age, collected, outputs
 
-    def decide(self, k: Any, age: Any, time: Any, state: Any, memory: Any, held: Any) -> Any:
-        """The control from sample `k` on, and what the controller then remembers."""
+    def decide(
+        self,
+        k: Int[Array, ""],
+        age: Int[Array, ""],
+        time: Time,
+        state: PyTree,
+        memory: PyTree,
+        held: PyTree,
+    ) -> Any:
+        """Return the control from sample `k` on, and the controller's memory then."""
         if held is None:
             return self.control(time, state, memory)
         # The counter is common to all lanes of a batch, so this stays a branch under `vmap`.
@@ -169,9 +190,9 @@ class _Rollout:
         return _where(age < k, (held, memory), (control, next_memory))
 
     def clock(
-        self, k: Int[Array, ""], age: Int[Array, ""], state: Any
+        self, k: Int[Array, ""], age: Int[Array, ""], state: PyTree
     ) -> tuple[Time, Bool[Array, ""]]:
-        """Time in seconds at sample `k`, and whether the state stays as it is from here on."""
+        """Return the time in seconds at sample `k`, and True where the state stays from here on."""
         over = k >= self.loop.steps
         if self.loop.terminate is None:
             return k.astype(_dtype(state)) * self.loop.dt, over
@@ -180,15 +201,15 @@ class _Rollout:
         ended = self.loop.terminate(state, self.features)
         return age.astype(_dtype(state)) * self.loop.dt, over | ended
 
-    def safe_state(self, frozen: Bool[Array, ""], state: Any, start: Any) -> Any:
-        """A state at which the dynamics may be evaluated.
+    def safe_state(self, frozen: Bool[Array, ""], state: PyTree, start: PyTree) -> Any:
+        """Return a state at which the dynamics may be evaluated.
 
-        A frozen state may lie where the dynamics have no finite slope (an emptied tank), and in
-        reverse mode zero times infinity would poison the gradient of the part that counts.
+        A frozen state may lie where the dynamics have no finite derivative (an emptied tank), and
+        in reverse mode zero times infinity would poison the gradient of the part that counts.
         """
         return state if self.loop.terminate is None else _where(frozen, start, state)
 
-    def control(self, time: Time, state: Any, memory: Any) -> tuple[Any, Any]:
+    def control(self, time: Time, state: PyTree, memory: PyTree) -> tuple[Any, Any]:
         loop = self.loop
         if loop.controller is None:
             return None, memory
@@ -196,32 +217,32 @@ class _Rollout:
             return loop.controller(time, state, self.features), memory
         return loop.controller(time, state, memory, self.features)
 
-    def signals(self, time: Time, state: Any, control: Any) -> Any:
+    def signals(self, time: Time, state: PyTree, control: PyTree) -> Any:
         if self.loop.signals is None:
             return default_signals(state, control)
         return self.loop.signals(time, state, control, self.features)
 
-    def step(self, time: Time, state: Any, control: Any) -> Any:
-        """From one sample to the next."""
+    def step(self, time: Time, state: PyTree, control: PyTree) -> Any:
+        """Integrate from one sample to the next."""
         count = self.loop.substeps
         advance = integrator(self.loop.method)
 
-        def slope(time: Time, state: Any) -> Any:
+        def derivative(time: Time, state: PyTree) -> Any:
             return self.loop.dynamics(time, state, control, self.features)
 
         if isinstance(count, int) and count == 1:
-            return advance(slope, time, state, self.loop.dt)
+            return advance(derivative, time, state, self.loop.dt)
         dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
 
-        def substep(j: Any, state: Any) -> Any:
-            return advance(slope, time + j.astype(dt.dtype) * dt, state, dt)
+        def substep(j: Int[Array, ""], state: PyTree) -> Any:
+            return advance(derivative, time + j.astype(dt.dtype) * dt, state, dt)
 
         return jax.lax.fori_loop(0, count, substep, state)
 
-    def check(self, state: Any, memory: Any) -> tuple[str, ...]:
+    def check(self, state: PyTree, memory: PyTree) -> tuple[str, ...]:
         """Refuse functions that do not fit together; abstract evaluation, nothing compiles.
 
-        Returns the signals that are parts of the state itself, whose finiteness is the state's.
+        **Returns:** the signals that are parts of the state, whose finiteness is the state's.
         """
         loop = self.loop
         time = jnp.zeros((), _dtype(state))
@@ -241,19 +262,21 @@ class _Rollout:
                     raise ValueError(f"controller must return {role}; got {outline(decided)}")
                 control = decided[0]
                 check_like(decided[1], memory, "controller", role)
-        slope = jax.eval_shape(
+        derivative = jax.eval_shape(
             lambda control: loop.dynamics(time, state, control, self.features), control
         )
-        check_like(slope, state, "dynamics", "the state's slope, in the form of the state")
+        check_like(
+            derivative, state, "dynamics", "the state's derivative, in the form of the state"
+        )
         parts, finite = jax.tree.leaves(state), []
 
-        def seen(control: Any) -> Any:
+        def sample_signals(control: PyTree) -> Any:
             signals = self.signals(time, state, control)
             if isinstance(signals, Mapping):
                 finite.extend(n for n, v in signals.items() if any(v is part for part in parts))
             return signals
 
-        check_signals(jax.eval_shape(seen, control))
+        check_signals(jax.eval_shape(sample_signals, control))
         if loop.terminate is not None:
             ended = jax.eval_shape(loop.terminate, state, self.features)
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
@@ -261,7 +284,7 @@ class _Rollout:
         return tuple(finite)
 
 
-def _status(last: Any) -> Int[Array, ""]:
+def _status(last: PyTree) -> Int[Array, ""]:
     # Integrators add to the state, and NaN or Inf plus anything is never finite again: if the last
     # state is finite, all were. A state frozen at its end is covered by the same check.
     finite = jnp.array(True)
@@ -270,20 +293,20 @@ def _status(last: Any) -> Int[Array, ""]:
     return jnp.where(finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
 
 
-def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+def _where(condition: Bool[Array, ""], yes: PyTree, no: PyTree) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def _dtype(state: Any) -> Any:
+def _dtype(state: PyTree) -> Any:
     return jax.tree.leaves(state)[0].dtype
 
 
-def _is_pair(value: Any) -> bool:
+def _is_pair(value: object) -> bool:
     return isinstance(value, tuple) and len(value) == 2
 
 
 def _whole(seconds: float, dt: float, name: str) -> int:
-    """How many steps of `dt` make `seconds`; refuses anything but a whole number >= 1."""
+    """Return the number of steps of `dt` in `seconds`; refuse anything but a whole number >= 1."""
     steps = round(seconds / dt) if math.isfinite(seconds) else 0
     if steps < 1 or abs(steps * dt - seconds) > 1e-6 * dt:
         raise ValueError(
@@ -303,27 +326,27 @@ def ode(
     steps: int | None = None,
     method: str = "rk4",
     control_period: float | None = None,
-    controller_memory: Any = None,
+    controller_memory: PyTree = None,
     signals: Callable[..., Mapping[str, Any]] | None = None,
     terminate: Callable[..., Any] | None = None,
     unroll: int = 1,
 ) -> Ode:
-    """A system `(features, key) -> Trace` from equations of motion, integrated with a fixed step.
+    """Make a system `(features, key) -> Trace` from equations of motion, with a fixed step.
 
     **Arguments:**
 
-    - `dynamics(time, state, control, features) -> slope`: d state / d time, in the form of the
+    - `dynamics(time, state, control, features) -> derivative`: d state / d time, in the form of the
       state; `time` in seconds; `control` is None without a controller.
     - `initial(features, key) -> state`: any pytree of real numbers, all made one float dtype.
     - `controller(time, state, features) -> control`: any pytree.
     - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
-    - `duration`: in seconds, a multiple of `dt`; or `steps`, how many.
+    - `duration`: in seconds, a multiple of `dt`; or the number of `steps`.
     - `method`: `"rk4"`, `"euler"`, or `"semi_implicit_euler"`, whose state is a tuple
       `(positions, velocities)`.
     - `control_period`: seconds between two runs of the controller, a multiple of `dt`; its output
       is held in between. `dt` when left out.
-    - `controller_memory`: what a controller with memory (an integrator, a filter) remembers at
-      first. It is then called `controller(time, state, memory, features)` and returns
+    - `controller_memory`: the memory at time 0 of a controller that has one (an integrator, a
+      filter). It is then called `controller(time, state, memory, features)` and returns
       `(control, memory)`.
     - `signals(time, state, control, features) -> dict`: a scalar or vector for each name, at each
       sample; `control` is the one applied from this sample on. When left out: the state's own
@@ -332,7 +355,8 @@ def ode(
       true is the last valid one; the state stays frozen from there on.
     - `unroll`: steps in one iteration of the compiled loop; changes speed only.
 
-    The status of the trace is `NONFINITE` if the state became NaN or infinite.
+    **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
+    infinite.
 
     **Raises:** `ValueError` for times that do not fit, and an unknown method; once the system is
     traced, for functions whose results do not fit together.

@@ -1,50 +1,57 @@
 """One step of fixed length of an ordinary differential equation, explicit methods.
 
     step = integrator("rk4")
-    state = step(slope, time, state, dt)                 # slope(time, state) -> d state / d time
+    state = step(derivative, time, state, dt)       # derivative(time, state) -> d state / d time
 
-The state is any pytree of as_floating-point arrays.
+The state is any pytree of floating-point arrays.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TypeAlias
 
 import jax
+from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
 
-Slope = Callable[[Any, Any], Any]
-Integrator = Callable[[Slope, Any, Any, float], Any]
+Time: TypeAlias = Float[Array, ""] | float
+"""Seconds."""
+Step: TypeAlias = Float[Array, ""] | float
+"""Seconds from one state to the next."""
+Derivative: TypeAlias = Callable[[Time, PyTree], PyTree]
+"""A function `(time, state) -> d state / d time`."""
+Integrator: TypeAlias = Callable[[Derivative, Time, PyTree, Step], PyTree]
+"""A function `(derivative, time, state, dt) -> state` at `time + dt`."""
 
 
-def euler(slope: Slope, time: Any, state: Any, dt: float) -> Any:
-    """Explicit Euler, order 1: `s + dt f(t, s)`."""
-    return _advance(state, dt, slope(time, state))
+def euler(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
+    """Take a step of explicit Euler, order 1: `s + dt f(t, s)`."""
+    return _advance(state, dt, derivative(time, state))
 
 
-def semi_implicit_euler(slope: Slope, time: Any, state: Any, dt: float) -> Any:
-    """Symplectic Euler, order 1, on a state `(positions, velocities)`.
+def semi_implicit_euler(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
+    """Take a step of symplectic Euler, order 1, on a state `(positions, velocities)`.
 
     Velocities first, then positions with the new velocities. Source: Hairer, Lubich and Wanner,
     Geometric Numerical Integration, 2nd ed., eq. I.1.9.
     """
     positions, velocities = state
-    velocities = _advance(velocities, dt, slope(time, state)[1])
-    # Asking the slope again is right for any kinematics (quaternions too) and free where the
-    # positions' slope is the velocities: XLA drops the half that nobody reads.
-    positions = _advance(positions, dt, slope(time, (positions, velocities))[0])
+    velocities = _advance(velocities, dt, derivative(time, state)[1])
+    # A second evaluation is right for any kinematics (quaternions too) and free where the
+    # positions' derivative is the velocities: XLA drops the half that is not used.
+    positions = _advance(positions, dt, derivative(time, (positions, velocities))[0])
     return positions, velocities
 
 
-def rk4(slope: Slope, time: Any, state: Any, dt: float) -> Any:
-    """The classical Runge-Kutta method, order 4.
+def rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
+    """Take a step of the classical Runge-Kutta method, order 4.
 
     Source: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, table II.1.2.
     """
-    k1 = slope(time, state)
-    k2 = slope(time + dt / 2, _advance(state, dt / 2, k1))
-    k3 = slope(time + dt / 2, _advance(state, dt / 2, k2))
-    k4 = slope(time + dt, _advance(state, dt, k3))
+    k1 = derivative(time, state)
+    k2 = derivative(time + dt / 2, _advance(state, dt / 2, k1))
+    k3 = derivative(time + dt / 2, _advance(state, dt / 2, k2))
+    k4 = derivative(time + dt, _advance(state, dt, k3))
     return jax.tree.map(
         lambda s, a, b, c, d: s + dt / 6 * (a + 2 * (b + c) + d), state, k1, k2, k3, k4
     )
@@ -58,7 +65,7 @@ METHODS: dict[str, Integrator] = {
 
 
 def integrator(method: str) -> Integrator:
-    """The integrator of this name.
+    """Return the integrator of this name.
 
     **Raises:** `UnknownNameError` for a name that is none of `METHODS`.
     """
@@ -67,8 +74,8 @@ def integrator(method: str) -> Integrator:
     return METHODS[method]
 
 
-def check_factor(factor: Any) -> None:
-    """Refuse what cannot divide a step.
+def check_factor(factor: object) -> None:
+    """Refuse a factor that cannot divide a step.
 
     **Raises:** `ValueError` for a factor that is not a positive integer.
     """
@@ -76,5 +83,5 @@ def check_factor(factor: Any) -> None:
         raise ValueError(f"factor must be a positive integer; got {factor!r}")
 
 
-def _advance(state: Any, dt: float, slope: Any) -> Any:
-    return jax.tree.map(lambda s, d: s + dt * d, state, slope)
+def _advance(state: PyTree, dt: Step, derivative: PyTree) -> PyTree:
+    return jax.tree.map(lambda s, d: s + dt * d, state, derivative)

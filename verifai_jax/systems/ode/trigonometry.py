@@ -25,10 +25,14 @@ _COSINE = tuple(np.float32(c) for c in (4.166664568298827e-2, -1.388731625493765
 def sin_cos(
     angle: Float[Array, "*shape"],
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """`(sin(angle), cos(angle))`, several times faster in float32 than asking for each.
+    """Return `(sin(angle), cos(angle))`, faster in float32 than two calls.
 
-    float32: within 1.2e-7 of the true values for an angle in radians of at most 1e5, NaN beyond.
-    Any other precision: `jnp.sin` and `jnp.cos`.
+    **Arguments:**
+
+    - `angle`: in radians, of any shape.
+
+    **Returns:** in float32 values within 1.2e-7 of the true ones for angles of at most 1e5, NaN
+    beyond; in any other precision those of `jnp.sin` and `jnp.cos`.
     """
     angle = jnp.asarray(angle)
     if angle.dtype != jnp.float32:
@@ -52,7 +56,9 @@ def sin_cos(
 
 
 @sin_cos.defjvp
-def _sin_cos_jvp(primals: Any, tangents: Any) -> Any:
+def _sin_cos_jvp(
+    primals: tuple[Float[Array, "*shape"]], tangents: tuple[Float[Array, "*shape"]]
+) -> Any:
     sin, cos = sin_cos(*primals)
     return (sin, cos), (cos * tangents[0], -sin * tangents[0])
 

@@ -16,12 +16,12 @@ import socket
 import threading
 import weakref
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Trace
-from verifai_jax.systems.base import Outcome, System
+from verifai_jax.systems.base import Features, Outcome, Seed, System
 from verifai_jax.systems.blackbox._blackbox import (
     SignalNames,
     TraceForm,
@@ -36,11 +36,13 @@ from verifai_jax.systems.remote.server import Server
 log = logging.getLogger("verifai_jax.remote")
 
 MOST_BYTES = 16 << 20
-BOTH = ("127.0.0.1", "::1")
+"""Bytes of one message of a client, unless `remote` is given another limit."""
+LOOPBACKS = ("127.0.0.1", "::1")
+"""Addresses of this machine, by IPv4 and IPv6."""
 
 
 class Remote(System):
-    """A host-side system whose simulations other programs do; made by `remote`.
+    """A system on the host that other programs simulate; made by `remote`.
 
     The port is opened when it is first needed, so a module that defines one does nothing yet.
     """
@@ -57,7 +59,7 @@ class Remote(System):
 
     @property
     def addresses(self) -> list[tuple[str, int]]:
-        """Where clients can connect: host and port, one for each protocol."""
+        """The addresses at which clients can connect: host and port, one for each protocol."""
         return [sock.getsockname()[:2] for sock in self._open().listening]
 
     @property
@@ -67,24 +69,24 @@ class Remote(System):
 
     @property
     def clients(self) -> list[str]:
-        """Who is connected now."""
+        """The names of the clients that are connected now."""
         return [client.name for client in tuple(self._open().clients) if client.here]
 
-    def abstract(self, features: Any) -> Trace | None:
-        """Return the form of the traces, if it is declared; see `Problem.check`."""
+    def abstract(self, features: Features) -> Trace | None:
+        """Return the form of the traces, if it is given."""
         return self.rules.declared.abstract()
 
-    def __call__(self, features: Any, key: Any = None) -> Trace:
-        """Simulate once.
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
+        """Simulate once, by any client.
 
         **Raises:** `RuntimeError`, `TimeoutError`: what went wrong there.
         """
         return single_trace(self.simulate_each([plain_leaves(features)], [seed_of(key)]))
 
     def simulate_each(
-        self, features: Sequence[Any], seeds: Sequence[int]
+        self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Each index exactly once, as its simulation ends; see `simulations.Each`.
+        """Simulate each row by some client; see `System.simulate_each`.
 
         **Raises:** `TypeError` for features that JSON cannot hold; `ConnectionError` if the server
         is closed meanwhile.
@@ -99,13 +101,13 @@ class Remote(System):
             batch.cancelled = True
 
     def close(self) -> None:
-        """Send the clients away and close the port. The next simulation opens it again."""
+        """Send the clients away and close the port; the next simulation opens it again."""
         with self._lock:
             server, self._server = self._server, None
         if server is not None:
             server.stop()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Remote":
         self._open()
         return self
 
@@ -141,7 +143,7 @@ def remote(
     length: int | None = None,
     most_bytes: int = MOST_BYTES,
 ) -> Remote:
-    """A system whose simulations are done by programs that connect to this one.
+    """Make a system that programs simulate which connect to this one.
 
     **Arguments:**
 
@@ -156,8 +158,10 @@ def remote(
     - `patience`: seconds without any client after which the points that are left become rows with
       status `error`; waits, and says so in the log, when left out.
     - `signals`, `dt`, `length`: what every trace must have; see `blackbox.Declared`. A client that
-      sends another is told, and the row has status `error`.
+      sends another gets an error, and the row has status `error`.
     - `most_bytes`: of one message from a client.
+
+    **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
 
     **Raises:** `ValueError` for options out of range, an address beyond this machine without a
     token; when it is first needed, `OSError` for a port that is taken.
@@ -183,8 +187,8 @@ def remote(
     return Remote(host, port, Rules(token, timeout, retries, patience, most_bytes, declared))
 
 
-def _text(features: Any, seed: int) -> bytes:
-    """A point of a `work` message behind its id."""
+def _text(features: Features, seed: int) -> bytes:
+    """Return a point of a `work` message, its JSON behind the id."""
     text = wire.to_text({"seed": int(seed), "features": wire.plain(features)})
     return text[1:].encode()
 
@@ -203,16 +207,16 @@ def _next(batch: Batch, server: Server) -> tuple[int, Outcome]:
 
 
 def _places(host: str, port: int) -> list[Any]:
-    """What `host` resolves to, each address once; both loopbacks for `localhost`."""
-    found = []
-    for name in BOTH if host == "localhost" else (host,):
+    """Return the addresses that `host` resolves to, each once; both loopbacks for `localhost`."""
+    places = []
+    for name in LOOPBACKS if host == "localhost" else (host,):
         try:
             kind = socket.SOCK_STREAM
-            places = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
+            resolved = socket.getaddrinfo(name, port, type=kind, flags=socket.AI_PASSIVE)
         except OSError as error:
             raise ValueError(f"host {host!r} is no address of this machine: {error}") from error
-        found += [place for place in places if place[4] not in [other[4] for other in found]]
-    return found
+        places += [p for p in resolved if p[4] not in [other[4] for other in places]]
+    return places
 
 
 def _is_loopback(address: str) -> bool:
@@ -220,7 +224,7 @@ def _is_loopback(address: str) -> bool:
 
 
 def _listen(host: str, port: int) -> list[socket.socket]:
-    """Sockets at one port, one for each address of the host."""
+    """Open sockets at one port, one for each address of the host."""
     for attempt in range(10):
         opened: list[socket.socket] = []
         chosen = port

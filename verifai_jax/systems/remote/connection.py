@@ -18,17 +18,22 @@ from verifai_jax.systems.blackbox._blackbox import TraceForm
 from verifai_jax.systems.remote import wire
 
 GREETING_SECONDS = 10.0
-GREETING_BYTES = 4096  # Before it has proved its token, a client may not fill our memory.
-LINGER_SECONDS = 2.0  # How long a client that is sent away has to read why.
-# Seconds from a point to its result that make a client's window grow, or shrink: enough points wait
-# at a fast one to keep it busy, and none at a slow one while others idle.
+"""Seconds within which a client must send its hello."""
+GREETING_BYTES = 4096
+"""Bytes of a hello: before it has proved its token, a client must not fill the memory."""
+LINGER_SECONDS = 2.0
+"""Seconds that a client has to read why it is sent away."""
 SWIFT, SLOW = 0.05, 0.2
-REMEMBERED = 4096  # Answered points that a client may answer again without being told off.
+"""Seconds from a point to its result below which a client's window grows, and above which it
+shrinks: enough points wait at a fast client to keep it busy, and none at a slow one while others
+are idle."""
+REMEMBERED = 4096
+"""Answered points that a client may answer again without an error."""
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What a server demands of its clients; see `remote`."""
+    """The demands of a server on its clients; see `remote`."""
 
     token: str | None
     timeout: float | None
@@ -48,7 +53,7 @@ class Batch:
 
 @dataclass(eq=False)
 class Point:
-    """One simulation: where its outcome goes, and what has happened to it so far."""
+    """One simulation: the place for its outcome, and its history so far."""
 
     id: int
     batch: Batch
@@ -61,9 +66,11 @@ class Point:
 
 
 class Client:
-    """One connection."""
+    """One connection to a client."""
 
-    def __init__(self, sock: socket.socket, address: Any) -> None:
+    def __init__(
+        self, sock: socket.socket, address: tuple[str, int] | tuple[str, int, int, int]
+    ) -> None:
         self.socket = sock
         self.name = f"{address[0]}:{address[1]}"
         self.frames = wire.Frames(GREETING_BYTES)
@@ -82,20 +89,20 @@ class Client:
 
     @property
     def here(self) -> bool:
-        """Whether points may be handed to it."""
+        """True where points may be handed to it."""
         return self.greeted and not self.leaving
 
     @property
     def room(self) -> int:
-        """How many more points it may have now."""
+        """The number of further points that it may have now."""
         return min(self.window, self.capacity) - len(self.has)
 
     def running(self) -> list[Point]:
-        """The points that it is simulating now, if it goes by their order."""
+        """Return the points that it is simulating now, if it keeps their order."""
         return list(itertools.islice(self.has.values(), self.parallel))
 
     def hello(self, rules: Rules) -> None:
-        """Tell it what is expected of it."""
+        """Tell the client what is expected of it."""
         about = {
             "type": "hello",
             "protocol": wire.PROTOCOL,
@@ -108,7 +115,7 @@ class Client:
         self.out += wire.frame(about)
 
     def greet(self, hello: dict[str, Any], rules: Rules) -> None:
-        """Take note of what it says of itself.
+        """Take up the client's hello: its capacity, name and token.
 
         **Raises:** `WireError` for a client that cannot be used, or does not know the token.
         """
@@ -146,7 +153,7 @@ class Client:
             raise wire.WireError("the token is wrong")
 
     def hand(self, points: list[Point], now: float) -> None:
-        """Give it points to simulate."""
+        """Hand points to the client to simulate."""
         for point in points:
             if not self.has:
                 self.progress = now
@@ -156,7 +163,7 @@ class Client:
         self.out += wire.frame(b'{"type":"work","points":[' + texts + b"]}")
 
     def done(self, point: Point, now: float) -> None:
-        """It has answered."""
+        """Take back a point that the client has answered."""
         del self.has[point.id]
         self.answered[point.id] = None
         if len(self.answered) > REMEMBERED:
@@ -168,7 +175,7 @@ class Client:
             self.window = max(self.window - 1, self.parallel)
 
     def overdue(self, now: float, timeout: float) -> list[Point]:
-        """Points that it has worked on for longer than that."""
+        """Return the points that it has worked on for longer than the timeout."""
         running = self.running()
         if now - self.progress > timeout:
             # It shows no progress, so all that it is simulating takes too long.
@@ -181,12 +188,12 @@ class Client:
         ]
 
     def tell(self, message: str, number: int | None = None, fatal: bool = False) -> None:
-        """Send it an error."""
+        """Send the client an error."""
         about = {"type": "error", "message": message, "id": number, "fatal": fatal}
         self.out += wire.frame(about)
 
     def flush(self) -> None:
-        """Send what the socket takes.
+        """Send as much as the socket takes.
 
         **Raises:** `OSError` if it has vanished.
         """
@@ -199,7 +206,7 @@ class Client:
 
 
 def keep_alive(sock: socket.socket) -> None:
-    """Let the system notice a peer whose machine is gone, within half a minute."""
+    """Let the operating system notice a peer whose machine is gone, within half a minute."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     # Not every system has each of them.

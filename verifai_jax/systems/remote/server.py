@@ -24,11 +24,16 @@ from verifai_jax.systems.remote.connection import Batch, Client, Point, Rules, k
 
 log = logging.getLogger("verifai_jax.remote")
 
-TICK = 0.1  # Seconds between two looks at the clock.
-MOST_LOGGED = 20  # Faults of one client.
-MOST_UNREAD = 1 << 20  # Bytes that a client may leave unread while it gives cause for more.
+TICK = 0.1
+"""Seconds between two checks of timeouts."""
+MOST_LOGGED = 20
+"""Faults of one client that are logged."""
+MOST_UNREAD = 1 << 20
+"""Bytes that a client may leave unread while it gives cause for more."""
 MOST_CLIENTS = 256
-REMINDER = 10.0  # Seconds without a client until the log says so; then twice as long, up to 60.
+"""Clients that may be connected at a time."""
+REMINDER = 10.0
+"""Seconds without a client until the log says so; then twice as long, up to 60."""
 
 
 class Server(threading.Thread):
@@ -55,7 +60,7 @@ class Server(threading.Thread):
     # Called by other threads
 
     def submit(self, batch: Batch, texts: Sequence[bytes]) -> None:
-        """Have these points simulated; each is `{"id":%d,...}` without its id."""
+        """Queue these points for simulation; each is `{"id":%d,...}` without its id."""
         self._tell((batch, texts))
 
     def stop(self) -> None:
@@ -66,7 +71,7 @@ class Server(threading.Thread):
             if threading.current_thread() is not self:
                 self.join(timeout=5.0)
 
-    def _tell(self, what: Any) -> None:
+    def _tell(self, what: tuple[Batch, Sequence[bytes]] | None) -> None:
         self._inbox.put(what)
         # Otherwise it wakes up by itself, or it has ended and says so.
         with contextlib.suppress(OSError):
@@ -75,7 +80,7 @@ class Server(threading.Thread):
     # The thread
 
     def run(self) -> None:
-        """Serve until told to stop."""
+        """Serve until `stop` is called."""
         ended: BaseException = ConnectionError("the server for remote simulators was closed")
         try:
             self._loop()
@@ -96,10 +101,10 @@ class Server(threading.Thread):
                 else:
                     self._attend(key.data, events)
             while not self._inbox.empty():
-                told = self._inbox.get()
-                if told is None:
+                request = self._inbox.get()
+                if request is None:
                     return
-                self._take_up(*told)
+                self._take_up(*request)
             self._hand_out()
             now = time.monotonic()
             if now - ticked >= TICK:
@@ -116,9 +121,9 @@ class Server(threading.Thread):
             sock.close()
         self._selector.close()
         while not self._inbox.empty():
-            told = self._inbox.get()
-            if told is not None:
-                self.batches.append(told[0])
+            request = self._inbox.get()
+            if request is not None:
+                self.batches.append(request[0])
         for batch in self.batches:
             batch.outcomes.put(ended)
 
@@ -133,7 +138,7 @@ class Server(threading.Thread):
 
     def _accept(self, listening: Any) -> None:
         if time.monotonic() < self._refused_until:
-            time.sleep(0.01)  # The socket stays ready for as long as nobody takes the connection.
+            time.sleep(0.01)  # The socket stays ready until the connection is accepted.
             return
         try:
             sock, address = listening.accept()
@@ -222,7 +227,7 @@ class Server(threading.Thread):
         self._release(client, how)
 
     def _release(self, client: Client, how: str) -> None:
-        """Give the points of a client to others, and count those against it that it worked on."""
+        """Give a client's points to others, and count its loss of those that it was simulating."""
         suspects = {point.id for point in client.running()}
         for point in reversed(client.has.values()):
             if point.id not in suspects:
@@ -287,7 +292,7 @@ class Server(threading.Thread):
             last = "; no more of its faults are logged" if client.faults == MOST_LOGGED else ""
             log.warning("simulator %s%s: %s%s", client.name, about, what, last)
         if len(client.out) > MOST_UNREAD:
-            raise wire.WireError("it is told of faults and does not read them")
+            raise wire.WireError("it is sent errors and does not read them")
         client.tell(what, number)
 
     def _settle(self, point: Point, outcome: Outcome) -> None:
@@ -306,7 +311,7 @@ class Server(threading.Thread):
                 self._hand(client, self.waiting, min(share, client.room))
 
     def _hand_out_lost(self) -> None:
-        """Points whose client vanished: to one that has answered, or was here already.
+        """Hand points whose client vanished to one that has answered, or was here already.
 
         A client that dies of everything, and comes back at once, must not use up the attempts of
         every point; so a lost point waits for a better one, if there is any.

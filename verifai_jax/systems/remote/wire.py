@@ -28,7 +28,7 @@ _LENGTH = struct.Struct(">I")
 
 
 class WireError(ValueError):
-    """What came is not what the protocol allows."""
+    """An error of a message that the protocol does not allow."""
 
 
 class Message(NamedTuple):
@@ -40,13 +40,13 @@ class Message(NamedTuple):
 
 
 def frame(message: Mapping[str, Any] | bytes) -> bytes:
-    """A message without raw bytes, or its JSON, ready to be sent."""
+    """Return a message without raw bytes, or its JSON, ready to be sent."""
     text = message if isinstance(message, bytes) else to_text(message).encode()
     return _LENGTH.pack(len(text)) + text
 
 
-def to_text(value: Any) -> str:
-    """JSON in one line. Numbers that JSON does not have are null."""
+def to_text(value: object) -> str:
+    """Write JSON in one line; a number that JSON does not have becomes null."""
     try:
         return json.dumps(value, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -54,7 +54,7 @@ def to_text(value: Any) -> str:
 
 
 class Frames:
-    """Bytes as they arrive, cut into messages.
+    """A stream of bytes, cut into messages as they arrive.
 
     - `most`: how many bytes a frame may have, raw ones included.
     """
@@ -67,18 +67,18 @@ class Frames:
         self._decoder = json.JSONDecoder(parse_constant=self._note)
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Whole messages, as far as they have come.
+        """Yield the whole messages among the bytes that have come so far.
 
         **Raises:** `WireError` for what is none. Nothing can be understood after that.
         """
         self._bytes += data
         at = 0
         try:
-            while (found := self._header or self._text(at)) is not None:
-                message, length, extra = found
+            while (next_message := self._header or self._text(at)) is not None:
+                message, length, extra = next_message
                 end = at + 4 + length
                 if len(self._bytes) < end + extra:
-                    self._header = found
+                    self._header = next_message
                     break
                 self._header, at = None, end + extra
                 yield message._replace(raw=bytes(self._bytes[end:at])) if extra else message
@@ -86,7 +86,7 @@ class Frames:
             del self._bytes[:at]
 
     def _text(self, at: int) -> tuple[Message, int, int] | None:
-        """The message that begins `at`, how long its JSON is, and how many raw bytes follow."""
+        """Return the message that begins `at`, the length of its JSON, and of its raw bytes."""
         if len(self._bytes) < at + 4:
             return None
         (length,) = _LENGTH.unpack_from(self._bytes, at)
@@ -127,7 +127,7 @@ RESULT = ("type", "id", "bytes", "signals", "dt", "times", "valid", "error")
 
 
 def trace_of(message: Message) -> Trace:
-    """The trace in a `result`.
+    """Return the trace in a `result`.
 
     **Raises:** `WireError`, or `ValueError` from `Trace`, for anything that is none.
     """
@@ -162,7 +162,7 @@ def trace_of(message: Message) -> Trace:
     return trace
 
 
-def _array(name: str, value: Any, raw: bytes) -> np.ndarray:
+def _array(name: str, value: object, raw: bytes) -> np.ndarray:
     if isinstance(value, dict):
         return _raw_array(name, value, raw)
     if not isinstance(value, list):
@@ -195,7 +195,7 @@ def _raw_array(name: str, value: dict[str, Any], raw: bytes) -> np.ndarray:
 
 
 def plain(value: Any) -> Any:
-    """Features as JSON has them: arrays as lists, a waveform as an object of its control points.
+    """Return features for JSON: arrays as lists, a waveform as an object of its control points.
 
     **Raises:** `TypeError` for a value that JSON cannot hold.
     """
@@ -215,7 +215,7 @@ def plain(value: Any) -> Any:
     return array.tolist()
 
 
-def _without_nan(value: Any) -> Any:
+def _without_nan(value: object) -> Any:
     if isinstance(value, dict):
         return {name: _without_nan(inner) for name, inner in value.items()}
     if isinstance(value, list):
@@ -223,21 +223,21 @@ def _without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _is_integer(value: Any) -> bool:
+def _is_integer(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def unknown_type(kind: Any, known: Iterable[str]) -> WireError:
-    """The error for a message of a type that is not `known`."""
+def unknown_type(kind: object, known: Iterable[str]) -> WireError:
+    """Return the error for a message of a type that is not `known`."""
     return WireError(str(unknown_name("type of message", printable(kind), known)))
 
 
-def brief(value: Any) -> str:
-    """What came, short enough for a message."""
+def brief(value: object) -> str:
+    """Write a value short enough for a message."""
     try:
         text = ascii(value)
     except ValueError:  # An integer of more digits than Python prints.
@@ -245,8 +245,8 @@ def brief(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def printable(value: Any, most: int = 80) -> str:
-    """A stranger's text in one line, without what could garble a log or a terminal."""
+def printable(value: object, most: int = 80) -> str:
+    """Write a stranger's text in one line that cannot garble a log or a terminal."""
     text = value if isinstance(value, str) else brief(value)
     text = "".join(c if c.isprintable() else " " for c in text[: most + 1])
     return text if len(text) <= most else text[: most - 3] + "..."
