@@ -48,7 +48,8 @@ def test_report_on_disk(found, tmp_path):
     report = found.save(tmp_path / "report")
     text = report.read_text()
     assert text.startswith("# table")
-    for name in ("overview", "rules", "importance", "clusters", "pca", "recurrent", "coverage"):
+    names = "overview rules importance clusters pca frequent_patterns coverage"
+    for name in names.split():
         assert f"({name}.png)" in text
         with Image.open(tmp_path / "report" / f"{name}.png") as image:
             assert image.size[0] > 200
@@ -75,7 +76,7 @@ def test_odd_tables(failing, tmp_path):
     words = {part.name: part.words for part in found.parts}
     if failing == "none":
         assert words["rules"] == "skipped: no row fails"
-        assert words["recurrent"] == "skipped: no row fails"
+        assert words["frequent_patterns"] == "skipped: no row fails"
         assert words["failures"].splitlines()[1].startswith("nearest: row ")
     if failing == "one":
         assert words["clusters"] == "skipped: only one row fails"

@@ -10,7 +10,8 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.counterexamples import Explained, explain
-from verifai_jax.counterexamples.description import Span, close, spans_of, told_spans
+from verifai_jax.counterexamples.description import format_apart, format_spans
+from verifai_jax.counterexamples.influence import Span, spans_of
 
 SPACE = {
     "throttle": vj.Signal(vj.Box(0.0, 100.0), knots=4, hold="constant", duration=20.0),
@@ -70,9 +71,9 @@ def test_single_control_points_and_slopes(explained):
     assert throttle.each_gone == (True, True, False, False)
     assert throttle.spans == (Span(0, 5), Span(5, 10), Span(10, 15), Span(15, 20))
     # Over the whole range of 100, in 5 s each; the last counts for 3 s.
-    np.testing.assert_allclose(throttle.slope, [-555.6, -555.6, -555.6, -333.3], rtol=0.02)
+    np.testing.assert_allclose(throttle.gradient, [-555.6, -555.6, -555.6, -333.3], rtol=0.02)
     mass = next(i for i in explained.influences if i.name == "mass")
-    assert mass.slope[0] == pytest.approx(1250 / 0.9**2, rel=0.02)
+    assert mass.gradient[0] == pytest.approx(1250 / 0.9**2, rel=0.02)
 
 
 def test_the_paragraph(explained):
@@ -89,7 +90,7 @@ def test_the_paragraph(explained):
 def test_without_nominal_features(driven):
     bare = replace(driven, problem=replace(driven.problem, nominal=None))
     why = explain(bare)
-    assert "does not say what is nominal: only slopes tell what matters" in str(why)
+    assert "does not say what is nominal: only gradients tell what matters" in str(why)
     assert why.influences[0].name == "mass"
     assert np.isnan(why.influences[0].reverted)
     assert why.plot() is not None
@@ -133,9 +134,9 @@ def test_an_absolute_value_over_two_formulas_and_a_black_box():
 
 
 def test_words():
-    assert close(120.0004, 120.0) == ("120.0004", "120")
-    assert close(1.0, 2.0) == ("1", "2")
-    assert told_spans([Span(0, 5), Span(5, 10), Span(15, 20)]) == (
+    assert format_apart(120.0004, 120.0) == ("120.0004", "120")
+    assert format_apart(1.0, 2.0) == ("1", "2")
+    assert format_spans([Span(0, 5), Span(5, 10), Span(15, 20)]) == (
         "from 0 s to 10 s and from 15 s to 20 s"
     )
     linear = vj.Signal(vj.Box(0.0, 1.0), knots=3, hold="linear")

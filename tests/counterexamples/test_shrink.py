@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import verifai_jax as vj
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.counterexamples import Shrunk, shrink
-from verifai_jax.counterexamples.fixed_key import key_of, with_key_of
+from verifai_jax.counterexamples.fixed_key import fix_key, key_of
 from verifai_jax.counterexamples.minimize_distance import least
 from verifai_jax.counterexamples.nominal import Nominal
 
@@ -74,7 +74,7 @@ def starts(run, count, seed=0):
 
 def checked(run, row, few, small, budget=2000, seed=0, others=True):
     """Both orders, against the known minimum; every result fails when simulated again."""
-    for by, (count, distance) in (("few", few), ("small", (None, small))):
+    for by, (count, distance) in (("count", few), ("distance", (None, small))):
         found = shrink(run, int(row), by=by, budget=budget, seed=seed, others=others)
         assert found.simulations <= budget
         assert found.rho <= 0
@@ -152,8 +152,8 @@ def test_refusals(edges):
         shrink(edges, safe)
     with pytest.raises(IndexError, match="row 512 is not in the table of 512 simulations"):
         shrink(edges, 512)
-    with pytest.raises(UnknownNameError, match="unknown order 'smal'; did you mean 'small'"):
-        shrink(edges, by="smal")
+    with pytest.raises(UnknownNameError, match="unknown order 'distanc'; did you mean 'distance'"):
+        shrink(edges, by="distanc")
     with pytest.raises(ValueError, match="budget must be an integer of at least 1; got 0"):
         shrink(edges, budget=0)
     with pytest.raises(UnknownNameError, match="option of shrink 'nominl'; did you mean 'nominal'"):
@@ -214,7 +214,7 @@ def test_choices_integers_and_a_constraint():
 def test_a_black_box_without_gradients():
     problem = problem_of("box", 3, half([0.8, 0.6, 0.0], 0.3), black_box=True)
     run = vj.falsify(problem, "uniform", 64, batch=64, progress=False)
-    checked_run = shrink(run, by="small", budget=600)
+    checked_run = shrink(run, by="distance", budget=600)
     assert checked_run.distance == pytest.approx(0.3, rel=0.05)
     assert checked_run.replay().violated
     few = shrink(run, budget=600)
@@ -233,11 +233,11 @@ def test_a_system_that_draws_is_simulated_with_the_key_of_the_row():
     lucky = float(jax.random.uniform(key_of(run, row)))
     assert found.changed["x"][1] == pytest.approx(0.5 + lucky, rel=0.01)
     assert found.replay().violated
-    keyed = with_key_of(problem, run, row)
+    keyed = fix_key(problem, run, row)
     traces = [keyed.system({"x": 0.0}, jax.random.key(k)) for k in range(2)]
     np.testing.assert_array_equal(traces[0].signals["m"], traces[1].signals["m"])
     still = problem_of("still", 2, lambda u: u[0])
-    assert with_key_of(still, run, row) is still
+    assert fix_key(still, run, row) is still
 
 
 def test_the_nearest_point_of_half_spaces():

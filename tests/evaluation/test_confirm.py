@@ -62,7 +62,7 @@ def checked(problem, values, seed=0, **options):
 
 def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles):
     a = circles.table.counterexamples["a"]
-    verdict = confirmed_circles.frame["verdict"]
+    verdict = confirmed_circles.table["verdict"]
     # The solution has the radius a: what does not reach the bound may not be claimed.
     assert (a[verdict == "confirmed"] > 1.5).all()
     assert (verdict[a > 1.56] == "confirmed").all()
@@ -77,7 +77,7 @@ def test_robustness_of_each_check_is_that_of_an_own_replay(circles, confirmed_ci
     for factor, name in ((1, "float64"), (2, "half_step"), (4, "quarter_step")):
         problem = replace(oscillator(), system=oscillator().system.refined(factor))
         again = replay(problem, row, run_keys(0)[1], 0, "float64").rho["spec"]
-        found = confirmed_circles.frame.loc[row.name, f"rho.{name}"]
+        found = confirmed_circles.table.loc[row.name, f"rho.{name}"]
         np.testing.assert_allclose(found, again, rtol=1e-12)
 
 
@@ -85,14 +85,14 @@ def test_one_row_in_words(circles, confirmed_circles):
     one = confirm(circles, int(circles.best.name))
     assert one.confirmed
     assert one == confirm(circles, circles.best)
-    row = confirmed_circles.frame.loc[circles.best.name]
+    row = confirmed_circles.table.loc[circles.best.name]
     assert (one.verdict, one.band) == (row["verdict"], pytest.approx(row["band"]))
     assert str(one).startswith(
         f"row {circles.best.name} of circle: confirmed, it fails in every replay. Robustness "
     )
     assert "as run (float32)" in str(one)
     assert "at a quarter of the step in float32" in str(one)
-    frame = confirmed_circles.frame
+    frame = confirmed_circles.table
     least = int(frame.loc[frame["verdict"] == "refuted", "rho"].idxmin())
     refuted = confirm(circles, least)
     assert (
@@ -239,7 +239,7 @@ def test_random_systems_keep_their_numbers_and_their_precision():
     noisy = plain(lambda f, key: f["x"] + 0.1 * jax.random.normal(key))
     run = vj.falsify(noisy, "uniform", 64, batch=64, seed=3, progress=False, confirm=False)
     found = confirm(run)
-    np.testing.assert_allclose(found.frame["rho.again"], found.frame["rho"], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found.table["rho.again"], found.table["rho"], rtol=1e-5, atol=1e-7)
     assert "not checked in float64: in it the system would draw other random numbers" in found.notes
     # The same numbers again say nothing new.
     assert found.counts == {"unchecked": len(found)}
@@ -477,7 +477,7 @@ def test_automatic_transmission_is_believed():
     numbers = found.confirmed.index[:3]
     finer = independent(run, numbers, (4, 8))
     assert np.all(finer < 0)
-    np.testing.assert_allclose(found.frame.loc[numbers, "rho.quarter_step"], finer[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(found.table.loc[numbers, "rho.quarter_step"], finer[:, 0], rtol=1e-6)
 
 
 @pytest.mark.slow

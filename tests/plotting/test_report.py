@@ -7,7 +7,7 @@ from PIL import Image
 import verifai_jax as vj
 from verifai_jax.plotting import draw_run, plot_features, plot_replay
 from verifai_jax.plotting.replay import decisive_instant
-from verifai_jax.plotting.scatter import telling_features
+from verifai_jax.plotting.scatter import distinguishing_features
 
 
 def system(features, key):
@@ -43,7 +43,7 @@ def test_the_feature_that_decides_comes_first():
     space = {"b": vj.Box(0, 1), "a": vj.Box(0, 1)}
     for spec in ("always x < 0.5", "always x < 9"):  # with failures, and by robustness alone
         run = vj.falsify(vj.Problem("p", space, system, spec), "uniform", 64, batch=64)
-        assert telling_features(run) == ["a", "b"]
+        assert distinguishing_features(run) == ["a", "b"]
 
 
 def test_the_decisive_instant_is_marked():

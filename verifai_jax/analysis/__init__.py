@@ -1,9 +1,11 @@
-"""What an error table says: components, neighbours, recurrent values, clusters, rules, coverage."""
+"""Analyses of error tables: components, neighbours, patterns, clusters, rules, coverage."""
 
 from verifai_jax.analysis._coverage import Coverage as Coverage
 from verifai_jax.analysis._coverage import coverage as coverage
 from verifai_jax.analysis._diverse import Diverse as Diverse
 from verifai_jax.analysis._diverse import diverse as diverse
+from verifai_jax.analysis._frequent_patterns import FrequentPatterns as FrequentPatterns
+from verifai_jax.analysis._frequent_patterns import frequent_patterns as frequent_patterns
 from verifai_jax.analysis._importance import Importance as Importance
 from verifai_jax.analysis._importance import importance as importance
 from verifai_jax.analysis._pca import Components as Components
@@ -15,8 +17,6 @@ from verifai_jax.analysis.clustering.clusters import Clusters as Clusters
 from verifai_jax.analysis.clustering.clusters import clusters as clusters
 from verifai_jax.analysis.data.columns import Column as Column
 from verifai_jax.analysis.data.samples import Samples as Samples
-from verifai_jax.analysis.frequent_patterns import Recurrent as Recurrent
-from verifai_jax.analysis.frequent_patterns import recurrent as recurrent
 from verifai_jax.analysis.neighbours import Neighbours as Neighbours
 from verifai_jax.analysis.neighbours import k_closest as k_closest
 from verifai_jax.analysis.neighbours import nearest as nearest
@@ -35,9 +35,9 @@ __all__ = [
     "Components",
     "Coverage",
     "Diverse",
+    "FrequentPatterns",
     "Importance",
     "Neighbours",
-    "Recurrent",
     "Rule",
     "Rules",
     "Samples",
@@ -46,6 +46,7 @@ __all__ = [
     "clusters",
     "coverage",
     "diverse",
+    "frequent_patterns",
     "gradient_sensitivity",
     "importance",
     "k_closest",
@@ -53,7 +54,6 @@ __all__ = [
     "nearest",
     "pca",
     "random_rows",
-    "recurrent",
     "rules",
     "sobol_indices",
 ]

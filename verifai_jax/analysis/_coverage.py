@@ -1,4 +1,4 @@
-"""How well the samples cover the feature space: how evenly, where the holes are, what is untried.
+"""Coverage of the feature space: how even samples are, where holes are, what is untried.
 
 found = coverage(run)
 found.hole                  features in the middle of the largest hole
@@ -8,38 +8,39 @@ found.untried               values and pairs of values that no row has
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
-from verifai_jax.analysis.data.cells import cut, occupied
+from verifai_jax.analysis.data.cells import count_occupied, cut
 from verifai_jax.analysis.data.marginals import Marginal, marginals
-from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.analysis.holes import MOST_TREE, alike, largest_hole
+from verifai_jax.analysis.data.samples import Samples, Source
+from verifai_jax.analysis.holes import MOST_TREE, largest_hole, uniform_points
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features, format_percent
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from verifai_jax.falsification.run import Run
-    from verifai_jax.falsification.table import ErrorTable
 
 MOST_ROWS = 2000
 MOST_ENTRIES = 8e7
 """Rows that the discrepancy is computed from, and what their square times the features may be."""
 REPEATS = 8
+"""Sets of uniform samples whose dispersion is averaged."""
 ALLOWED = 8192
+"""Samples drawn that fulfil a constraint."""
 LEAST_ACCEPTED = 0.005
+"""Share of the space that a constraint must leave to be taken into account."""
 MOST_LISTED = 5
+"""Untried values written in words."""
 MOST_NAMED = 8
+"""Features named in words."""
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """How well the rows cover the feature space.
+    """Coverage of the feature space by the rows of a table.
 
     **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
     `occupied`, the share of pairs of cells with other features (`pairs`), and the share that as
@@ -52,8 +53,8 @@ class Coverage:
     `samples`.
     """
 
-    table: "pd.DataFrame"
-    untried: "pd.DataFrame"
+    table: pd.DataFrame
+    untried: pd.DataFrame
     untried_count: int
     discrepancy: float
     dispersion: float | None
@@ -67,8 +68,15 @@ class Coverage:
         column = "pairs" if len(self.table) > 1 else "occupied"
         return float(np.nanmean(self.table[column].to_numpy(float)))
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw how often each cell is occupied, and the least occupied pair; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw how often each cell is occupied, and the least occupied pair.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.coverage", "plot_coverage")(self, path)
 
     def __repr__(self) -> str:
@@ -81,7 +89,7 @@ class Coverage:
         lines = [
             f"{len(self.samples):,} rows of {self.samples.name!r} lie in {format_percent(share)} "
             f"of all {what} ({format_percent(uniform)} if they were uniform), "
-            + _evenness(self.discrepancy)
+            + _describe_evenness(self.discrepancy)
         ]
         if self.hole is not None:
             where = format_features(dict(list(self.hole.items())[:MOST_NAMED]))
@@ -97,7 +105,9 @@ class Coverage:
                 f"least covered feature: {worst}, {format_percent(shares.min())} of its cells"
             )
         if self.untried_count:
-            shown = [_words(row) for row in self.untried.head(MOST_LISTED).to_dict("records")]
+            shown = [
+                _describe_row(row) for row in self.untried.head(MOST_LISTED).to_dict("records")
+            ]
             more = self.untried_count - len(shown)
             lines.append("never tried: " + "; ".join(shown) + (f"; and {more:,} more" * (more > 0)))
         if self.samples.space is not None and self.samples.space.where is not None:
@@ -105,15 +115,18 @@ class Coverage:
         return "\n".join(lines)
 
 
-def coverage(
-    source: "Run | ErrorTable | pd.DataFrame | Samples", *, cells: int = 10, seed: int = 0
-) -> Coverage:
+def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
     """Measure how well samples cover the space of features.
+
+    **Arguments:**
 
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
       to fill them; a discrete feature of up to 20 values has a cell for each.
+    - `seed`: of what is drawn at random.
+
+    **Returns:** a `Coverage`.
 
     Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares
     of the ranges in the table where no space is known. With a constraint between features, uniform
@@ -131,13 +144,13 @@ def coverage(
     """
     cells = check_count("cells", cells, 2)
     samples = Samples.of(source, "all")
-    samples = _varying(samples)
+    samples = _drop_constant(samples)
     generator = np.random.default_rng(seed)
     parts = marginals(samples)
     allowed = _allowed(samples, seed)
     # With five rows a pair of cells, uniform samples leave one in a hundred and fifty empty.
     count = int(np.clip(np.sqrt(len(samples) / 5), 2, cells))
-    table, untried, missing = occupied(
+    table, untried, missing = count_occupied(
         len(samples),
         cut(samples, parts, count),
         None if allowed is None else cut(allowed, parts, count),
@@ -149,7 +162,7 @@ def coverage(
         if allowed is None:
             among = None
             repeats = REPEATS if len(ordered) <= MOST_TREE else 1
-            others = [alike(ordered, generator, len(points)) for _ in range(repeats)]
+            others = [uniform_points(ordered, generator, len(points)) for _ in range(repeats)]
         else:
             among, other = np.array_split(_units(allowed, ordered), 2)
             others = [other[: len(points)]]
@@ -175,26 +188,25 @@ def coverage(
 
 
 def _units(
-    samples: Samples, parts: Sequence[Marginal], generator: Any = None
+    samples: Samples, parts: Sequence[Marginal], generator: np.random.Generator | None = None
 ) -> Float[np.ndarray, "n d"]:
     return np.stack([part.unit(samples, generator) for part in parts], axis=1)
 
 
 def _allowed(samples: Samples, seed: int) -> Samples | None:
-    """Samples of the prior that fulfil the constraint of the space; None without one."""
+    """Draw samples of the prior that fulfil the constraint of the space; None without one."""
     space = samples.space
     if space is None or space.where is None or space.check_where() < LEAST_ACCEPTED:
         return None
     import jax
-    import pandas as pd
 
     key = jax.random.key(seed, impl="threefry2x32")
     rows = space.rows(space.sample(key, ALLOWED))
     return replace(samples, frame=pd.DataFrame(rows))
 
 
-def _varying(samples: Samples) -> Samples:
-    """Without the columns that have a single value in the space, or in a table without a space."""
+def _drop_constant(samples: Samples) -> Samples:
+    """Drop columns that have a single value in the space, or in a table without a space."""
     names = [
         column.name
         for column in samples.columns
@@ -209,9 +221,11 @@ def _varying(samples: Samples) -> Samples:
 
 
 def _discrepancy(
-    unit: Float[np.ndarray, "n d"], allowed: Float[np.ndarray, "m d"] | None, generator: Any
+    unit: Float[np.ndarray, "n d"],
+    allowed: Float[np.ndarray, "m d"] | None,
+    generator: np.random.Generator,
 ) -> float:
-    """Squared centred discrepancy over that of as many samples of the prior."""
+    """Return the squared centred discrepancy over that of as many samples of the prior."""
     from scipy.stats import qmc
 
     n, d = unit.shape
@@ -226,7 +240,7 @@ def _discrepancy(
     return float(qmc.discrepancy(unit, method="CD") / expected)
 
 
-def _words(row: dict[Any, Any]) -> str:
+def _describe_row(row: dict[Any, Any]) -> str:
     def pair(name: str, value: Any) -> str:
         return f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
 
@@ -234,7 +248,7 @@ def _words(row: dict[Any, Any]) -> str:
     return f"{words} with {pair(row['other'], row['other_value'])}" if row["other"] else words
 
 
-def _evenness(discrepancy: float) -> str:
+def _describe_evenness(discrepancy: float) -> str:
     if discrepancy < 0.5:
         return f"more evenly than uniform samples (discrepancy {discrepancy:.2g} times theirs)"
     if discrepancy <= 3:

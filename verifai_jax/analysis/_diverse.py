@@ -1,4 +1,4 @@
-"""A diverse subset: few rows that stand for all, each as far as can be from those before.
+"""A diverse subset: some rows that stand for all, each as far as can be from those before.
 
     found = diverse(run, 10)
     found.table                    the rows, the worst first, and how far each was from those before
@@ -13,19 +13,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, distances
+from verifai_jax.analysis.data.samples import (
+    Samples,
+    Scale,
+    Source,
+    Which,
+    beside,
+    distances,
+)
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +48,20 @@ class Diverse:
     radius: float
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
-        import pandas as pd
-
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return beside(self.samples.at(self.rows), own)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the rows among all, in their order, and the distances; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the rows among all, in their order, and the distances.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.diverse", "plot_diverse")(self, path)
 
     def __len__(self) -> int:
@@ -69,7 +79,7 @@ class Diverse:
 
 
 def diverse(
-    source: Any,
+    source: Source,
     k: int,
     start: int | None = None,
     columns: Sequence[str] | None = None,
@@ -77,14 +87,22 @@ def diverse(
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Diverse:
-    """`k` rows: the worst one first, then always the row farthest from all those chosen.
+    """Select `k` rows: the worst one first, then always the row farthest from all before.
 
-    - `source`, `columns`, `which`, `space`: as in `Samples.of`; `scale` as in `Samples.scaling`.
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
     - `k`: how many; all rows if there are no more.
     - `start`: the number of the first row, instead of that of the least robustness.
+    - `scale`: as in `Samples.scaling`.
+
+    **Returns:** a `Diverse`.
 
     Rows that equal a chosen one come last, at a distance of 0. Of rows that are equally far the
-    first in the table is taken. Takes `n k` steps. **Raises:** `ValueError` for a `k` below 1;
+    first in the table is taken. Takes `n k` steps.
+
+    **Raises:** `ValueError` for a `k` below 1;
     `IndexError` for a start that is not among the rows.
     """
     samples = Samples.of(source, which, columns, space)

@@ -1,4 +1,4 @@
-"""Which features failing, and the robustness, depend on, from the table alone.
+"""Importance of features for failing and for the robustness, from the table alone.
 
 found = importance(run)
 found.table                 drop of the score when a feature is shuffled
@@ -8,20 +8,16 @@ found.trusted("failing")    whether the model behind it can predict at all
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from verifai_jax.falsification.run import Run
-    from verifai_jax.falsification.table import ErrorTable
 
 MOST_TRAINED = 4000
 MOST_TESTED = 2000
@@ -43,7 +39,7 @@ MOST_NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class Importance:
-    """How much a model of the table loses when a feature is shuffled.
+    """Losses of a model of the table when a feature is shuffled.
 
     **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
     area under the ROC curve (0.5 is chance) of a model of which rows fail, `rho` the loss in R^2
@@ -52,13 +48,13 @@ class Importance:
     not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
     """
 
-    table: "pd.DataFrame"
+    table: pd.DataFrame
     scores: dict[str, float]
     missing: dict[str, str]
     name: str
 
     def trusted(self, target: str) -> bool:
-        """Whether the model of `"failing"` or `"rho"` predicts rows that it has not seen."""
+        """Return whether the model of `"failing"` or `"rho"` predicts rows kept aside."""
         return self.scores.get(target, -np.inf) >= LEAST[target]
 
     @property
@@ -66,8 +62,15 @@ class Importance:
         """Features from the most to the least important, by the model that can be trusted."""
         return [str(name) for name in self.table.index]
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the losses as bars; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the losses as bars.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.bars", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
@@ -98,14 +101,17 @@ class Importance:
         return f"{SCORES[target]} {self.scores[target]:.2f} on rows kept aside"
 
 
-def importance(
-    source: "Run | ErrorTable | pd.DataFrame | Samples", *, repeats: int = 5, seed: int = 0
-) -> Importance:
+def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance:
     """Measure how important each feature is to a model trained on the table; nothing is simulated.
+
+    **Arguments:**
 
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
       verdict.
     - `repeats`: how often each feature is shuffled.
+    - `seed`: of all that is drawn at random.
+
+    **Returns:** an `Importance`.
 
     Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two
     features that go together in the table, as an active search may make them, share their
@@ -142,16 +148,14 @@ def importance(
     if not scores:
         reasons = "; ".join(f"{NAMES[target]}: {reason}" for target, reason in missing.items())
         raise ValueError(f"no importance can be learned from {samples.name!r}: {reasons}")
-    import pandas as pd
-
     table = pd.DataFrame(columns, index=pd.Index(names, name="feature"))
     by = max(scores, key=lambda target: (scores[target] >= LEAST[target], target == "failing"))
     table = table.sort_values(by, ascending=False, kind="stable")
     return Importance(table, scores, missing, samples.name)
 
 
-def _unlearnable(target: str, values: Any) -> str:
-    """Why nothing can be learned; empty if something can."""
+def _unlearnable(target: str, values: np.ndarray) -> str:
+    """Explain why nothing can be learned; empty if something can."""
     if target == "failing":
         fewest = int(min(values.sum(), (~values).sum()))
         if fewest < 2 * FEWEST:
@@ -168,9 +172,9 @@ def _unlearnable(target: str, values: Any) -> str:
 
 
 def _split(
-    values: Any, generator: Any, predictions: int
+    values: np.ndarray, generator: np.random.Generator, predictions: int
 ) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " test"]]:
-    """Rows to train on and rows to measure on; rare verdicts are kept before others."""
+    """Return rows to train on and rows to measure on; rare verdicts are kept before others."""
     most = int(np.clip(MOST_PREDICTED // max(predictions, 1), 200, MOST_TESTED))
     if values.dtype != bool:
         order = generator.permutation(len(values))
@@ -188,15 +192,15 @@ def _split(
 
 def _losses(
     matrix: Float[np.ndarray, "n e"],
-    values: Any,
+    values: np.ndarray,
     groups: Sequence[Sequence[int]],
     train: Int[np.ndarray, " train"],
     test: Int[np.ndarray, " test"],
-    generator: Any,
+    generator: np.random.Generator,
     repeats: int,
     seed: int,
 ) -> tuple[float, Float[np.ndarray, "features repeats"]]:
-    """The score of a model on the test rows, and its losses by shuffling each feature."""
+    """Return the score of a model on the test rows, and its losses by shuffling each feature."""
     from sklearn.ensemble import ExtraTreesClassifier, ExtraTreesRegressor
     from sklearn.metrics import r2_score, roc_auc_score
 
@@ -232,7 +236,7 @@ def _losses(
 
 
 def _encoded(samples: Samples) -> tuple[Float[np.ndarray, "n e"], list[list[int]]]:
-    """Columns for the trees, and which of them belong to each feature, ordered ones first."""
+    """Return columns for the trees, and those that belong to each feature, ordered ones first."""
     columns: list[Any] = []
     groups: list[list[int]] = []
     for values in samples.matrix().T.reshape(len(samples.ordered), -1):

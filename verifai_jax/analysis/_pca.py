@@ -14,27 +14,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, Key
+import pandas as pd
+from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.columns import feature_columns
-from verifai_jax.analysis.data.samples import Samples, Scale, Which, beside, generator
+from verifai_jax.analysis.data.samples import (
+    Samples,
+    Scale,
+    Seed,
+    Source,
+    Which,
+    beside,
+    generator,
+)
 from verifai_jax.core.checks import check_count, check_positive
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-# Fractions of the total variance below this are rounding.
 _NOTHING = 1e-12
+"""Share of the total variance below which a component is rounding."""
 _REDRAWS = 32
+"""Rounds in which draws outside the bounds are drawn again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +72,17 @@ class Components:
         return tuple(column.name for column in self.samples.ordered)
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """A row for each component: its loadings, its deviation and its share of the variance."""
-        import pandas as pd
-
         place = pd.RangeIndex(1, len(self.directions) + 1, name="component")
         table = pd.DataFrame(self.directions, index=place, columns=list(self.names))
         own = pd.DataFrame({"deviation": self.deviations, "share": self.shares}, index=place)
         return beside(table, own)
 
-    def project(self, rows: "pd.DataFrame | Sequence[int] | None" = None) -> "pd.DataFrame":
-        """Coordinates along the components, in scaled units, a column each; 0 is the pivot.
+    def project(self, rows: pd.DataFrame | Sequence[int] | None = None) -> pd.DataFrame:
+        """Return coordinates along the components, in scaled units, a column each; 0 is the pivot.
+
+        **Arguments:**
 
         - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
           that were analysed.
@@ -82,8 +90,6 @@ class Components:
         An absent entry is taken as the pivot's. **Raises:** `IndexError` for a row number that is
         not in the table.
         """
-        import pandas as pd
-
         frame = self.samples.frame
         if isinstance(rows, pd.DataFrame):
             frame = rows
@@ -94,12 +100,13 @@ class Components:
         columns = range(1, len(self.directions) + 1)
         return pd.DataFrame(moved @ self.directions.T, index=frame.index, columns=list(columns))
 
-    def generate(
-        self, seed: "int | Key[jax.Array, '']", n: int, spread: float = 1.0
-    ) -> "pd.DataFrame":
-        """New features: normal along the components around the pivot, within the space's bounds.
+    def generate(self, seed: Seed, n: int, spread: float = 1.0) -> pd.DataFrame:
+        """Draw features: normal along the components around the pivot, within the space's bounds.
 
-        - `seed`: an integer or a `jax.random` key.
+        **Arguments:**
+
+        - `seed`: an integer, a NumPy generator or a `jax.random` key.
+        - `n`: how many.
         - `spread`: times the standard deviations of the rows.
 
         Draws outside the bounds (of the space, or of the whole table where no space is known) are
@@ -111,8 +118,6 @@ class Components:
 
         **Raises:** `ValueError` for `n < 0` or a spread that is not a positive finite number.
         """
-        import pandas as pd
-
         check_count("the number of samples", n, 0)
         check_positive("spread", spread, finite=True)
         rng = generator(seed)
@@ -130,7 +135,7 @@ class Components:
         return found.rename_axis(index="sample")
 
     def _draw(self, rng: np.random.Generator, n: int, spread: float) -> Float[np.ndarray, "n k"]:
-        """Values of the ordered columns within the bounds."""
+        """Draw values of the ordered columns within the bounds."""
         low, high = self._bounds
         steps = self.directions * self.width
 
@@ -152,8 +157,8 @@ class Components:
 
     def _features(
         self, values: Float[np.ndarray, "n k"]
-    ) -> "tuple[pd.DataFrame, Int[np.ndarray, ' n']]":
-        """All features with these ordered values, and the places of the rows that lent the rest."""
+    ) -> tuple[pd.DataFrame, Int[np.ndarray, " n"]]:
+        """Return all features with these ordered values, and the rows that lend the others."""
         donors = self._nearest(values)
         names = feature_columns(self.samples.table, self.samples.space)
         found: Any = self.samples.frame.iloc[donors][list(names)].reset_index(drop=True)
@@ -182,8 +187,15 @@ class Components:
         tree = KDTree(self.samples.matrix("raw") / self.width)
         return np.asarray(tree.query(values / self.width)[1], np.int64)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the rows along the first two components, and the loadings; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the rows along the first two components, and the loadings.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.pca", "plot_components")(self, path)
 
     def __str__(self) -> str:
@@ -207,21 +219,27 @@ class Components:
 
 
 def pca(
-    source: Any,
+    source: Source,
     components: int | None = None,
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Components:
-    """Principal components of the ordered features.
+    """Compute principal components of the ordered features.
 
-    - `source`, `columns`, `which`, `space`: as in `Samples.of`; unordered columns are left out.
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
+      Unordered columns are left out.
     - `components`: how many; by default all in which the rows vary. Fewer are returned where the
       rows vary in fewer directions.
     - `scale`: `"range"` compares features by their range in the space, `"raw"` does not scale
       (VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` compares by
       the range of the rows.
+
+    **Returns:** `Components`.
 
     **Raises:** `ValueError` for no ordered column, or more components than rows or columns.
     """
@@ -258,8 +276,8 @@ def pca(
     )
 
 
-def _accepted(space: FeatureSpace | None, frame: "pd.DataFrame") -> np.ndarray:
-    """Which rows keep the constraint of the space, if it has one."""
+def _accepted(space: FeatureSpace | None, frame: pd.DataFrame) -> np.ndarray:
+    """Return the rows that keep the constraint of the space, if it has one."""
     if space is None or space.where is None or not len(frame):
         return np.ones(len(frame), bool)
     rows: Any = frame.to_dict("records")

@@ -8,27 +8,25 @@ do not help, written in short numbers, and taken one by one until nearly all fai
 How well they do is measured on rows that were kept aside.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.conditions import Condition, Region, everywhere
 from verifai_jax.analysis.data.columns import Column
-from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.analysis.trees import proposals
+from verifai_jax.analysis.data.samples import Samples, Source
+from verifai_jax.analysis.trees import propose_regions
 from verifai_jax.core.checks import check_count, check_fraction
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from verifai_jax.falsification.table import ErrorTable
 
 FEWEST = 10
 """Failing rows, and safe rows, from which on some are kept aside."""
@@ -50,8 +48,8 @@ class Rule:
     precision: Rate | None
     region: Region = field(repr=False)
 
-    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
-        """Which rows `[n]` of a table (any DataFrame with these features) lie inside."""
+    def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+        """Return the rows of a table (any DataFrame with these features) that lie inside."""
         inside = np.ones(len(frame), bool)
         for condition in self.conditions:
             inside &= condition.matches(frame)
@@ -67,12 +65,12 @@ class Rule:
 
     def __str__(self) -> str:
         covered = f"covers {format_percent(self.coverage)} of the failures"
-        return f"{self.words}: {covered}, {_told(self.precision)}"
+        return f"{self.words}: {covered}, {_describe_precision(self.precision)}"
 
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """What `rules` found, the most telling rule first.
+    """Rules that together describe where a system fails, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together; `held_out`: whether
     they were measured on rows kept aside; `measured`: how many rows that is; `doubt`: why
@@ -87,18 +85,16 @@ class Rules:
     doubt: str
     samples: Samples
 
-    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
-        """Which rows `[n]` lie inside any of the rules."""
+    def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+        """Return the rows of a table that lie inside any of the rules."""
         inside = np.zeros(len(frame), bool)
         for rule in self.rules:
             inside |= rule.matches(frame)
         return inside
 
     @property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """One row a rule: its words, coverage and precision as measured."""
-        import pandas as pd
-
         columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
         for rule in self.rules:
             rate = rule.precision
@@ -107,8 +103,15 @@ class Rules:
                 columns[name].append(value)
         return pd.DataFrame(columns)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the rules over the two features that they use most; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the rules over the two features that they use most.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.panels", "plot_rules")(self, path)
 
     def __repr__(self) -> str:
@@ -123,16 +126,14 @@ class Rules:
             )
         lines = [str(rule) for rule in self.rules]
         if len(self.rules) > 1:
-            lines.append(
-                f"together: {format_percent(self.coverage)} of the failures, "
-                f"{_told(self.precision)}"
-            )
+            precision = _describe_precision(self.precision)
+            lines.append(f"together: {format_percent(self.coverage)} of the failures, {precision}")
         lines.append(self.basis)
         return "\n".join(lines)
 
     @property
     def basis(self) -> str:
-        """What the numbers were measured on, and what they say."""
+        """The rows that the numbers were measured on, and their meaning."""
         measured = (
             f"measured on {self.measured:,} rows kept aside"
             if self.held_out
@@ -148,7 +149,7 @@ _COLUMNS = ("rule", "coverage", "precision", "low", "high", "failures", "rows")
 
 
 def rules(
-    source: "Run | ErrorTable | pd.DataFrame | Samples",
+    source: Source,
     depth: int = 3,
     *,
     cover: float = 0.95,
@@ -158,12 +159,17 @@ def rules(
 ) -> Rules:
     """Describe the failure region by a few boxes.
 
+    **Arguments:**
+
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
     - `depth`: features that a rule has conditions on at most.
     - `cover`: share of the failures to cover; `most` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
       `seed` among failing and safe rows alike. With fewer than 10 failing or safe rows all of them
       are used for both, and the result says so.
+    - `seed`: of the rows kept aside.
+
+    **Returns:** `Rules`.
 
     A rule is chosen for the share of the remaining failures that it covers times the square of its
     precision among the remaining rows, so that a precise half is worth more than a vague whole.
@@ -182,11 +188,11 @@ def rules(
     aside = _aside(failing, held_out, seed)
     values, codes = samples.values(), samples.codes()
     made = ~aside
-    regions = _chosen(
+    regions = _select_regions(
         values[made], codes[made], failing[made], samples.unordered, depth, cover, most
     )
     integer = [column.integer for column in samples.ordered]
-    regions = [region.rounded(values[made], codes[made], integer) for region in regions]
+    regions = [region.round(values[made], codes[made], integer) for region in regions]
     measured = aside if aside.any() else made
     inside: Any = np.array([r.covers(values[measured], codes[measured]) for r in regions], bool)
     inside = inside.reshape(len(regions), int(measured.sum()))
@@ -210,8 +216,8 @@ def rules(
     )
 
 
-def _doubt(source: Any) -> str:
-    """Why the share of failures among rows is not their probability; empty where it is."""
+def _doubt(source: Source) -> str:
+    """Explain why the share of failures among rows is not their probability; empty where it is."""
     if not isinstance(source, Run):
         return "the rows may not be samples of the prior"
     if not source.prior:
@@ -222,7 +228,10 @@ def _doubt(source: Any) -> str:
 
 
 def check_both(samples: Samples, purpose: str) -> None:
-    """Raise `ValueError` unless there are failing and safe rows; `purpose` says what for."""
+    """Check that there are failing and safe rows, which `purpose` needs.
+
+    **Raises:** `ValueError` where there are not.
+    """
     failures = int(samples.failing.sum())
     if failures == 0:
         raise ValueError(
@@ -237,7 +246,7 @@ def check_both(samples: Samples, purpose: str) -> None:
 
 
 def _aside(failing: Bool[np.ndarray, " n"], share: float, seed: int) -> Bool[np.ndarray, " n"]:
-    """Rows to keep aside: the same share of failing and of safe ones."""
+    """Draw rows to keep aside: the same share of failing and of safe ones."""
     aside = np.zeros(len(failing), bool)
     if min(failing.sum(), (~failing).sum()) < FEWEST:
         return aside
@@ -248,7 +257,7 @@ def _aside(failing: Bool[np.ndarray, " n"], share: float, seed: int) -> Bool[np.
     return aside
 
 
-def _chosen(
+def _select_regions(
     values: Float[np.ndarray, "n k"],
     codes: Int[np.ndarray, "n m"],
     failing: Bool[np.ndarray, " n"],
@@ -257,7 +266,7 @@ def _chosen(
     cover: float,
     most: int,
 ) -> list[Region]:
-    """Regions that together cover the failures, each made from what those before left over."""
+    """Select regions that together cover the failures, each from what those before left over."""
     base = failing.mean()
     # Twice as dense in failures as everywhere, or half of what is missing to all.
     dense = min(2 * base, (1 + base) / 2)
@@ -275,11 +284,13 @@ def _chosen(
         best, grown = everywhere(values.shape[1], codes.shape[1]), True
         while grown:
             rows = remaining & best.covers(values, codes)
-            tried = proposals(best, values[rows], codes[rows], failing[rows], unordered, depth)
+            tried = propose_regions(
+                best, values[rows], codes[rows], failing[rows], unordered, depth
+            )
             tried = [region for region in tried if region.size <= depth]
             finer = max(tried, key=score, default=best)
             grown = score(finer) > WORTH * score(best)
-            best = _simplified(finer, score) if grown else best
+            best = _simplify(finer, score) if grown else best
         if score(best) == 0:
             break
         inside = best.covers(values, codes)
@@ -290,10 +301,10 @@ def _chosen(
     return found
 
 
-def _simplified(region: Region, score: Any) -> Region:
-    """The region without conditions that hardly raise the score."""
+def _simplify(region: Region, score: Callable[[Region], float]) -> Region:
+    """Remove conditions of a region that hardly raise the score."""
     value = score(region)
-    while looser := region.loosened():
+    while looser := region.loosen():
         best = max(looser, key=score)
         if WORTH * score(best) < value:
             break
@@ -315,7 +326,7 @@ def _numbers(rate: Rate | None) -> tuple[float, float, float, int, int]:
     return rate.estimate, rate.low, rate.high, rate.failures, rate.simulations
 
 
-def _told(rate: Rate | None) -> str:
+def _describe_precision(rate: Rate | None) -> str:
     if rate is None:
         return "no measured row inside"
     return (

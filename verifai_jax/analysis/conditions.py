@@ -6,15 +6,13 @@ masspole > 0.31
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.columns import Column
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,8 @@ class Between:
     upto: float = np.inf
     integer: bool = False
 
-    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
-        """Which rows fulfil the condition."""
+    def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+        """Return the rows that fulfil the condition."""
         values = frame[self.feature].to_numpy(np.float64)
         return (values > self.above) & (values <= self.upto)
 
@@ -56,8 +54,8 @@ class OneOf:
         """Name of the column."""
         return self.column.name
 
-    def matches(self, frame: "pd.DataFrame") -> Bool[np.ndarray, " n"]:
-        """Which rows fulfil the condition."""
+    def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+        """Return the rows that fulfil the condition."""
         return np.isin(self.column.codes(frame[self.feature]), self.places)
 
     def __str__(self) -> str:
@@ -88,7 +86,7 @@ class Region:
     def covers(
         self, values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"]
     ) -> Bool[np.ndarray, " n"]:
-        """Which rows lie inside; absent entries only where nothing is asked of them."""
+        """Return the rows that lie inside; absent entries only in columns without a condition."""
         inside = np.ones(len(values), bool)
         for j, (above, upto) in enumerate(zip(self.above, self.upto, strict=True)):
             if np.isfinite(above):
@@ -102,27 +100,27 @@ class Region:
 
     @property
     def size(self) -> int:
-        """On how many columns it has conditions."""
+        """Number of columns with conditions."""
         ends = zip(self.above, self.upto, strict=True)
         bounded = sum(bool(np.isfinite(above) or np.isfinite(upto)) for above, upto in ends)
         return bounded + sum(allowed is not None for allowed in self.allowed)
 
-    def bounded(self, j: int, above: float = -np.inf, upto: float = np.inf) -> "Region":
-        """The part of the region with a further bound on ordered column `j`."""
+    def bound(self, j: int, above: float = -np.inf, upto: float = np.inf) -> "Region":
+        """Return the part of the region with a further bound on ordered column `j`."""
         return replace(
             self,
             above=_put(self.above, j, max(self.above[j], above)),
             upto=_put(self.upto, j, min(self.upto[j], upto)),
         )
 
-    def restricted(self, j: int, places: frozenset[int]) -> "Region":
-        """The part of the region with these choices of unordered column `j` only."""
+    def restrict(self, j: int, places: frozenset[int]) -> "Region":
+        """Return the part of the region with these choices of unordered column `j` only."""
         before = self.allowed[j]
         places = places if before is None else before & places
         return replace(self, allowed=_put(self.allowed, j, places))
 
-    def loosened(self) -> list["Region"]:
-        """The regions with one bound or restriction less."""
+    def loosen(self) -> list["Region"]:
+        """Return the regions with one bound or restriction less."""
         found = []
         for j in range(len(self.above)):
             if np.isfinite(self.above[j]):
@@ -134,14 +132,17 @@ class Region:
                 found.append(replace(self, allowed=_put(self.allowed, j, None)))
         return found
 
-    def rounded(
+    def round(
         self,
         values: Float[np.ndarray, "n k"],
         codes: Int[np.ndarray, "n m"],
         integer: Sequence[bool],
     ) -> "Region":
-        """The region in short numbers, which covers the same of these rows.
+        """Round the bounds to short numbers, so that the region covers the same of these rows.
 
+        **Arguments:**
+
+        - `values` and `codes` of the rows.
         - `integer`: for each ordered column, whether it holds whole numbers only.
         """
         region = self
@@ -153,16 +154,16 @@ class Region:
                 open_end = -np.inf if ends == "above" else np.inf
                 without = replace(region, **{ends: _put(getattr(region, ends), j, open_end)})
                 # Only rows that fulfil all else can tell where the bound is.
-                seen = np.unique(values[without.covers(values, codes), j])
-                seen = seen[~np.isnan(seen)]
-                moved = _between_values(end, seen, integer[j])
+                present = np.unique(values[without.covers(values, codes), j])
+                present = present[~np.isnan(present)]
+                moved = _between_values(end, present, integer[j])
                 region = replace(region, **{ends: _put(getattr(region, ends), j, moved)})
         return region
 
     def conditions(
         self, ordered: Sequence[Column], unordered: Sequence[Column]
     ) -> tuple[Condition, ...]:
-        """The region in words, one condition a column."""
+        """Return the conditions of the region, one for each column."""
         found: list[Condition] = []
         for column, above, upto in zip(ordered, self.above, self.upto, strict=True):
             if np.isfinite(above) or np.isfinite(upto):
@@ -174,12 +175,12 @@ class Region:
 
 
 def everywhere(ordered: int, unordered: int) -> Region:
-    """The region without any condition."""
+    """Return the region without any condition."""
     return Region((-np.inf,) * ordered, (np.inf,) * ordered, (None,) * unordered)
 
 
 def short_number(least: float, below: float, near: float) -> float:
-    """The number with fewest decimals in `[least, below)`; the one closest to `near` of them.
+    """Return the number with fewest decimals in `[least, below)`, of those the closest to `near`.
 
     >>> short_number(0.3071, 0.3164, 0.31175)
     0.31
@@ -194,13 +195,13 @@ def short_number(least: float, below: float, near: float) -> float:
     return least
 
 
-def _between_values(end: float, seen: Float[np.ndarray, " n"], integer: bool) -> float:
-    """A short number that parts the values seen as `end` does."""
-    place = int(np.searchsorted(seen, end, side="right"))
-    if place in (0, len(seen)):
+def _between_values(end: float, values: Float[np.ndarray, " n"], integer: bool) -> float:
+    """Return a short number that divides values as `end` does."""
+    place = int(np.searchsorted(values, end, side="right"))
+    if place in (0, len(values)):
         # All values are on one side: no bound at all, as far as these rows can tell.
         return -np.inf if place == 0 else np.inf
-    least, below = float(seen[place - 1]), float(seen[place])
+    least, below = float(values[place - 1]), float(values[place])
     return float(np.floor(least)) if integer else short_number(least, below, (least + below) / 2)
 
 

@@ -5,7 +5,6 @@ Its radius is their dispersion: Niederreiter, Random number generation and quasi
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,9 +12,13 @@ from jaxtyping import Float
 from verifai_jax.analysis.data.marginals import Marginal
 
 PROBES = 4096
-REFINED = 4
-MOST_TREE = 8  # Dimensions up to which a tree finds neighbours faster than brute force.
+"""Points at which the distance to the nearest point is computed."""
+REFINEMENTS = 4
+"""Rounds of closer probes around the best one."""
+MOST_TREE = 8
+"""Dimensions up to which a tree finds neighbours faster than brute force."""
 BLOCK = 4096
+"""Points that distances are computed from at once."""
 
 
 def largest_hole(
@@ -24,11 +27,16 @@ def largest_hole(
     seed: int,
     among: Float[np.ndarray, "m k"] | None = None,
 ) -> tuple[float, Float[np.ndarray, " k"]]:
-    """The greatest distance of a probe to its nearest point, and that probe.
+    """Return the greatest distance of a probe to its nearest point, and that probe.
 
     Probes are 4096 points of a Sobol sequence, then more and more closely around the best; 1024 in
     more than 8 dimensions.
 
+    **Arguments:**
+
+    - `points`: in the unit cube.
+    - `parts`: the prior distributions of their columns.
+    - `seed`: of the probes.
     - `among`: the only points that may be probes, where not all of the cube is allowed.
     """
     from scipy.spatial import KDTree
@@ -39,17 +47,17 @@ def largest_hole(
         distance = np.asarray(KDTree(points).query(among)[0])
         return float(distance.max()), among[int(np.argmax(distance))]
     probes = qmc.Sobol(k, rng=seed).random(PROBES if k <= MOST_TREE else PROBES // 4)
-    probes = np.stack([part.snapped(probes[:, j]) for j, part in enumerate(parts)], axis=1)
+    probes = np.stack([part.snap(probes[:, j]) for j, part in enumerate(parts)], axis=1)
     probes = probes if among is None else among[: len(probes)]
     if k <= MOST_TREE:
         tree = KDTree(points)
         distance = np.asarray(tree.query(probes)[0])
         best, radius = int(np.argmax(distance)), float(distance.max())
-        for _ in range(REFINED):
+        for _ in range(REFINEMENTS):
             # Closer and closer around the emptiest place so far, which stays among the probes.
             radius /= 2
             near = np.clip(probes[best] + radius * (2 * probes[: PROBES // 4] - 1), 0, 1)
-            near = [part.snapped(near[:, j]) for j, part in enumerate(parts)]
+            near = [part.snap(near[:, j]) for j, part in enumerate(parts)]
             probes = np.concatenate([probes[best : best + 1], np.stack(near, axis=1)])
             distance = np.asarray(tree.query(probes)[0])
             best = int(np.argmax(distance))
@@ -67,6 +75,8 @@ def largest_hole(
     return float(distance[place]), probes[place]
 
 
-def alike(parts: Sequence[Marginal], generator: Any, n: int) -> Float[np.ndarray, "n k"]:
-    """Uniform samples of the same columns."""
-    return np.stack([part.snapped(generator.random(n)) for part in parts], axis=1)
+def uniform_points(
+    parts: Sequence[Marginal], generator: np.random.Generator, n: int
+) -> Float[np.ndarray, "n k"]:
+    """Draw uniform samples of the same columns."""
+    return np.stack([part.snap(generator.random(n)) for part in parts], axis=1)

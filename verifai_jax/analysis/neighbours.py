@@ -1,4 +1,4 @@
-"""Rows that are near: to each other, or to given features; and rows drawn at random.
+"""Rows near each other or near given features, and rows drawn at random.
 
     k_closest(run, 5)                      the tightest group of five counterexamples
     nearest(run, {"x": 0.1, "alg": "sac"}, 5)
@@ -11,15 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Float, Int, Key
+import pandas as pd
+from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.samples import (
     Samples,
     Scale,
+    Seed,
+    Source,
     Which,
     beside,
     distances,
@@ -28,12 +30,10 @@ from verifai_jax.analysis.data.samples import (
 from verifai_jax.analysis.tightest import tightest
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Neighbours:
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
     in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
-    which they lie, None if that is no row.
+    which they lie, None if that is no row; `how`: how they were chosen, in words.
     """
 
     samples: Samples
@@ -52,15 +52,20 @@ class Neighbours:
     how: str
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
-        import pandas as pd
-
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return beside(self.samples.at(self.rows), own)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the rows among the others, over the two features that vary most; the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the rows among the others, over the two features that vary most.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.neighbours", "plot_neighbours")(self, path)
 
     def __len__(self) -> int:
@@ -74,21 +79,28 @@ class Neighbours:
 
 
 def k_closest(
-    source: Any,
+    source: Source,
     k: int | None,
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Neighbours:
-    """The tightest group: a row and its `k - 1` nearest, whose distances to it sum up to least.
+    """Select the tightest group: a row and its `k - 1` nearest, of the least sum of distances.
 
-    - `source`, `columns`, `which`, `space`: as in `Samples.of`. Unordered columns count 1 where
-      they differ; VerifAI leaves them out and includes `rho`: name the columns for that.
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
+      Unordered columns count 1 where they differ; VerifAI leaves them out and includes `rho`:
+      name the columns for that.
     - `k`: how many; None or more than there are gives all.
     - `scale`: as in `Samples.scaling`; `"rows"` is VerifAI's.
 
+    **Returns:** `Neighbours`, the nearest first.
+
     Takes about `n log n` steps over up to 20 ordered columns, `n^2` over more; see `tightest.py`.
+
     **Raises:** `ValueError` for a `k` below 1.
     """
     samples = Samples.of(source, which, columns, space)
@@ -111,24 +123,30 @@ def _middle(rows: tuple[np.ndarray, np.ndarray]) -> int:
 
 
 def nearest(
-    source: Any,
-    point: "Mapping[str, Any] | pd.Series | int",
+    source: Source,
+    point: Mapping[str, Any] | pd.Series | int | np.integer,
     k: int = 1,
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Neighbours:
-    """The `k` rows nearest to a point, the nearest first.
+    """Select the `k` rows nearest to a point, the nearest first.
 
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
     - `point`: features (a mapping with all analysed columns, or a row of a table), or the number of
       a row of the table, which need not be among those looked at.
+    - `k`: how many; all rows if there are no more.
+    - `scale`: as in `Samples.scaling`.
+
+    **Returns:** `Neighbours`, the nearest first.
 
     **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or none of the choices;
     `IndexError` for a row number that is not in the table.
     """
-    import pandas as pd
-
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))
     if isinstance(point, int | np.integer):
@@ -149,14 +167,26 @@ def nearest(
 
 
 def random_rows(
-    source: Any,
+    source: Source,
     k: int,
-    seed: "int | Key[jax.Array, '']",
+    seed: Seed,
     which: Which = "counterexamples",
     columns: Sequence[str] | None = None,
     space: Problem | FeatureSpace | None = None,
 ) -> Neighbours:
-    """`k` different rows, each as likely as any other; all of them if there are no more."""
+    """Draw `k` different rows, each as likely as any other; all of them if there are no more.
+
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
+    - `k`: how many.
+    - `seed`: an integer, a NumPy generator or a `jax.random` key.
+
+    **Returns:** `Neighbours`, in the order drawn.
+
+    **Raises:** `ValueError` for a `k` below 1.
+    """
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))
     chosen = generator(seed).permutation(len(samples))[:k]

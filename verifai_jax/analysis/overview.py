@@ -11,26 +11,24 @@ import html
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from verifai_jax.analysis._coverage import coverage
+from verifai_jax.analysis._frequent_patterns import frequent_patterns
 from verifai_jax.analysis._importance import importance
 from verifai_jax.analysis._pca import pca
 from verifai_jax.analysis._rules import rules
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.analysis.frequent_patterns import recurrent
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features
 from verifai_jax.falsification.run import Run
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.falsification.table import ErrorTable
 
 FEWEST = 4
 MOST_TO_CLUSTER = 2000
@@ -42,7 +40,7 @@ TITLES = {
     "importance": "What it depends on",
     "clusters": "Kinds of failures",
     "pca": "Directions in which failures vary",
-    "recurrent": "Recurrent values of failures",
+    "frequent_patterns": "Frequent patterns of failures",
     "coverage": "Coverage of the space",
 }
 
@@ -63,7 +61,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Analysis:
-    """What the error table of a run says.
+    """All analyses of the error table of a run.
 
     **Fields:** `name` of the run; `parts` in the order of the report; `samples`: the rows with a
     verdict, None if there are none.
@@ -93,19 +91,25 @@ class Analysis:
         return [int(row) for row in found.table[column][found.table.index >= 0]]
 
     @property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """One row a feature: importance, range over the failures, cells covered."""
         return _features(self)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the failures over the two most important features; returns the figure.
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the failures over the two most important features.
 
         With the boxes of the rules, the representatives of clusters, and the importances as bars.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
         """
         return late("verifai_jax.plotting.overview", "plot_overview")(self, path)
 
     def save(self, folder: str | Path) -> Path:
-        """Write `report.md` and pictures to a folder; returns the report.
+        """Write `report.md` and pictures to a folder; return the path of the report.
 
         **Raises:** `FileExistsError` where the folder's name is that of a file.
         """
@@ -144,12 +148,17 @@ class Analysis:
         return "\n".join(parts)
 
 
-def analyze(source: "Run | ErrorTable | pd.DataFrame", *, seed: int = 0) -> Analysis:
+def analyze(source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0) -> Analysis:
     """Apply every analysis of the error table that fits it, and say why others do not.
 
-    - `source`: a run, its table, or a DataFrame with feature columns.
+    **Arguments:**
 
-    Failures, rules, importance of features, clusters, principal components, recurrent values,
+    - `source`: a run, its table, or a DataFrame with feature columns.
+    - `seed`: of all that is drawn at random.
+
+    **Returns:** an `Analysis`.
+
+    Failures, rules, importance of features, clusters, principal components, frequent patterns,
     coverage; nothing is simulated. More than 2000 failures are thinned out, by `seed`, before they
     are clustered.
 
@@ -162,31 +171,31 @@ def analyze(source: "Run | ErrorTable | pd.DataFrame", *, seed: int = 0) -> Anal
         words = f"nothing to analyse: {error}"
         return Analysis(name, (Part("failures", words),), None)
     failures = int(samples.failing.sum())
-    parts = [Part("failures", _failures(source, samples))]
+    parts = [Part("failures", _describe_failures(source, samples))]
     for analysis, reason, found in (
         ("rules", _too_few(failures), lambda: rules(source, seed=seed)),
         ("importance", "", lambda: importance(source, seed=seed)),
         ("clusters", _too_few(failures), lambda: clusters(_thinned(samples, seed), seed=seed)),
         ("pca", _too_few(failures), lambda: pca(_failing(samples))),
-        ("recurrent", _no_choices(samples), lambda: recurrent(_failing(samples))),
+        ("frequent_patterns", _no_choices(samples), lambda: frequent_patterns(_failing(samples))),
         ("coverage", "", lambda: coverage(source, seed=seed)),
     ):
         parts.append(_part(analysis, reason, found))
     return Analysis(name, tuple(parts), samples)
 
 
-def _part(name: str, reason: str, found: Callable[[], Any]) -> Part:
+def _part(name: str, reason: str, analysis: Callable[[], Any]) -> Part:
     if reason:
         return Part(name, f"skipped: {reason}")
     try:
-        result = found()
+        result = analysis()
     except ValueError as error:
         # Every analysis says what it lacks; here that is a line of the report.
         return Part(name, f"skipped: {error}")
     return Part(name, str(result), result)
 
 
-def _failures(source: Any, samples: Samples) -> str:
+def _describe_failures(source: object, samples: Samples) -> str:
     rows, failures = len(samples.table), int(samples.failing.sum())
     lines = [f"{failures:,} of {rows:,} simulations violate the property"]
     if len(samples) < rows:
@@ -241,9 +250,7 @@ def _no_choices(samples: Samples) -> str:
     return "" if samples.failing.any() else "no row fails"
 
 
-def _features(found: Analysis) -> "pd.DataFrame":
-    import pandas as pd
-
+def _features(found: Analysis) -> pd.DataFrame:
     names = [] if found.samples is None else list(found.samples.names)
     table = pd.DataFrame(index=pd.Index(names, name="feature"))
     if (weighed := found["importance"] if names else None) is not None:

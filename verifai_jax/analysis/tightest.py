@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-# A k-d tree looks at nearly every point in more dimensions than this.
 _MOST_DIMENSIONS = 20
+"""Dimensions beyond which a k-d tree looks at nearly every point."""
 _ENTRIES = 20_000_000
+"""Entries of the arrays of a block at most."""
 
 
 def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"], k: int) -> int:
-    """The place of a row whose `k` nearest, itself included, have the least summed distance.
+    """Return the place of a row whose `k` nearest, itself included, have the least summed distance.
 
     The squared distance is that of the coordinates plus the number of different codes.
     """
@@ -47,7 +48,7 @@ def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"
 
 
 def _groups(codes: np.ndarray) -> Iterator[np.ndarray]:
-    """Places of the rows with the same codes."""
+    """Yield the places of rows with the same codes, group by group."""
     if codes.shape[1] == 0:
         yield np.arange(len(codes))
         return
@@ -60,7 +61,7 @@ def _groups(codes: np.ndarray) -> Iterator[np.ndarray]:
 def _within(
     coordinates: np.ndarray, weights: np.ndarray, k: int, alone: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least sums that rows of a group can have, and whether they do have them.
+    """Bound the sums of distances of the rows of a group; return whether the bounds are exact.
 
     Unless the group is `alone`, neighbours farther than 1, and those that it lacks, may be rows of
     other groups at a distance of 1.
@@ -87,7 +88,7 @@ def _within(
 
 
 def _taken(weights: Int[np.ndarray, "n k"], k: int) -> Int[np.ndarray, "n k"]:
-    """How many of each neighbour, the nearest first, are among the `k` nearest rows."""
+    """Count how many of each neighbour, the nearest first, are among the `k` nearest rows."""
     behind = np.cumsum(weights, axis=1) - weights
     return np.clip(k - behind, 0, weights)
 
@@ -101,7 +102,7 @@ def _tree(coordinates: np.ndarray) -> Any:
 def _nearest_of_all(
     coordinates: np.ndarray, codes: np.ndarray, some: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and places of the `k` nearest of `some` rows, by looking at all."""
+    """Return distances and places of the `k` nearest of `some` rows, by comparing them with all."""
     # From the middle of the cloud, so that its place costs no digits.
     centred = coordinates - coordinates.mean(axis=0)
     squares = (centred**2).sum(axis=1)

@@ -17,7 +17,7 @@ MOST_ENTRIES = 500_000
 """Rows times columns that a tree is made from."""
 
 
-def proposals(
+def propose_regions(
     start: Region,
     values: Float[np.ndarray, "n k"],
     codes: Int[np.ndarray, "n m"],
@@ -25,7 +25,7 @@ def proposals(
     unordered: tuple[Column, ...],
     depth: int,
 ) -> list[Region]:
-    """Parts of `start`: all nodes of trees that weigh failing rows as they are, or like safe ones.
+    """Propose parts of `start`: all nodes of trees that weigh failing rows as they are, or evenly.
 
     The rows are those inside `start`.
     """
@@ -36,9 +36,9 @@ def proposals(
     matrix, meanings = _encoded(values, codes, failing, unordered)
     if not matrix.shape[1]:
         return []
-    rows = _few(failing, int(MOST_ENTRIES // matrix.shape[1]))
+    rows = _limit_rows(failing, int(MOST_ENTRIES // matrix.shape[1]))
     leaf = int(np.clip(failing[rows].sum() // 10, 1, 5))
-    found: list[Region] = []
+    regions: list[Region] = []
     for weight in (None, "balanced"):
         tree = DecisionTreeClassifier(
             max_depth=depth, min_samples_leaf=leaf, class_weight=weight, random_state=0
@@ -48,17 +48,17 @@ def proposals(
         while stack:
             node, region = stack.pop()
             if node:
-                found.append(region)
+                regions.append(region)
             if nodes.children_left[node] < 0:
                 continue
             column, edge = meanings[nodes.feature[node]], nodes.threshold[node]
             stack.append((nodes.children_right[node], _part(region, column, edge, upper=True)))
             stack.append((nodes.children_left[node], _part(region, column, edge, upper=False)))
-    return found
+    return regions
 
 
-def _few(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
-    """Rows that trees are made from where there are too many: rare verdicts are kept."""
+def _limit_rows(failing: Bool[np.ndarray, " n"], most: int) -> Int[np.ndarray, " k"]:
+    """Return rows to make trees from, `most` at most; rare verdicts are kept."""
     if len(failing) <= most:
         return np.arange(len(failing))
     parts = []
@@ -73,7 +73,7 @@ def _encoded(
     failing: Bool[np.ndarray, " n"],
     unordered: tuple[Column, ...],
 ) -> tuple[Float[np.ndarray, "n e"], list[tuple[int, Any]]]:
-    """Columns that a tree can split, and what each means.
+    """Return columns that a tree can split, and the meaning of each.
 
     An ordered column stands for itself. An unordered one is given by a column for each choice, and
     by its choices ranked by their share of failures: a cut in that order is the best subset.
@@ -83,9 +83,9 @@ def _encoded(
     for j, column in enumerate(unordered):
         count = len(column.choices)
         present = codes[:, j] >= 0
-        seen = np.bincount(codes[present, j], minlength=count)
+        counts = np.bincount(codes[present, j], minlength=count)
         bad = np.bincount(codes[present & failing, j], minlength=count)
-        ranks = np.argsort(np.argsort(bad / np.maximum(seen, 1), kind="stable"), kind="stable")
+        ranks = np.argsort(np.argsort(bad / np.maximum(counts, 1), kind="stable"), kind="stable")
         columns.append(np.where(present, ranks[np.maximum(codes[:, j], 0)], -1).astype(float))
         meanings.append((j, ranks))
         if count <= MOST_ONE_HOT:
@@ -98,5 +98,5 @@ def _encoded(
 def _part(region: Region, column: tuple[int, Any], edge: float, *, upper: bool) -> Region:
     j, ranks = column
     if ranks is None:
-        return region.bounded(j, above=edge) if upper else region.bounded(j, upto=edge)
-    return region.restricted(j, frozenset(np.flatnonzero((ranks > edge) == upper).tolist()))
+        return region.bound(j, above=edge) if upper else region.bound(j, upto=edge)
+    return region.restrict(j, frozenset(np.flatnonzero((ranks > edge) == upper).tolist()))

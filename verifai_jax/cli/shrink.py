@@ -1,6 +1,7 @@
 """`verifai-jax shrink runs/balance-1`: the least departure from nominal that still fails."""
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -13,8 +14,8 @@ from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, SEED,
 @PROBLEM
 @click.option(
     "--by",
-    type=click.Choice(["few", "small"]),
-    default="few",
+    type=click.Choice(["count", "distance"]),
+    default="count",
     show_default=True,
     help="Fewest features first, or least distance first.",
 )
@@ -32,7 +33,7 @@ def shrink(
     folder: Path,
     row: int | None,
     target: str | None,
-    by: str,
+    by: Literal["count", "distance"],
     budget: int,
     seed: int,
     others: bool,

@@ -1,29 +1,34 @@
-"""Whether the counterexamples of a run are real.
+"""The confirmation of counterexamples by finer replays.
 
     print(confirm(run, run.best))                       # one row, in words
-    confirm(run).frame                                  # all of them, a row each
+    confirm(run).table                                  # all of them, a row each
     confirm(run, 12, simulator="native")                # also by another simulator
 
 `verifai_jax.evaluation.confirmation` says what is checked.
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypeAlias, overload
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.confirmation import IN_WORDS, MOST, VERDICTS, Checked, Confirmer
 from verifai_jax.falsification.run import Run
-
-if TYPE_CHECKING:
-    import pandas as pd
+from verifai_jax.problem.problem import Problem
 
 BLOCK = 128
 """Rows of a run that are checked at once; what is finished survives Ctrl-C."""
 SHOWN = 5
+"""Doubtful rows listed in words."""
+
+Simulator: TypeAlias = Callable[..., Any] | Problem | str | None
+"""A system, a problem with one, or the name of a backend."""
 
 MEANING = {
     "confirmed": "it fails in every replay",
@@ -36,10 +41,18 @@ MEANING = {
 
 @dataclass(frozen=True, repr=False)
 class Confirmation:
-    """What replays say of one counterexample; see `confirmation.Checked` for the parts.
+    """The verdict of finer replays on one counterexample.
 
+    **Fields:**
+
+    - `name`: of the problem.
     - `row`: its number in the table; None for features without one.
+    - `verdict`: `"confirmed"`, `"fragile"`, `"refuted"` or `"unchecked"`.
     - `rho`: robustness `as_run`, NaN where that is not known, and of each check by name.
+    - `band`: how far the robustness moved between the replays.
+    - `why`: the reason of the verdict, in words.
+    - `notes`: checks that could not be made, and why.
+    - `precision`: of the run.
     """
 
     name: str
@@ -53,59 +66,62 @@ class Confirmation:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the counterexample may be claimed."""
+        """Whether the counterexample failed in every replay."""
         return self.verdict == "confirmed"
 
     def __str__(self) -> str:
         which = f"row {self.row} of {self.name}" if self.row is not None else f"{self.name}"
-        told = f"{which}: {self.verdict}, {MEANING[self.verdict]}"
+        text = f"{which}: {self.verdict}, {MEANING[self.verdict]}"
         if self.why and self.why not in self.notes:
-            told += f": {self.why}"
+            text += f": {self.why}"
         words = {"as_run": f"as run ({self.precision})", **IN_WORDS}
         values = [f"{rho:.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
-        told += f". Robustness {', '.join(values)}" if values else ""
-        return ". ".join([told, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
+        text += f". Robustness {', '.join(values)}" if values else ""
+        return ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
 
     __repr__ = __str__
 
 
 @dataclass(frozen=True, eq=False)
 class Confirmations:
-    """What replays say of all counterexamples of a run.
+    """The verdicts of finer replays on all counterexamples of a run.
 
-    - `frame`: a row each, indexed by row number: `verdict`,
-      `rho` as run, `rho.NAME` of each check, `band`, `why`.
-    - `notes`: which checks could not be made, and why.
+    **Fields:**
+
+    - `name`: of the problem.
+    - `table`: a row each, indexed by row number: `verdict`, `rho` as run, `rho.NAME` of each check,
+      `band`, `why`.
+    - `notes`: checks that could not be made, and why.
     """
 
     name: str
-    frame: "pd.DataFrame" = field(repr=False)
+    table: pd.DataFrame = field(repr=False)
     notes: tuple[str, ...]
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many rows have which verdict, those that occur."""
-        counted = Counter(self.frame["verdict"])
+        """Number of rows with each verdict that occurs."""
+        counted = Counter(self.table["verdict"])
         return {verdict: counted[verdict] for verdict in VERDICTS if counted[verdict]}
 
     @property
-    def confirmed(self) -> "pd.DataFrame":
-        """The rows that may be claimed."""
-        return self.frame.loc[self.frame["verdict"] == "confirmed"]
+    def confirmed(self) -> pd.DataFrame:
+        """The rows that fail in every replay."""
+        return self.table.loc[self.table["verdict"] == "confirmed"]
 
     def __len__(self) -> int:
-        return len(self.frame)
+        return len(self.table)
 
     def __str__(self) -> str:
         if not len(self):
             return f"{self.name}: no counterexample to confirm"
         counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items())
         lines = [f"{self.name}: of {_counted(len(self))}, {counts}"]
-        doubtful = self.frame.loc[~self.frame["verdict"].isin(["confirmed", "unexamined"])]
+        doubtful = self.table.loc[~self.table["verdict"].isin(["confirmed", "unexamined"])]
         for row, entry in doubtful.head(SHOWN).iterrows():
             lines.append(f"  row {row} {entry['verdict']}: {entry['why']}")
         if len(doubtful) > SHOWN:
-            lines.append(f"  and {len(doubtful) - SHOWN} more: see .frame")
+            lines.append(f"  and {len(doubtful) - SHOWN} more: see .table")
         lines += [f"  note: {note}" for note in self.notes]
         if len(self.confirmed):
             worst = self.confirmed["rho"].idxmin()
@@ -118,18 +134,31 @@ class Confirmations:
     __repr__ = __str__
 
 
+@overload
+def confirm(
+    run: Run, row: None = None, *, simulator: Simulator = None, most: int = MOST
+) -> Confirmations: ...
+@overload
+def confirm(
+    run: Run,
+    row: int | np.integer | pd.Series | Mapping[str, Any],
+    *,
+    simulator: Simulator = None,
+    most: int = MOST,
+) -> Confirmation: ...
 @suggests_options
 def confirm(
     run: Run,
-    row: "int | pd.Series | Mapping[str, Any] | None" = None,
+    row: Row = None,
     *,
-    simulator: Any = None,
+    simulator: Simulator = None,
     most: int = MOST,
-) -> Any:
-    """Replay counterexamples more finely than they were found, and say which are real.
+) -> Confirmation | Confirmations:
+    """Replay counterexamples more finely than they were found, and decide which are real.
 
     **Arguments:**
 
+    - `run`: a run of a problem.
     - `row`: a row number, a row of the table, or a mapping with its feature columns; all
       counterexamples of the table when left out.
     - `simulator`: another system for the same features and signals, a problem with one, or the
@@ -137,7 +166,7 @@ def confirm(
     - `most`: how many rows are replayed at least; of more, those nearest to zero, until the rest
       is far from it (see `confirmation.Confirmer`).
 
-    A `Confirmation` for a row, `Confirmations` for all. Ctrl-C returns what is finished.
+    **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 
     **Raises:** `ValueError` for a run without its problem, a row that is no counterexample, a
     simulator that does not fit; `IndexError` for a row that is not in the table.
@@ -155,7 +184,9 @@ def confirm(
     return _one(run, confirmer, row)
 
 
-def _one(run: Run, confirmer: Confirmer, row: Any) -> Confirmation:
+def _one(
+    run: Run, confirmer: Confirmer, row: int | np.integer | pd.Series | Mapping[str, Any]
+) -> Confirmation:
     number: int | None
     if isinstance(row, (int, np.integer)):
         if not 0 <= row < len(run.table):
@@ -163,8 +194,9 @@ def _one(run: Run, confirmer: Confirmer, row: Any) -> Confirmation:
         number, values = int(row), run.table.all.iloc[int(row)]
     else:
         number, values = getattr(row, "name", None), row
-    _check_fails(number, values)
-    columns = {str(name): np.asarray([value]) for name, value in values.items()}
+    entries = {str(name): value for name, value in values.items()}
+    _check_fails(number, entries)
+    columns = {name: np.asarray([value]) for name, value in entries.items()}
     checked = confirmer(columns, [0 if number is None else number])
     rho = {"as_run": float(columns["rho"][0]) if "rho" in columns else float("nan")}
     rho |= {name: float(values[0]) for name, values in checked.rho.items()}
@@ -174,7 +206,7 @@ def _one(run: Run, confirmer: Confirmer, row: Any) -> Confirmation:
     )  # fmt: skip
 
 
-def _check_fails(number: int | None, values: Any) -> None:
+def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
     """Refuse a row of the table that did not fail."""
     if "status" not in values or "violated" not in values:
         return
@@ -191,8 +223,6 @@ def _check_fails(number: int | None, values: Any) -> None:
 
 
 def _all(run: Run, confirmer: Confirmer) -> Confirmations:
-    import pandas as pd
-
     failing = run.table.counterexamples
     numbers, rho = failing.index.to_numpy(), failing["rho"].to_numpy(np.float64)
     columns = {str(name): failing[name].to_numpy() for name in failing.columns}
@@ -221,7 +251,9 @@ def _all(run: Run, confirmer: Confirmer) -> Confirmations:
     return Confirmations(run.name, frame, (*notes, *stopped))
 
 
-def _placed(parts: list[tuple[np.ndarray, Checked]], count: int, column: Any) -> np.ndarray:
+def _placed(
+    parts: list[tuple[np.ndarray, Checked]], count: int, column: Callable[[Checked], np.ndarray]
+) -> Float[np.ndarray, " n"]:
     values = np.full(count, np.nan)
     for block, checked in parts:
         values[block] = column(checked)

@@ -1,15 +1,16 @@
-"""Why a row fails: which predicate, when, and which features matter, for people.
+"""The reasons of a failure: the predicate, the instant, and the features that matter.
 
     why = explain(run)                                  # the worst row
     print(why)                                          # a paragraph
     why.plot("why.png")                                 # the signal, and the features beside it
 
-Which predicate and when: `mtl.explain` on the replayed trace. Which features: each back at its
-nominal value, all others as they are, and the slope of the robustness where there is one.
+Predicate and instant come from `mtl.explain` on the replayed trace. Features are judged by the
+robustness with each back at its nominal value, all others as they are, and by its gradient.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,15 +18,17 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
-from verifai_jax.counterexamples.candidates import Judge
+from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
-from verifai_jax.counterexamples.fixed_key import with_key_of
+from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.influence import Influence, spans_of
 from verifai_jax.counterexamples.nominal import Nominal
-from verifai_jax.counterexamples.selection import problem_of, row_of
+from verifai_jax.counterexamples.selection import Row, problem_of, select_row
 from verifai_jax.falsification.run import Replay, Run, replay
+from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Explanation
 
 MATTERS = 0.05
@@ -34,7 +37,7 @@ MATTERS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """Why a row fails; `str()` is a paragraph, `plot` a picture.
+    """Reasons of a failure; `str()` is a paragraph, `plot` a picture.
 
     **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:
     the predicate, the instant and the path (`mtl.Explanation`); `influences`: the features, the one
@@ -51,7 +54,7 @@ class Explained:
     notes: tuple[str, ...] = ()
 
     def effect(self, influence: Influence) -> float:
-        """By how much a feature moves the robustness: back at nominal, or else by its slope."""
+        """Return the change of the robustness by a feature: back at nominal, or by its gradient."""
         return influence.effect(self.rho)
 
     @property
@@ -62,8 +65,15 @@ class Explained:
             i for i in self.influences if i.gone or abs(self.effect(i)) > MATTERS * max(most, 1e-12)
         )
 
-    def plot(self, path: Any = None) -> Any:
-        """Draw the deciding signal with its bound and instant, and the features; the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the deciding signal with its bound and instant, and the features.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.counterexamples", "plot_explanation")(self, path)
 
     def __str__(self) -> str:
@@ -76,8 +86,8 @@ class Explained:
 
 
 @suggests_options
-def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = None) -> Explained:
-    """Why a counterexample fails: which predicate decides, when, and which features matter.
+def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = None) -> Explained:
+    """Explain a counterexample: the predicate that decides, when, and the features that matter.
 
     **Arguments:**
 
@@ -88,11 +98,13 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
     Takes one simulation for each feature and each unit coordinate, and one gradient. Without
     nominal features only the gradient tells what matters.
 
+    **Returns:** an `Explained`.
+
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
     is none, or has no verdict when simulated again.
     """
     problem = problem_of(run)
-    number, entry = row_of(run, row)
+    number, entry = select_row(run, row)
     notes = []
     try:
         at, known = Nominal.of(problem, nominal), True
@@ -100,15 +112,15 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
         if nominal:
             raise
         at, known = Nominal(problem.space, np.full(problem.space.dim, 0.5, np.float32)), False
-        notes.append("the problem does not say what is nominal: only slopes tell what matters")
-    seen = replay(problem, entry, run_keys(run.seed)[1], number, run.precision)
-    if not seen.violated:
+        notes.append("the problem does not say what is nominal: only gradients tell what matters")
+    replayed = replay(problem, entry, run_keys(run.seed)[1], number, run.precision)
+    if not replayed.violated:
         notes.append("simulated again alone the row does not fail; see what confirm says of it")
-    why = seen.explain()
-    keyed = with_key_of(problem, run, number)
+    why = replayed.explain()
+    fixed = fix_key(problem, run, number)
     features = problem.space.from_row(entry)
     u = at.settle(np.asarray(jax.jit(problem.space.flatten)(features))[None])[0]
-    judge = Judge(keyed, at, 10**9, run.precision)
+    candidates = Candidates(fixed, at, 10**9, run.precision)
     groups = at.groups
     singles = list(range(len(u)))
     points = np.repeat(u[None], 1 + len(groups) + len(singles), axis=0)
@@ -116,20 +128,20 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
         point[places] = at.u[places]
     for point, i in zip(points[1 + len(groups) :], singles, strict=True):
         point[i] = at.u[i]
-    rho, failing = judge(points if known else points[:1])
+    rho, failing = candidates(points if known else points[:1])
     if not known:
         rho = np.concatenate([rho, np.full(len(points) - 1, np.nan)])
         failing = np.concatenate([failing, np.ones(len(points) - 1, bool)])
     # A simulation without a verdict, or one that the constraint refuses, says nothing.
     rho[~np.isfinite(rho)] = np.nan
     spread = np.nanmax(np.abs(rho), initial=0.0)
-    # Near the hard robustness: the slope is told as a number.
-    judge.temperature = max(0.002 * float(spread), 1e-6)
-    linear = judge.linear(u[None])[0]
-    slope = np.full(len(u), np.nan) if linear is None else linear.slope
-    if judge.note:
-        notes.append(judge.note)
-    duration = float(np.asarray(seen.trace.clock())[-1])
+    # Near the hard robustness, since the gradient is reported as a number.
+    candidates.temperature = max(0.002 * float(spread), 1e-6)
+    tangent = candidates.tangents(u[None])[0]
+    gradient = np.full(len(u), np.nan) if tangent is None else tangent.gradient
+    if candidates.note:
+        notes.append(candidates.note)
+    duration = float(np.asarray(replayed.trace.clock())[-1])
     influences = []
     for n, (name, places) in enumerate(groups, start=1):
         one = 1 + len(groups) + places
@@ -147,17 +159,17 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
                 departs=bool(at.departs(u[None])[0, places].any()),
                 each=rho[one],
                 each_gone=tuple(bool(gone) for gone in safe[one]),
-                slope=slope[places],
+                gradient=gradient[places],
             )
         )
     explained = Explained(
         row=number,
-        formula=seen.worst,
-        rho=min(seen.rho.values()),
+        formula=replayed.worst,
+        rho=min(replayed.rho.values()),
         why=why,
         influences=tuple(influences),
-        simulations=judge.simulations + 1,
-        replay=seen,
+        simulations=candidates.simulations + 1,
+        replay=replayed,
         notes=tuple(notes),
     )
     ordered = sorted(influences, key=lambda i: (-i.gone, -abs(explained.effect(i))))
@@ -165,8 +177,8 @@ def explain(run: Run, row: Any = None, *, nominal: Mapping[str, Any] | None = No
     return explained
 
 
-def values_of(space: Any, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:
-    """The entries of the table's columns of one feature at a point."""
+def values_of(space: FeatureSpace, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:
+    """Return the entries of the table's columns of one feature at a point."""
     features = jax.tree.map(lambda leaf: np.asarray(leaf)[None], jax.jit(space.unflatten)(u))
     columns = space.domains[name].to_columns(features[name], name)
     return tuple(c[0].item() if isinstance(c[0], np.generic) else c[0] for c in columns.values())

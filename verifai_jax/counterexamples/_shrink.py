@@ -1,10 +1,10 @@
 """The least departure from nominal that still fails: a counterexample made small.
 
     small = shrink(run)                                 # from the worst row
-    small = shrink(run, 17, by="small", budget=5000)
+    small = shrink(run, 17, by="distance", budget=5000)
     print(small); small.features; small.replay().plot()
 
-As a property-testing library does with its failing example: first few features, then small values
+As a property-testing library does with its failing example: first the count, then the distance
 (MacIver and Donaldson, Test-case reduction via test-case generation, ECOOP 2020), with batches,
 and with gradients where there are some.
 """
@@ -12,7 +12,8 @@ and with gradients where there are some.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -20,30 +21,37 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
-from verifai_jax.counterexamples.candidates import Judge
-from verifai_jax.counterexamples.fixed_key import with_key_of
-from verifai_jax.counterexamples.minimize_count import fewest, grown, reduced
-from verifai_jax.counterexamples.minimize_distance import nearest
+from verifai_jax.counterexamples.candidates import Candidates
+from verifai_jax.counterexamples.fixed_key import fix_key
+from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
+from verifai_jax.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.counterexamples.nominal import Nominal
-from verifai_jax.counterexamples.selection import columns_at, other_failures, problem_of, row_of
+from verifai_jax.counterexamples.selection import (
+    Row,
+    columns_at,
+    problem_of,
+    select_others,
+    select_row,
+)
 from verifai_jax.falsification.run import Replay, Run, replay
 from verifai_jax.problem.problem import Problem
 
-ORDERS = ("few", "small")
-STARTS = 32
-"""Other counterexamples of the run that are looked at,"""
+ORDERS = ("count", "distance")
+OTHERS = 32
+"""Other counterexamples of the run to begin with, at most."""
 FOLLOWED = 5
-"""points that are followed along the boundary,"""
+"""Points that are followed along the boundary at once."""
 DESCENTS = 8
-"""and descents at once towards a failure elsewhere."""
+"""Descents at once towards a failure elsewhere."""
 AWAY = 0.002
-"""How much farther than the nearest failing point the result is, for rounding's sake."""
+"""Share by which the result is farther than the nearest failing point, for rounding's sake."""
 
 
 class Step(NamedTuple):
-    """What was known after so many simulations: departing coordinates, and their distance."""
+    """The least departure after so many simulations: its coordinates' number, and its distance."""
 
     simulations: int
     count: int
@@ -52,13 +60,14 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shrunk:
-    """The least departure from nominal that was found to fail.
+    """The least departure from nominal found to fail.
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
     margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
     name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
     coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
-    `simulations` spent; `by`: what was made least first; `history`; `notes` for people.
+    `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
+    `notes` for people.
     """
 
     problem: Problem
@@ -80,7 +89,7 @@ class Shrunk:
 
     @property
     def count(self) -> int:
-        """How many coordinates are not nominal."""
+        """Number of coordinates that are not nominal."""
         return len(self.changed)
 
     def replay(self, precision: str | None = None) -> Replay:
@@ -88,8 +97,15 @@ class Shrunk:
         columns = columns_at(self.problem, self.u)
         return replay(self.problem, columns, self.key, self.row, precision or self.precision)  # pyright: ignore[reportArgumentType]
 
-    def plot(self, path: Any = None) -> Any:
-        """Draw what departs, and the signals of the simulation; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the coordinates that depart, and the signal that breaks the property.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.counterexamples", "plot_shrunk")(self, path)
 
     def __str__(self) -> str:
@@ -125,24 +141,24 @@ class Shrunk:
 @suggests_options
 def shrink(
     run: Run,
-    row: Any = None,
+    row: Row = None,
     *,
     nominal: Mapping[str, Any] | None = None,
-    by: str = "few",
+    by: Literal["count", "distance"] = "count",
     budget: int = 2000,
     seed: int = 0,
     others: bool = True,
     stay: bool = False,
 ) -> Shrunk:
-    """The least departure from the nominal features that still fails.
+    """Search the least departure from the nominal features that still fails.
 
     **Arguments:**
 
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `by`: `"few"`: first the fewest coordinates that are not exactly nominal, then, with so many,
-      the least distance; `"small"`: the least distance, whatever their number. The distance is
+    - `by`: `"count"`: first the fewest coordinates that are not exactly nominal, then, with so
+      many, the least distance; `"distance"`: the least distance, whatever their number. It is
       Euclidean in unit coordinates, of which each is 1 over its whole range (by probability, for a
       distribution), between two choices 1, and by places in integers. Every control point of a
       signal and every component of a vector is a coordinate of its own.
@@ -164,34 +180,38 @@ def shrink(
     if by not in ORDERS:
         raise unknown_name("order", by, ORDERS)
     check_count("budget", budget)
-    number, first = row_of(run, row)
+    number, first = select_row(run, row)
     at = Nominal.of(problem, nominal)
-    problem = with_key_of(problem, run, number)
+    problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
-    seen = replay(problem, first, key, number, run.precision)
-    if not seen.violated:
-        told = f"robustness {min(seen.rho.values()):.4g}" if seen.status == 0 else seen.status.name
+    original = replay(problem, first, key, number, run.precision)
+    if not original.violated:
+        reason = (
+            f"robustness {min(original.rho.values()):.4g}"
+            if original.status == 0
+            else original.status.name
+        )
         raise ValueError(
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
-            f"({told}); see what confirm says of it, and shrink another"
+            f"({reason}); see what confirm says of it, and shrink another"
         )
     u = np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))
     start = at.settle(u[None])
     if stay:
-        at = at.on_the_side_of(start[0])
-    judge = Judge(problem, at, int(budget), run.precision)
-    shrinking = _Shrinking(judge, by, np.random.default_rng(seed))
-    points = np.concatenate([start, other_failures(run, at, number, STARTS)]) if others else start
+        at = at.restrict_to_side(start[0])
+    candidates = Candidates(problem, at, int(budget), run.precision)
+    search = _Search(candidates, by, np.random.default_rng(seed))
+    points = np.concatenate([start, select_others(run, at, number, OTHERS)]) if others else start
     notes = []
     try:
-        shrinking.search(points)
+        search.search(points)
     except KeyboardInterrupt:
         notes.append("interrupted: the least so far")
-    found = _verified(problem, shrinking, key, number, run.precision)
-    u = start[0] if found is None else found[0]
-    replayed = seen if found is None else found[1]
-    if judge.note:
-        notes.append(judge.note)
+    verified = _verified(problem, search, key, number, run.precision)
+    u = start[0] if verified is None else verified[0]
+    replayed = original if verified is None else verified[1]
+    if candidates.note:
+        notes.append(candidates.note)
     return Shrunk(
         problem=problem,
         row=number,
@@ -203,80 +223,83 @@ def shrink(
         nominal=at.u,
         start_count=int(at.count(start)[0]),
         start_distance=float(at.distance(start)[0]),
-        simulations=judge.simulations,
+        simulations=candidates.simulations,
         by=by,
         precision=run.precision,
-        history=tuple(shrinking.history),
+        history=tuple(search.history),
         notes=tuple(notes),
         key=key,
     )
 
 
-class _Shrinking:
-    """The order of things: what is few, what is near, and whether another mode is nearer."""
+class _Search:
+    """The order of a shrinking: fewer coordinates, a smaller distance, then other failures."""
 
-    def __init__(self, judge: Judge, by: str, rng: np.random.Generator) -> None:
-        self.judge, self.by, self.rng = judge, by, rng
+    def __init__(self, candidates: Candidates, by: str, rng: np.random.Generator) -> None:
+        self.candidates, self.by, self.rng = candidates, by, rng
         self.history: list[Step] = []
 
     def order(self, points: Float[np.ndarray, "n d"]) -> np.ndarray:
-        """Which come first."""
-        count, length = self.judge.nominal.count(points), self.judge.nominal.distance(points)
-        if self.by == "few":
+        """Return the order of points, the least departure first."""
+        count, length = (
+            self.candidates.nominal.count(points),
+            self.candidates.nominal.distance(points),
+        )
+        if self.by == "count":
             return np.lexsort((length, count))
         return np.lexsort((count, length))
 
     def failures(self) -> Float[np.ndarray, "n d"]:
-        """All failing points so far, the least first."""
-        points = self.judge.points[self.judge.failing]
+        """Return all failing points so far, the least departure first."""
+        points = self.candidates.points[self.candidates.failing]
         return points[self.order(points)]
 
     def note(self) -> None:
         points = self.failures()[:1]
         if len(points):
-            nominal = self.judge.nominal
+            nominal = self.candidates.nominal
             step = (int(nominal.count(points)[0]), float(nominal.distance(points)[0]))
             if not self.history or self.history[-1][1:] != step:
-                self.history.append(Step(self.judge.simulations, *step))
+                self.history.append(Step(self.candidates.simulations, *step))
 
     def search(self, points: Float[np.ndarray, "n d"]) -> None:
-        """Spend the budget; what is found is in `judge`."""
-        judge, nominal = self.judge, self.judge.nominal
-        rho, _ = judge(np.concatenate([nominal.u[None], points]))
+        """Spend the budget; all failing points are in `candidates` afterwards."""
+        candidates, nominal = self.candidates, self.candidates.nominal
+        rho, _ = candidates(np.concatenate([nominal.u[None], points]))
         self.note()
         failures = self.failures()
         if not len(failures) or not nominal.count(failures[:1])[0]:
             return
         spread = [abs(r) for r in rho if math.isfinite(r)]
-        # Smooth enough for a slope where several instants compete, and near the hard value.
-        judge.temperature = max(0.02 * max(spread, default=1.0), 1e-6)
+        # Smooth enough for a gradient where several instants compete, and near the hard value.
+        candidates.temperature = max(0.02 * max(spread, default=1.0), 1e-6)
         # Half for what decides where to go, so that some is left to go there.
-        judge.limit = judge.budget // 2
-        if self.by == "few":
-            own = points[:1][judge(points[:1])[1]]
-            fewest(judge, self.starts(own, alike=False), self.rng)
+        candidates.limit = candidates.budget // 2
+        if self.by == "count":
+            own = points[:1][candidates(points[:1])[1]]
+            minimize_count(candidates, self.starts(own, alike=False), self.rng)
         else:
-            grown(judge, failures[:1], 1)
-            reduced(judge, failures[0])
+            grow(candidates, failures[:1], 1)
+            revert_features(candidates, failures[0])
         self.note()
         self.follow(self.starts())
-        judge.limit = judge.budget - 2 * nominal.space.dim
+        candidates.limit = candidates.budget - 2 * nominal.space.dim
         self.follow(self.starts()[:1])
         # A boundary of many pieces has a nearest point on each: some of those beside this one.
-        beyond(judge, self.failures()[0], self.rng)
+        search_beside(candidates, self.failures()[0], self.rng)
         self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
         for _ in range(2):
-            if judge.left < judge.budget // 20:
+            if candidates.left < candidates.budget // 20:
                 break
             before = self.failures()[0]
-            elsewhere(judge, before, self.by == "few", self.rng)
+            search_elsewhere(candidates, before, self.by == "count", self.rng)
             self.note()
             if not np.array_equal(self.failures()[0], before):
                 self.follow(self.failures()[:1])
         self.follow(self.failures()[:1])
         # What departs by next to nothing need not depart.
-        judge.limit = judge.budget
-        reduced(judge, self.failures()[0])
+        candidates.limit = candidates.budget
+        revert_features(candidates, self.failures()[0])
         self.note()
 
     def starts(
@@ -286,13 +309,16 @@ class _Shrinking:
         alike: bool = True,
         cosine: float = 0.7,
     ) -> Float[np.ndarray, "n d"]:
-        """The least failures in different directions, after those of `first`.
+        """Return the least failures in different directions, after those of `first`.
 
-        - `alike`: only with as few departures as the least one.
+        **Arguments:**
+
+        - `first` `[m, d]`: points that are returned at any rate.
+        - `alike`: whether only failures with as few departures as the least one count.
         - `cosine`: of the angle between directions, at most.
         """
-        failures, nominal = self.failures(), self.judge.nominal
-        if self.by == "few" and alike:
+        failures, nominal = self.failures(), self.candidates.nominal
+        if self.by == "count" and alike:
             count = nominal.count(failures)
             failures = failures[count == count[0]]
         chosen = [] if first is None else list(first)
@@ -306,35 +332,41 @@ class _Shrinking:
         return np.array(chosen)
 
     def follow(self, starts: Float[np.ndarray, "n d"], rounds: int = 60) -> None:
-        """Bring these points nearer."""
+        """Move points along the boundary towards nominal."""
         if len(starts):
-            nearest(self.judge, starts, self.rng, few=self.by == "few", rounds=rounds)
+            minimize_distance(
+                self.candidates, starts, self.rng, keep_nominal=self.by == "count", rounds=rounds
+            )
             self.note()
 
 
-def beyond(judge: Judge, u: Float[np.ndarray, " d"], rng: np.random.Generator) -> None:
-    """Look for failures on the same coordinates a little farther away, in other directions."""
-    nominal = judge.nominal
+def search_beside(
+    candidates: Candidates, u: Float[np.ndarray, " d"], rng: np.random.Generator
+) -> None:
+    """Search failures on the same coordinates, a little farther away in other directions."""
+    nominal = candidates.nominal
     v = u.astype(np.float64) - nominal.u
     v[np.array(nominal.cube.levels) > 0] = 0
     reach = float(np.linalg.norm(v))
     moved = v * (1 + 0.6 * rng.standard_normal((64, len(v))))
     moved *= reach * rng.uniform(1, 1.2, (64, 1)) / _length(moved)
     points = np.repeat(u[None].astype(np.float64), 64, axis=0)
-    judge(np.where(v != 0, nominal.u + moved, points))
+    candidates(np.where(v != 0, nominal.u + moved, points))
 
 
-def elsewhere(
-    judge: Judge, u: Float[np.ndarray, " d"], few: bool, rng: np.random.Generator
+def search_elsewhere(
+    candidates: Candidates, u: Float[np.ndarray, " d"], keep_count: bool, rng: np.random.Generator
 ) -> None:
-    """Look for a failure nearer than `u` in other directions, with no more departures if `few`.
+    """Search a failure nearer than `u` in other directions.
+
+    With `keep_count` it has no more departures than `u`.
 
     Descents of the robustness from random points that are nearer, each for itself, so that the
     known failure does not draw them all.
     """
-    nominal = judge.nominal
+    nominal = candidates.nominal
     free = np.flatnonzero(np.array(nominal.cube.levels) == 0)
-    most = min(int(nominal.count(u[None])[0]), len(free)) if few else len(free)
+    most = min(int(nominal.count(u[None])[0]), len(free)) if keep_count else len(free)
     reach = 0.98 * float(nominal.distance(u[None])[0])
     if not most or not reach:
         return
@@ -343,28 +375,28 @@ def elsewhere(
         row[rng.permutation(free)[:most]] = rng.standard_normal(most)
     moved *= reach * rng.uniform(0.3, 1, (len(moved), 1)) / _length(moved)
     points = nominal.settle(nominal.u + moved)
-    rho, failing = judge(points)
+    rho, failing = candidates(points)
     if failing.any():
         return
     order = np.argsort(rho)[:DESCENTS]
     here, level = points[order].astype(np.float64), rho[order]
     for turn in range(5):
-        if judge.left <= 0:
+        if candidates.left <= 0:
             return
         children = []
-        for point, linear in zip(here, judge.linear(here), strict=True):
-            same = (point != nominal.u) | (not few)
+        for point, tangent in zip(here, candidates.tangents(here), strict=True):
+            same = (point != nominal.u) | (not keep_count)
             noise = rng.standard_normal((5, len(point))) * same
             noise[:, np.array(nominal.cube.levels) > 0] = 0
             steps = 0.3 * 0.6**turn * reach * noise / _length(noise)
-            if linear is not None and (slope := linear.slope * same).any():
+            if tangent is not None and (gradient := tangent.gradient * same).any():
                 # To where the tangent is zero, half and twice as far.
-                full = -max(linear.value, 1e-9) * slope / (slope @ slope)
+                full = -max(tangent.value, 1e-9) * gradient / (gradient @ gradient)
                 steps[:3] = np.outer([1.05, 0.5, 2.0], full)
             away = point + steps - nominal.u
             children.append(nominal.u + away * np.minimum(1, reach / _length(away)))
         points = nominal.settle(np.concatenate(children))
-        rho, failing = judge(points)
+        rho, failing = candidates(points)
         if failing.any():
             return
         best = rho.reshape(len(here), -1).argmin(axis=1) + 5 * np.arange(len(here))
@@ -377,16 +409,16 @@ def _length(rows: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
 
 
 def _verified(
-    problem: Problem, shrinking: _Shrinking, key: Any, number: int, precision: str
+    problem: Problem, search: _Search, key: Key[Array, ""], number: int, precision: str
 ) -> tuple[np.ndarray, Replay] | None:
-    """The least failure that fails alone too, in float64 as well; None where none does.
+    """Return the least failure that fails alone too, in float64 as well; None where none does.
 
     It is taken a little farther from nominal than the boundary, where rounding would decide.
     """
-    nominal = shrinking.judge.nominal
+    nominal = search.candidates.nominal
     # In float64 other random numbers would be drawn, and a black box does not compute in it.
     exact = not problem.black_box and not problem.draws()
-    for u in shrinking.failures()[:20]:
+    for u in search.failures()[:20]:
         farther = nominal.settle(nominal.u + (1 + AWAY) * (u[None].astype(np.float64) - nominal.u))
         for point in (farther[0], u):
             if not nominal.space.accepts_points(point[None])[0]:
@@ -401,7 +433,7 @@ def _verified(
 
 
 def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[Any, Any]]:
-    """What departs, by coordinate: its nominal value and that at `u`."""
+    """Return the coordinates that depart: the nominal value of each and that at `u`."""
     pair = jax.jit(jax.vmap(nominal.space.unflatten))(np.stack([nominal.u, u]))
     columns = nominal.space.rows(pair)
     names = list(columns) if len(columns) == len(u) else []
@@ -416,7 +448,7 @@ def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[An
     return changed
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -424,5 +456,5 @@ def _of(count: int, d: int) -> str:
     return f"{count} of {d} features" if d != 1 else "its one feature"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return f"{value:.5g}" if isinstance(value, float) else str(value)

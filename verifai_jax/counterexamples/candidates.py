@@ -1,10 +1,10 @@
-"""Candidates for a smaller counterexample, simulated once each, and all that came of them.
+"""Candidates for a smaller counterexample: simulated once each, remembered, within a budget.
 
-judge = Judge(problem, nominal, budget=2000, precision="float32")
-rho, failing = judge(points)                        # refused, repeated and unpaid ones too
+candidates = Candidates(problem, nominal, budget=2000, precision="float32")
+rho, failing = candidates(points)                   # also of points that cannot be simulated
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,23 +14,35 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem
 
 BATCH = 64
-"""Simulations at once: what a round of candidates takes."""
-FEW = 8
-"""Gradients at once: one for each point that a search of the boundary follows."""
+"""Simulations in one call of the compiled program."""
+GRADIENTS = 8
+"""Gradients in one call of the compiled program."""
 
 
-class Linear(NamedTuple):
-    """Robustness near a point: `value + slope (u - point)`."""
+class Tangent(NamedTuple):
+    """Linear model of the robustness near a point: `value + gradient (u - point)`."""
 
     point: Float[np.ndarray, " d"]
     value: float
-    slope: Float[np.ndarray, " d"]
+    gradient: Float[np.ndarray, " d"]
 
 
-class Judge:
-    """Simulates settled points and remembers them; `simulations` counts, at most `budget`.
+class Candidates:
+    """Simulations of candidate points, each made once, `budget` of them at most.
 
     A gradient counts as one simulation.
+
+    **Arguments:**
+
+    - `problem`: whose system is simulated.
+    - `nominal`: the point from which candidates depart.
+    - `budget`: simulations at most.
+    - `precision`: of the simulations, `"float32"` or `"float64"`.
+
+    **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all that were simulated;
+    `limit`: simulations after which no more are made for now; `temperature` of the smooth
+    robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
+    not, in words.
     """
 
     def __init__(
@@ -41,29 +53,31 @@ class Judge:
         self._evaluate = Evaluator(problem, BATCH, precision=precision)
         self._differentiate: Evaluator | None = None
         self._known: dict[bytes, tuple[float, bool]] = {}
-        self._linear: dict[bytes, Linear] = {}
+        self._tangents_at: dict[bytes, Tangent] = {}
         self.points = np.zeros((0, nominal.space.dim), np.float32)
         self.rho = np.zeros(0)
         self.failing = np.zeros(0, bool)
         self.temperature = 1.0
-        self.gradients = not problem.black_box
+        self.differentiable = not problem.black_box
         self.note = ""
 
     @property
     def simulations(self) -> int:
-        """How many there were."""
+        """Number of simulations and gradients so far."""
         differentiated = 0 if self._differentiate is None else self._differentiate.simulations
         return self._evaluate.simulations + differentiated
 
     @property
     def left(self) -> int:
-        """How many there may still be."""
+        """Number of simulations that may still be made before the limit."""
         return self.limit - self.simulations
 
-    def __call__(self, points: Any) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Robustness and whether each point fails.
+    def __call__(
+        self, points: np.ndarray
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Simulate points `[n, d]`; return the robustness of each and whether it fails.
 
-        A point that the constraint refuses, or that the budget no longer pays for, or whose
+        A point that the constraint refuses, that the limit leaves no simulation for, or whose
         simulation has no verdict, does not fail and has an infinite robustness.
         """
         points = self.nominal.settle(points)
@@ -72,54 +86,54 @@ class Judge:
         order = sorted(fresh.values())
         order = self._accepted(points, order)[: max(self.left, 0)]
         if order:
-            judged = self._evaluate(points[order])
-            rho = np.where(judged.proper, judged.rho, np.inf).astype(np.float64)
-            for i, value, fails in zip(order, rho, judged.failing, strict=True):
+            verdicts = self._evaluate(points[order])
+            rho = np.where(verdicts.proper, verdicts.rho, np.inf).astype(np.float64)
+            for i, value, fails in zip(order, rho, verdicts.failing, strict=True):
                 self._known[keys[i]] = (float(value), bool(fails))
             self.points = np.concatenate([self.points, points[order]])
             self.rho = np.concatenate([self.rho, rho])
-            self.failing = np.concatenate([self.failing, judged.failing])
-        found = [self._known.get(key, (np.inf, False)) for key in keys]
-        return np.array([rho for rho, _ in found]), np.array([bad for _, bad in found], bool)
+            self.failing = np.concatenate([self.failing, verdicts.failing])
+        known = [self._known.get(key, (np.inf, False)) for key in keys]
+        return np.array([rho for rho, _ in known]), np.array([fails for _, fails in known], bool)
 
-    def linear(self, points: Any) -> list[Linear | None]:
-        """The tangents of the robustness at these points; None where there is none of use."""
+    def tangents(self, points: Float[np.ndarray, "n d"]) -> list[Tangent | None]:
+        """Return the tangents of the robustness at points `[n, d]`; None where it has none."""
         points = self.nominal.settle(points)
         keys = [point.tobytes() for point in points]
-        if self.gradients:
-            todo = [i for i, key in enumerate(keys) if key not in self._linear]
+        if self.differentiable:
+            todo = [i for i, key in enumerate(keys) if key not in self._tangents_at]
             todo = self._accepted(points, todo)[: max(self.left, 0)]
             if todo:
-                self._tangents(points[todo], [keys[i] for i in todo])
-        return [self._linear.get(key) for key in keys]
+                self._differentiate_at(points[todo], [keys[i] for i in todo])
+        return [self._tangents_at.get(key) for key in keys]
 
-    def _tangents(self, points: Float[np.ndarray, "n d"], keys: list[bytes]) -> None:
+    def _differentiate_at(self, points: Float[np.ndarray, "n d"], keys: list[bytes]) -> None:
         try:
             if self._differentiate is None:
                 self._differentiate = Evaluator(
-                    self.problem, FEW, gradient=True, precision=self.precision
+                    self.problem, GRADIENTS, gradient=True, precision=self.precision
                 )
-            judged = self._differentiate(points, self.temperature)
+            verdicts = self._differentiate(points, self.temperature)
         except Exception as error:
-            # Some systems run and cannot be differentiated; without a slope it takes longer.
-            self.gradients = False
+            # Some systems run and cannot be differentiated; without a gradient it takes longer.
+            self.differentiable = False
             self.note = f"without gradients, which raised {type(error).__name__}"
             return
-        assert judged.gradient is not None
+        assert verdicts.gradient is not None
         free = np.array(self.nominal.cube.levels) == 0
-        for key, point, rho, slope in zip(keys, points, judged.rho, judged.gradient, strict=True):
-            slope = np.where(free, slope, 0.0).astype(np.float64)
-            if np.isfinite(rho) and np.all(np.isfinite(slope)) and np.any(slope):
-                self._linear[key] = Linear(point.astype(np.float64), float(rho), slope)
+        gradients = np.where(free, verdicts.gradient, 0.0).astype(np.float64)
+        for key, point, rho, gradient in zip(keys, points, verdicts.rho, gradients, strict=True):
+            if np.isfinite(rho) and np.all(np.isfinite(gradient)) and np.any(gradient):
+                self._tangents_at[key] = Tangent(point.astype(np.float64), float(rho), gradient)
 
     def _accepted(self, points: Float[np.ndarray, "n d"], order: list[int]) -> list[int]:
         if self.nominal.space.where is None or not order:
             return order
-        kept = []
+        accepted_places = []
         for start in range(0, len(order), BATCH):
             part = order[start : start + BATCH]
             block = np.zeros((BATCH, points.shape[1]), np.float32)
             block[: len(part)] = points[part]
             accepted = np.asarray(self.nominal.space.accepts_points(block))[: len(part)]
-            kept += [i for i, good in zip(part, accepted, strict=True) if good]
-        return kept
+            accepted_places += [i for i, good in zip(part, accepted, strict=True) if good]
+        return accepted_places

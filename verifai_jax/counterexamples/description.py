@@ -164,13 +164,13 @@ def describe_gradient(influences: Sequence[Influence]) -> str:
     slopes = [
         (abs(slope), slope, i, k)
         for i in influences
-        for k, slope in enumerate(i.slope)
+        for k, slope in enumerate(i.gradient)
         if np.isfinite(slope)
     ]
     if not slopes or max(slopes, key=lambda entry: entry[0])[0] == 0:
         return ""
     size, slope, i, k = max(slopes, key=lambda entry: entry[0])
-    what = i.name if len(i.slope) == 1 else i.coordinates[k]
+    what = i.name if len(i.gradient) == 1 else i.coordinates[k]
     if i.spans is not None:
         what = f"{i.name} {format_spans([i.spans[k]])}"
     way = "less" if slope < 0 else "more"

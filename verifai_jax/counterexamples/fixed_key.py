@@ -1,6 +1,6 @@
-"""Simulations that all have the random key of one row, so that only features make a difference.
+"""Simulations with one random key, so that only features make a difference.
 
-problem = with_key_of(run, row)                     # the same problem where no key is used
+problem = fix_key(problem, run, row)                # the problem itself where no key is used
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,8 +17,8 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Carry, Features, Outcome, Seed, System
 
 
-class Keyed(System):
-    """A system that ignores the key that it is given and uses its own.
+class FixedKey(System):
+    """A system that uses one random key, whatever key it is given.
 
     It offers what the system offers: `fold`, `simulate_batch`, `simulate_each`, ...
     """
@@ -69,15 +69,16 @@ class Keyed(System):
 
 
 def key_of(run: Run, row: int | None) -> Key[Array, ""]:
-    """The random key with which a row of this run was simulated."""
+    """Return the random key with which a row of a run was simulated."""
     return simulation_key(run_keys(run.seed)[1], 0 if row is None else row)
 
 
-def with_key_of(problem: Problem, run: Run, row: int | None) -> Problem:
-    """The problem with every simulation on the random key of that row.
+def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:
+    """Return the problem with every simulation on the random key of one row.
 
-    Itself where the system does not draw, so that it keeps what is compiled.
+    That is the problem itself where the system draws no random numbers, so that its compiled
+    programs are used again.
     """
     if not problem.black_box and not problem.draws():
         return problem
-    return replace(problem, system=Keyed(problem.system, key_of(run, row)))
+    return replace(problem, system=FixedKey(problem.system, key_of(run, row)))

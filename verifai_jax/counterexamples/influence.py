@@ -11,14 +11,14 @@ from verifai_jax.features import Domain, Signal
 
 
 class Span(NamedTuple):
-    """When a control point acts, in seconds."""
+    """The time during which a control point acts, in seconds."""
 
     begin: float
     end: float
 
 
 def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
-    """When each coordinate of a signal acts; None for what is no signal.
+    """Return when each coordinate of a signal acts; None for other domains.
 
     A point between two lines acts from the point before to the one behind.
     """
@@ -37,14 +37,15 @@ def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
 
 @dataclass(frozen=True)
 class Influence:
-    """What one feature has to do with a failure.
+    """The part of one feature in a failure.
 
     **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
     when each coordinate acts, for the control points of a signal, else None; `reverted`: the
     robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
-    back; `slope` `[k]`: change of the smooth robustness over the whole range of each coordinate, as
-    seen from the row. What is not known is NaN. `gone`: whether the failure vanishes with the whole
-    feature back.
+    back; `gradient` `[k]`: change of the smooth robustness over the whole range of each coordinate,
+    by its gradient at the row. What is not known is NaN. `gone`: whether the failure vanishes with
+    the whole feature back; `departs`: whether the feature is not nominal; `each_gone`: whether the
+    failure vanishes with one coordinate back.
     """
 
     name: str
@@ -57,13 +58,13 @@ class Influence:
     departs: bool
     each: Float[np.ndarray, " k"]
     each_gone: tuple[bool, ...]
-    slope: Float[np.ndarray, " k"]
+    gradient: Float[np.ndarray, " k"]
 
     def effect(self, rho: float) -> float:
         """Return by how much the feature moves the robustness `rho` of the row.
 
-        That of the whole feature back at nominal, or where it is not known its steepest slope.
+        That of the whole feature back at nominal, or where it is not known its steepest gradient.
         """
         if np.isfinite(self.reverted):
             return self.reverted - rho
-        return float(np.nan_to_num(np.abs(self.slope)).max(initial=0.0))
+        return float(np.nan_to_num(np.abs(self.gradient)).max(initial=0.0))

@@ -1,23 +1,24 @@
-"""The fewest features that have to depart from nominal for a failure, by batches.
+"""The fewest features that have to depart from nominal for a failure, in batches.
 
-    points = fewest(judge, starts, rng)                 # failing, the least count first
+    points = minimize_count(candidates, starts, rng)    # failing, the least count first
 
 Three moves, in turns:
 
 - reversals: as many features as possible back to nominal, the others as they are (delta debugging:
   Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, IEEE Transactions on
   Software Engineering 28(2), 2002);
-- exchanges: one feature back, the others pushed on until it fails again;
+- exchanges: one feature back, the others push on until it fails again;
 - growth: from nominal, always the features by which the robustness falls most (a beam search).
 """
 
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.counterexamples.candidates import Judge
+from verifai_jax.counterexamples.candidates import Candidates, Tangent
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
+Results = Float[np.ndarray, "m d"]
 
 LEVELS = 5
 """Values of one feature alone that growth begins with."""
@@ -25,14 +26,14 @@ BEAM = 6
 """Sets of features that growth goes on with."""
 
 
-def reduced(judge: Judge, u: Point) -> Point:
-    """A failing point of which no feature can go back to nominal and leave the others as they are.
+def revert_features(candidates: Candidates, u: Point) -> Point:
+    """Move features of a failing point back to nominal until every further one ends the failure.
 
     `u` fails. Each round: all single reversals and all features' at once, then all of the single
     ones' that keep it failing, one after the other.
     """
-    nominal = judge.nominal
-    while judge.left > 0:
+    nominal = candidates.nominal
+    while candidates.left > 0:
         changed = np.flatnonzero(nominal.departs(u[None])[0])
         if not len(changed):
             return u
@@ -41,8 +42,8 @@ def reduced(judge: Judge, u: Point) -> Point:
         if len(changed) > 24:
             sets += [part for n in (2, 4, 8) for part in np.array_split(changed, n)]
         sets += [changed[i : i + 1] for i in range(len(changed))]
-        tried = reverted(judge, u, sets)
-        rho, failing = judge(tried)
+        tried = revert(candidates, u, sets)
+        rho, failing = candidates(tried)
         if not failing.any():
             return u
         order = [int(sets[i][0]) for i in np.argsort(rho) if failing[i] and len(sets[i]) == 1]
@@ -56,30 +57,30 @@ def reduced(judge: Judge, u: Point) -> Point:
             if n
         ]
         if more:
-            others = reverted(judge, u, more)
+            others = revert(candidates, u, more)
             tried = np.concatenate([tried, others])
-            failing = np.concatenate([failing, judge(others)[1]])
-        u = best(judge, tried[failing])
+            failing = np.concatenate([failing, candidates(others)[1]])
+        u = least_departure(candidates, tried[failing])
     return u
 
 
-def reverted(judge: Judge, u: Point, sets: list[np.ndarray]) -> Points:
-    """The point with each of these sets of coordinates back at nominal."""
+def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
+    """Return the point with each of these sets of coordinates back at nominal."""
     points = np.repeat(u[None], len(sets), axis=0)
     for point, places in zip(points, sets, strict=True):
-        point[places] = judge.nominal.u[places]
+        point[places] = candidates.nominal.u[places]
     return points
 
 
-def best(judge: Judge, points: Points) -> Point:
-    """The one with the fewest departures, and of those the nearest."""
-    order = np.lexsort((judge.nominal.distance(points), judge.nominal.count(points)))
+def least_departure(candidates: Candidates, points: Points) -> Point:
+    """Return the point with the fewest departures, and of those the nearest."""
+    order = np.lexsort((candidates.nominal.distance(points), candidates.nominal.count(points)))
     return points[order[0]]
 
 
-def values_of(judge: Judge, i: int) -> list[float]:
-    """Values of one coordinate to try: its ends and between, or its cells, nominal left out."""
-    cube = judge.nominal.cube
+def trial_values(candidates: Candidates, i: int) -> list[float]:
+    """Return values of one coordinate to try: over its range, or its cells, without nominal."""
+    cube = candidates.nominal.cube
     if cube.levels[i] == 0:
         values = np.linspace(0, 1, LEVELS)
     else:
@@ -87,23 +88,23 @@ def values_of(judge: Judge, i: int) -> list[float]:
         every = np.zeros((len(cells), len(cube.discrete)), int)
         place = int(np.flatnonzero(cube.discrete == i)[0])
         every[:, place] = cells
-        values = judge.nominal.centres(every)[:, place]
-    return [float(v) for v in values if np.float32(v) != judge.nominal.u[i]]
+        values = candidates.nominal.centres(every)[:, place]
+    return [float(v) for v in values if np.float32(v) != candidates.nominal.u[i]]
 
 
-def grown(judge: Judge, starts: Points, most: int) -> Points:
-    """Failing points with at most `most` departures, grown from nominal; perhaps none."""
-    nominal = judge.nominal
+def grow(candidates: Candidates, starts: Points, most: int) -> Results:
+    """Search failing points with `most` departures at most, from nominal on; perhaps none."""
+    nominal = candidates.nominal
     d = nominal.space.dim
-    pairs = [(i, value) for i in range(d) for value in values_of(judge, i)]
+    pairs = [(i, value) for i in range(d) for value in trial_values(candidates, i)]
     pairs += [
         (i, float(u[i])) for u in starts[:3] for i in np.flatnonzero(nominal.departs(u[None])[0])
     ]
-    pairs = list(dict.fromkeys(pairs))[: max(judge.left, 0)]
+    pairs = list(dict.fromkeys(pairs))[: max(candidates.left, 0)]
     points = np.repeat(nominal.u[None], len(pairs), axis=0)
     for point, (i, value) in zip(points, pairs, strict=True):
         point[i] = value
-    rho, failing = judge(points)
+    rho, failing = candidates(points)
     if failing.any() or most < 2:
         return points[failing]
     # Of each coordinate the two best values, the best coordinates first.
@@ -113,9 +114,9 @@ def grown(judge: Judge, starts: Points, most: int) -> Points:
         i, value = pairs[n]
         if len(offered.setdefault(i, [])) < 2:
             offered[i].append(value)
-    beam = distinct_sets(judge, points[ranked])[:BEAM]
+    beam = distinct_sets(candidates, points[ranked])[:BEAM]
     for _ in range(2, most + 1):
-        if judge.left <= 0:
+        if candidates.left <= 0:
             break
         longer = []
         for u in beam:
@@ -128,51 +129,57 @@ def grown(judge: Judge, starts: Points, most: int) -> Points:
         if not longer:
             break
         each = max(200 // len(beam), 8) * len(beam)
-        longer = np.array(longer)[:each] if len(longer) <= each else np.array(spread(longer, each))
-        rho, failing = judge(longer)
+        longer = (
+            np.array(longer)[:each]
+            if len(longer) <= each
+            else np.array(spread_evenly(longer, each))
+        )
+        rho, failing = candidates(longer)
         if failing.any():
             return longer[failing]
-        beam = distinct_sets(judge, longer[np.argsort(rho)])[:BEAM]
+        beam = distinct_sets(candidates, longer[np.argsort(rho)])[:BEAM]
     return np.zeros((0, d), np.float32)
 
 
-def spread(points: list[Point], count: int) -> list[Point]:
-    """So many of them, evenly."""
+def spread_evenly(points: list[Point], count: int) -> list[Point]:
+    """Return `count` of the points, evenly spaced in their order."""
     return [points[i] for i in np.linspace(0, len(points) - 1, count).astype(int)]
 
 
-def distinct_sets(judge: Judge, points: Points) -> Points:
-    """The first point of each set of departing coordinates."""
-    seen: dict[bytes, int] = {}
-    for i, mask in enumerate(judge.nominal.departs(points)):
-        seen.setdefault(mask.tobytes(), i)
-    return points[list(seen.values())]
+def distinct_sets(candidates: Candidates, points: Points) -> Results:
+    """Return the first point of each set of departing coordinates."""
+    first: dict[bytes, int] = {}
+    for i, mask in enumerate(candidates.nominal.departs(points)):
+        first.setdefault(mask.tobytes(), i)
+    return points[list(first.values())]
 
 
-def exchanged(judge: Judge, u: Point, rng: np.random.Generator) -> Point | None:
-    """A failing point on the departing coordinates of `u` less one; None if none is found.
+def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Point | None:
+    """Search a failing point with one departure less than `u`; None where none is found.
 
-    The other coordinates are pushed away from nominal, along the slope of the robustness, and at
+    The other coordinates are pushed away from nominal, along the gradient of the robustness, and at
     random, three rounds, with more for the sets that came nearest to a failure.
     """
-    nominal = judge.nominal
+    nominal = candidates.nominal
     support = np.flatnonzero(nominal.departs(u[None])[0])
     if len(support) < 2:
         return None
     smaller = [np.setdiff1d(support, [i]) for i in support]
-    centres = reverted(judge, u, [support[i : i + 1] for i in range(len(support))])
+    centres = revert(candidates, u, [support[i : i + 1] for i in range(len(support))])
     width = 1.0
     for turn in range(3):
         each = int(np.clip((96, 96, 96)[turn] // len(smaller), 4, 32))
         tried = []
-        for linear, centre, places in zip(judge.linear(centres), centres, smaller, strict=True):
-            tried.append(pushed(judge, centre, places, linear, each, width, rng))
+        for tangent, centre, places in zip(
+            candidates.tangents(centres), centres, smaller, strict=True
+        ):
+            tried.append(push(candidates, centre, places, tangent, each, width, rng))
         owner = np.repeat(np.arange(len(smaller)), [len(part) for part in tried])
         points = nominal.settle(np.concatenate(tried))
-        rho, failing = judge(points)
+        rho, failing = candidates(points)
         if failing.any():
-            return best(judge, points[failing])
-        if judge.left <= 0:
+            return least_departure(candidates, points[failing])
+        if candidates.left <= 0:
             return None
         # The half that came nearest, each from its best point on.
         least = np.array([rho[owner == k].min() for k in range(len(smaller))])
@@ -183,23 +190,25 @@ def exchanged(judge: Judge, u: Point, rng: np.random.Generator) -> Point | None:
     return None
 
 
-def pushed(
-    judge: Judge,
+def push(
+    candidates: Candidates,
     centre: Point,
     places: np.ndarray,
-    linear: object,
+    tangent: Tangent | None,
     count: int,
     width: float,
     rng: np.random.Generator,
-) -> Points:
-    """Points that differ from `centre` on these coordinates only."""
-    cube, u0 = judge.nominal.cube, judge.nominal.u
+) -> Results:
+    """Draw points that differ from `centre` in these coordinates only."""
+    cube, u0 = candidates.nominal.cube, candidates.nominal.u
     free = np.array([i for i in places if cube.levels[i] == 0], int)
     points = np.repeat(centre[None].astype(np.float64), count, axis=0)
     if len(free):
         away = np.sign(centre[free] - u0[free])
-        slope = getattr(linear, "slope", None)
-        downhill = away if slope is None or not np.any(slope[free]) else -np.sign(slope[free])
+        gradient = None if tangent is None else tangent.gradient
+        downhill = (
+            away if gradient is None or not np.any(gradient[free]) else -np.sign(gradient[free])
+        )
         end = lambda sign: np.where(sign > 0, 1.0, np.where(sign < 0, 0.0, centre[free]))  # noqa: E731
         fixed = [end(away), end(downhill), (centre[free] + end(away)) / 2]
         for point, values in zip(points, fixed, strict=False):
@@ -217,27 +226,38 @@ def pushed(
     return points
 
 
-def fewest(judge: Judge, starts: Points, rng: np.random.Generator) -> Points:
-    """Failing points from these, which fail too: the fewest departures first, then the nearest."""
-    nominal = judge.nominal
-    enough = judge.left // 3
+def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Generator) -> Results:
+    """Minimise the number of coordinates that depart from nominal, among failing points.
+
+    **Arguments:**
+
+    - `candidates`: simulates, and remembers what failed.
+    - `starts` `[m, d]`: failing points to begin with.
+    - `rng`: for random candidates.
+
+    **Returns:** failing points `[n, d]`, the fewest departures first, then the nearest.
+    """
+    nominal = candidates.nominal
+    enough = candidates.left // 3
     pool = []
     for u in starts:
         # The first at any rate; the others as long as enough is left to go on with.
-        if not pool or judge.left > enough:
-            pool.append(reduced(judge, u))
-    while judge.left > 0:
-        u = best(judge, np.array(pool))
+        if not pool or candidates.left > enough:
+            pool.append(revert_features(candidates, u))
+    while candidates.left > 0:
+        u = least_departure(candidates, np.array(pool))
         count = int(nominal.count(u[None])[0])
         if count <= 1:
             break
-        smaller = grown(judge, starts, count - 1)
+        smaller = grow(candidates, starts, count - 1)
         if not len(smaller):
-            one = exchanged(judge, u, rng)
+            one = exchange(candidates, u, rng)
             if one is None:
                 break
             smaller = one[None]
-        pool += [reduced(judge, point) for point in distinct_sets(judge, smaller)[:4]]
-    points = np.concatenate([np.array(pool), judge.points[judge.failing]])
+        pool += [
+            revert_features(candidates, point) for point in distinct_sets(candidates, smaller)[:4]
+        ]
+    points = np.concatenate([np.array(pool), candidates.points[candidates.failing]])
     order = np.lexsort((nominal.distance(points), nominal.count(points)))
     return points[order]

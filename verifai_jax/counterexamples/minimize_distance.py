@@ -1,6 +1,6 @@
-"""The nearest failure to nominal over given features, by batches along the failure boundary.
+"""The nearest failure to nominal over given features, in batches along the failure boundary.
 
-    points = nearest(judge, starts, rng)                # failing, each no farther than its start
+    points = minimize_distance(candidates, starts, rng)  # failing, none farther than its start
 
 Each round a batch of candidates for each point that is followed:
 
@@ -11,24 +11,26 @@ Each round a batch of candidates for each point that is followed:
   random load sequences, Computers and Structures 9, 1978), with a line search by batch; where
   several pieces of the boundary meet, nearest to all of their half-spaces
   (`statistics.least_distance`);
-- beside it and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial attacks,
-  ICLR 2018), which needs no slope and no continuity;
+- beside it and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial
+  attacks, ICLR 2018), which needs no gradient and no continuity;
 - one coordinate nearer alone; a cell nearer where discrete.
 
-The slope is that of the smooth robustness, or where there is none a least-squares fit to the
+The gradient is that of the smooth robustness, or where there is none a least-squares fit to the
 points simulated nearby.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from verifai_jax.counterexamples.candidates import Judge, Linear
+from verifai_jax.counterexamples.candidates import Candidates, Tangent
 from verifai_jax.statistics.least_distance import shortest_in_box
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]
+Departure = Float[np.ndarray, " k"]
+Departures = Float[np.ndarray, "n k"]
 
 TURNS = (1.0, 0.75, 0.5, 0.3, 0.15, 0.05)
 """Shares of the way to the linearised boundary's nearest point,"""
@@ -44,68 +46,83 @@ class Track:
 
     `free`: which coordinates may depart; `gap`: the share of the way to nominal on which the last
     failure lies, as far as is known; `sigma`: size of random steps, relative to the distance;
-    `dull`: rounds without progress; `pieces`: tangents of the boundary met so far, the latest last;
-    `aimed`: the nearest point of the last linearised boundary.
+    `stalled`: rounds without progress; `tangents` of the boundary so far, the latest last;
+    `target`: the nearest point of the last linearised boundary.
     """
 
     u: Point
     free: Bool[np.ndarray, " d"]
     gap: float = 1.0
     sigma: float = 0.3
-    dull: int = 0
-    pieces: list[Linear] = field(default_factory=list)
-    aimed: Point | None = None
+    stalled: int = 0
+    tangents: list[Tangent] = field(default_factory=list)
+    target: Point | None = None
 
 
-def nearest(
-    judge: Judge, starts: Points, rng: np.random.Generator, *, few: bool, rounds: int = 60
+def minimize_distance(
+    candidates: Candidates,
+    starts: Points,
+    rng: np.random.Generator,
+    *,
+    keep_nominal: bool,
+    rounds: int = 60,
 ) -> Points:
-    """Follow these failing points until none comes nearer; the points reached, one for each.
+    """Follow failing points along the boundary until none comes nearer to nominal.
 
-    - `few`: whether coordinates that are nominal stay so.
+    **Arguments:**
+
+    - `candidates`: simulates, and remembers what failed.
+    - `starts` `[n, d]`: failing points.
+    - `rng`: for random candidates.
+    - `keep_nominal`: whether coordinates that are nominal stay so.
+    - `rounds`: batches at most.
+
+    **Returns:** the points reached `[n, d]`, one for each start.
     """
-    nominal = judge.nominal
+    nominal = candidates.nominal
     d = nominal.space.dim
-    tracks = [Track(u, nominal.departs(u[None])[0] if few else np.ones(d, bool)) for u in starts]
+    tracks = [
+        Track(u, nominal.departs(u[None])[0] if keep_nominal else np.ones(d, bool)) for u in starts
+    ]
     active = list(tracks)
     for _ in range(rounds):
-        if not active or judge.left <= 0:
+        if not active or candidates.left <= 0:
             break
         each = max(12, min(40, 64 // len(active)))
-        batches = [candidates(judge, track, each, rng) for track in active]
-        _, failing = judge(np.concatenate(batches))
+        batches = [propose(candidates, track, each, rng) for track in active]
+        _, failing = candidates(np.concatenate(batches))
         first = 0
         for track, batch in zip(active, batches, strict=True):
-            advance(judge, track, nominal.settle(batch), failing[first : first + len(batch)])
+            advance(candidates, track, nominal.settle(batch), failing[first : first + len(batch)])
             first += len(batch)
-        follow(judge, active)
-        active = [track for track in active if track.dull < 3]
+        update_tangents(candidates, active)
+        active = [track for track in active if track.stalled < 3]
         if len(active) > 1:
             # What is far behind the best gets no more of the budget.
             reach = min(float(nominal.distance(track.u[None])[0]) for track in tracks)
             active = [
                 track
                 for track in active
-                if track.dull == 0 or nominal.distance(track.u[None])[0] < 1.3 * reach
+                if track.stalled == 0 or nominal.distance(track.u[None])[0] < 1.3 * reach
             ]
     return np.array([track.u for track in tracks])
 
 
-def candidates(judge: Judge, track: Track, count: int, rng: np.random.Generator) -> Points:
-    """About so many points nearer to nominal than that of the track."""
-    nominal = judge.nominal
+def propose(candidates: Candidates, track: Track, count: int, rng: np.random.Generator) -> Points:
+    """Propose about `count` points nearer to nominal than that of the track."""
+    nominal = candidates.nominal
     levels = np.array(nominal.cube.levels)
     places = np.flatnonzero(track.free & (levels == 0))
     u0 = nominal.u.astype(np.float64)
     v = track.u.astype(np.float64)[places] - u0[places]
     length = float(np.linalg.norm(v))
-    parts = [whole_cells(judge, track)]
+    parts = [discrete_steps(candidates, track)]
     if length > 0:
-        lines = rays(track)
-        aims = aimed(judge, track, places, v)
+        lines = segment_shares(track)
+        aims = boundary_steps(candidates, track, places, v)
         left = max(count - len(lines) - len(aims) - len(parts[0]), 6)
-        ones = single(track, v, left // 3, rng)
-        near = beside(track, v, left - len(ones), rng)
+        ones = single_coordinates(track, v, left // 3, rng)
+        near = random_directions(track, v, left - len(ones), rng)
         moved = np.concatenate([np.outer(lines, v), aims, ones, near])
         moved = moved[np.linalg.norm(moved, axis=1) < length]
         points = np.repeat(track.u[None].astype(np.float64), len(moved), axis=0)
@@ -114,33 +131,35 @@ def candidates(judge: Judge, track: Track, count: int, rng: np.random.Generator)
     return np.concatenate(parts)
 
 
-def rays(track: Track) -> Float[np.ndarray, " n"]:
-    """Shares of the way from nominal to the point, where the boundary may be."""
+def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
+    """Return shares of the way from nominal to the point where the boundary may be."""
     if track.gap >= 1:
         return np.linspace(0, 1, 14)[1:-1]
     return 1 - track.gap * np.linspace(0.2, 1, 5) if track.gap > 2e-4 else np.zeros(0)
 
 
-def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Departures at, and on the way to, the nearest points of the linearised boundary."""
-    u0 = judge.nominal.u.astype(np.float64)[places]
+def boundary_steps(
+    candidates: Candidates, track: Track, places: Int[np.ndarray, " k"], v: Departure
+) -> Departures:
+    """Return departures at, and on the way to, the nearest points of the linearised boundary."""
+    u0 = candidates.nominal.u.astype(np.float64)[places]
     ends = np.zeros(len(track.u))
-    low, high = (ends + judge.nominal.low)[places], (ends + judge.nominal.high)[places]
-    pieces = track.pieces[-1:] or fitted(judge, track, places)
+    low, high = (ends + candidates.nominal.low)[places], (ends + candidates.nominal.high)[places]
+    tangents = track.tangents[-1:] or fit_tangent(candidates, track, places)
     targets = []
-    for some in (pieces, track.pieces[-6:]) if len(track.pieces) > 1 else (pieces,):
-        rows = np.array([piece.slope[places] for piece in some])
+    for some in (tangents, track.tangents[-6:]) if len(track.tangents) > 1 else (tangents,):
+        rows = np.array([piece.gradient[places] for piece in some])
         if not len(rows) or not rows.any():
             continue
-        levels = np.array([p.slope[places] @ (p.point[places] - u0) - p.value for p in some])
-        found = shortest_in_box(rows, levels, low - u0, high - u0)
-        if found is not None:
-            targets.append(found)
-    track.aimed = None
+        levels = np.array([p.gradient[places] @ (p.point[places] - u0) - p.value for p in some])
+        nearest = shortest_in_box(rows, levels, low - u0, high - u0)
+        if nearest is not None:
+            targets.append(nearest)
+    track.target = None
     if not targets:
         return np.zeros((0, len(v)))
-    track.aimed = track.u.astype(np.float64)
-    track.aimed[places] = u0 + targets[0]
+    track.target = track.u.astype(np.float64)
+    track.target[places] = u0 + targets[0]
     steps = [
         stretch * ((1 - turn) * v + turn * target)
         for target in targets
@@ -150,12 +169,16 @@ def aimed(judge: Judge, track: Track, places: np.ndarray, v: np.ndarray) -> np.n
     return np.array(steps)
 
 
-def fitted(judge: Judge, track: Track, places: np.ndarray) -> list[Linear]:
-    """A tangent from the points that were simulated nearby; none where they are too few."""
+def fit_tangent(
+    candidates: Candidates, track: Track, places: Int[np.ndarray, " k"]
+) -> list[Tangent]:
+    """Fit a tangent to the points that were simulated nearby; none where they are too few."""
     others = np.ones(len(track.u), bool)
     others[places] = False
-    alike = np.isfinite(judge.rho) & np.all(judge.points[:, others] == track.u[others], axis=1)
-    points, rho = judge.points[alike].astype(np.float64)[:, places], judge.rho[alike]
+    alike = np.isfinite(candidates.rho) & np.all(
+        candidates.points[:, others] == track.u[others], axis=1
+    )
+    points, rho = candidates.points[alike].astype(np.float64)[:, places], candidates.rho[alike]
     k = len(places)
     if len(points) < k + 2:
         return []
@@ -168,15 +191,17 @@ def fitted(judge: Judge, track: Track, places: np.ndarray) -> list[Linear]:
     ridge = 1e-6 * float(weight @ (far**2 + 1e-12)) * np.eye(k + 1)
     weighted = design * weight[:, None]
     solution = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ rho)
-    slope = np.zeros(len(track.u))
-    slope[places] = solution[1:]
-    if not np.all(np.isfinite(slope)) or not slope.any():
+    gradient = np.zeros(len(track.u))
+    gradient[places] = solution[1:]
+    if not np.all(np.isfinite(gradient)) or not gradient.any():
         return []
-    return [Linear(track.u.astype(np.float64), float(solution[0]), slope)]
+    return [Tangent(track.u.astype(np.float64), float(solution[0]), gradient)]
 
 
-def single(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """One coordinate nearer to nominal than it is, the others as they are."""
+def single_coordinates(
+    track: Track, v: Departure, count: int, rng: np.random.Generator
+) -> Departures:
+    """Draw departures with one coordinate nearer to nominal, the others as they are."""
     chosen = np.flatnonzero(v)
     if not len(chosen) or count < 1:
         return np.zeros((0, len(v)))
@@ -187,12 +212,14 @@ def single(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) ->
     return moved
 
 
-def beside(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Random directions near that of `v`, a little shorter."""
+def random_directions(
+    track: Track, v: Departure, count: int, rng: np.random.Generator
+) -> Departures:
+    """Draw departures in random directions near that of `v`, a little shorter."""
     length = np.linalg.norm(v)
     k = len(v)
     noise = rng.standard_normal((count, k))
-    # Half of them in few coordinates: boundaries are often aligned with some.
+    # Half of them in keep_nominal coordinates: boundaries are often aligned with some.
     kept = rng.random((count, k)) < min(1.0, 2 / k)
     kept |= (rng.random(count) < 0.5).reshape(-1, 1) | ~kept.any(axis=1, keepdims=True)
     noise *= kept
@@ -204,9 +231,9 @@ def beside(track: Track, v: np.ndarray, count: int, rng: np.random.Generator) ->
     return moved * length * shorter
 
 
-def whole_cells(judge: Judge, track: Track) -> Points:
-    """Each departing discrete coordinate back at nominal, and nearer where cells have an order."""
-    nominal = judge.nominal
+def discrete_steps(candidates: Candidates, track: Track) -> Points:
+    """Return points with one discrete coordinate at nominal, or nearer where cells are ordered."""
+    nominal = candidates.nominal
     cube = nominal.cube
     tried = []
     for place, i in enumerate(cube.discrete):
@@ -226,46 +253,46 @@ def whole_cells(judge: Judge, track: Track) -> Points:
     return np.array(tried).reshape(-1, nominal.space.dim)
 
 
-def advance(judge: Judge, track: Track, points: Points, failing: np.ndarray) -> None:
+def advance(candidates: Candidates, track: Track, points: Points, failing: np.ndarray) -> None:
     """Take the nearest failing candidate, and learn where on the segment there was none."""
-    nominal = judge.nominal
+    nominal = candidates.nominal
     before = float(nominal.distance(track.u[None])[0])
     lengths = np.where(failing, nominal.distance(points), np.inf)
     after = float(lengths.min(initial=np.inf))
     gain = 1 - after / before if after < before else 0.0
     if gain:
         u = points[int(np.argmin(lengths))]
-        straight = on_segment(judge, track.u, u) is not None
+        straight = share_of_segment(candidates, track.u, u) is not None
         wider = min(1.0, 4 * track.gap) if straight else 0.1
         track.u = u
     else:
         wider = track.gap
-    shares = [on_segment(judge, track.u, point) for point in points[~failing]]
+    shares = [share_of_segment(candidates, track.u, point) for point in points[~failing]]
     safe = max((share for share in shares if share is not None and share < 1), default=None)
     track.gap = wider if safe is None else 1 - safe
     track.sigma = float(np.clip(track.sigma * (1.3 if gain > 0.02 else 0.6), 1e-3, 0.5))
     settled = gain <= ENOUGH and track.gap <= 1e-3
-    track.dull = track.dull + 1 if settled else 0
+    track.stalled = track.stalled + 1 if settled else 0
 
 
-def on_segment(judge: Judge, u: Point, other: Point) -> float | None:
-    """What share of the way from nominal to `u` the other point is; None if it is beside."""
-    u0 = judge.nominal.u.astype(np.float64)
+def share_of_segment(candidates: Candidates, u: Point, other: Point) -> float | None:
+    """Return the share of the way from nominal to `u` at which `other` lies; None if beside it."""
+    u0 = candidates.nominal.u.astype(np.float64)
     v, w = u - u0, other - u0
     share = float(w @ v / max(v @ v, 1e-30))
     return share if np.linalg.norm(w - share * v) < 1e-5 * np.linalg.norm(v) + 1e-7 else None
 
 
-def follow(judge: Judge, tracks: list[Track]) -> None:
-    """Tangents where the tracks are, and where those that do not get on had aimed."""
-    if not judge.gradients:
+def update_tangents(candidates: Candidates, tracks: list[Track]) -> None:
+    """Take tangents where the tracks are, and at the targets of those that make no progress."""
+    if not candidates.differentiable:
         return
     wanted = [(track, track.u) for track in tracks]
     wanted = [
-        (track, track.aimed) for track in tracks if track.dull and track.aimed is not None
+        (track, track.target) for track in tracks if track.stalled and track.target is not None
     ] + wanted
     for (track, _), linear in zip(
-        wanted, judge.linear(np.array([u for _, u in wanted])), strict=True
+        wanted, candidates.tangents(np.array([u for _, u in wanted])), strict=True
     ):
-        if linear is not None and (not track.pieces or track.pieces[-1] is not linear):
-            track.pieces.append(linear)
+        if linear is not None and (not track.tangents or track.tangents[-1] is not linear):
+            track.tangents.append(linear)

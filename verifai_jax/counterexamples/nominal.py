@@ -1,4 +1,4 @@
-"""How far a point is from the nominal one: how many features depart from it, and how much.
+"""The nominal point, and the number and the distance of departures from it.
 
     nominal = Nominal.of(problem)
     nominal.count(points), nominal.distance(points)     # [n] each
@@ -24,9 +24,13 @@ from verifai_jax.problem.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """The features of an ordinary day, as the point `u` `[d]` of the unit cube.
+    """The nominal features as a point of the unit cube.
 
-    `low` and `high` `[d]` are the ends of the coordinates that may be departed to.
+    **Fields:**
+
+    - `space`: of the features.
+    - `u` `[d]`: the point.
+    - `low` and `high` `[d]`: ends of the coordinates within which points may depart.
     """
 
     space: FeatureSpace
@@ -36,7 +40,12 @@ class Nominal:
 
     @classmethod
     def of(cls, problem: Problem, nominal: Mapping[str, Any] | None = None) -> "Nominal":
-        """That of a problem, with the given features instead where there are some.
+        """Return the nominal point of a problem.
+
+        **Arguments:**
+
+        - `problem`: says what is nominal.
+        - `nominal`: features that take the place of what it says.
 
         **Raises:** `ValueError` where neither names all features, or one is outside the space.
         """
@@ -54,8 +63,11 @@ class Nominal:
         features = space.coerce({name: whole[name] for name in varied})
         return cls(space, np.asarray(jax.jit(space.flatten)(features), np.float32))
 
-    def on_the_side_of(self, u: Float[np.ndarray, " d"]) -> "Nominal":
-        """The same, and continuous coordinates depart only to where those of `u` do."""
+    def restrict_to_side(self, u: Float[np.ndarray, " d"]) -> "Nominal":
+        """Return the same point with departures allowed only to the side on which `u` is.
+
+        Discrete coordinates stay free.
+        """
         free = (np.array(self.space.levels) > 0) | (u == self.u)
         low = np.where(free | (u < self.u), 0.0, self.u)
         high = np.where(free | (u > self.u), 1.0, self.u)
@@ -68,21 +80,24 @@ class Nominal:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What the coordinates are called."""
+        """Names of the coordinates."""
         return self.space.coordinates
 
     @cached_property
     def groups(self) -> tuple[tuple[str, Int[np.ndarray, " k"]], ...]:
         """The features, each with the places of its coordinates."""
-        found, first = [], 0
+        groups, first = [], 0
         for name, domain in self.space.root.fields:
             if domain.size:
-                found.append((name, np.arange(first, first + domain.size)))
+                groups.append((name, np.arange(first, first + domain.size)))
             first += domain.size
-        return tuple(found)
+        return tuple(groups)
 
-    def settle(self, points: Any) -> Float[np.ndarray, "n d"]:
-        """These points inside the cube, in the middles of cells, nominal where they mean it."""
+    def settle(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Move points into the cube, and their discrete coordinates to the middles of cells.
+
+        In the cell of the nominal point a discrete coordinate is exactly nominal.
+        """
         u = np.clip(np.asarray(points, np.float64), self.low, self.high).astype(np.float32)
         discrete = self.cube.discrete
         if len(discrete):
@@ -92,22 +107,22 @@ class Nominal:
             u[:, discrete] = np.where(same, self.u[discrete], middles)
         return u
 
-    def cells(self, points: Any) -> Int[np.ndarray, "*n k"]:
-        """Which cell holds each discrete coordinate."""
+    def cells(self, points: Float[np.ndarray, "*n d"]) -> Int[np.ndarray, "*n k"]:
+        """Return the cell of each discrete coordinate of points `[*n, d]`."""
         return np.asarray(self.cube.cells(np.asarray(points, np.float32)))  # pyright: ignore[reportArgumentType]
 
-    def centres(self, cells: Any) -> Float[np.ndarray, "*n k"]:
-        """The middles of cells."""
+    def centres(self, cells: Int[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
+        """Return the middles of cells as coordinates."""
         return np.asarray(self.cube.centres(np.asarray(cells, np.int32)))  # pyright: ignore[reportArgumentType]
 
     def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
-        """Which coordinates of settled points are not nominal."""
+        """Return the coordinates of settled points that are not nominal."""
         return points != self.u
 
     def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-        """How much each coordinate departs, 0 to 1.
+        """Return the departure of each coordinate, from 0 to 1.
 
-        Integers and lengths by difference of places, choices 0 or 1.
+        That of integers and lengths is a difference of places, that of choices 0 or 1.
         """
         gap = np.abs(np.asarray(points, np.float64) - self.u)
         discrete = self.cube.discrete
@@ -120,9 +135,9 @@ class Nominal:
         return gap
 
     def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
-        """How many coordinates depart."""
+        """Count the coordinates that depart."""
         return self.departs(points).sum(axis=1)
 
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Euclidean length of the departure."""
+        """Return the Euclidean length of the departure."""
         return np.sqrt((self.gaps(points) ** 2).sum(axis=1))

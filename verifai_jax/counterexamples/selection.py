@@ -1,9 +1,11 @@
-"""Which row of a run is meant, and what else the run has: where shrink and explain begin."""
+"""The selection of a counterexample of a run, and of others beside it."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 
 from verifai_jax.counterexamples.nominal import Nominal
@@ -11,11 +13,14 @@ from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
+Row: TypeAlias = int | np.integer | pd.Series | Mapping[str, Any] | None
+"""A row of a table by its number, itself, or as a mapping of its columns; None if left out."""
 
-def problem_of(run: Any) -> Problem:
-    """The problem of a run, on the backend on which it ran.
 
-    **Raises:** `TypeError` for what is no run; `ValueError` for one without its problem.
+def problem_of(run: Run) -> Problem:
+    """Return the problem of a run, on the backend on which it ran.
+
+    **Raises:** `TypeError` for anything but a run; `ValueError` for one without its problem.
     """
     if not isinstance(run, Run):
         raise TypeError(f"a run of falsify is needed; got {type(run).__name__}")
@@ -27,10 +32,18 @@ def problem_of(run: Any) -> Problem:
     return resolved(run.problem, wanted=run.backend).problem
 
 
-def row_of(run: Run, row: Any) -> tuple[int, Any]:
-    """The number and the entries of a counterexample.
+def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
+    """Select a counterexample of a run.
 
-    **Raises:** `ValueError` where there is none, or this is none.
+    **Arguments:**
+
+    - `run`: a run with a counterexample.
+    - `row`: its number, or a row of the table; the worst where it is None.
+
+    **Returns:** its number, and the entries of its row by column.
+
+    **Raises:** `ValueError` for a run without a counterexample, or a row that is none; `TypeError`
+    or `IndexError` for what is no row of the table.
     """
     failing = run.table.counterexamples
     if not len(failing):
@@ -43,7 +56,7 @@ def row_of(run: Run, row: Any) -> tuple[int, Any]:
     number = int(number)
     if not 0 <= number < run.simulations:
         raise IndexError(f"row {number} is not in the table of {run.simulations} simulations")
-    entry = run.table.all.iloc[number]
+    entry = {str(name): value for name, value in run.table.all.iloc[number].items()}
     # A row that was not confirmed is none that the run claims; it may be asked for all the same.
     if number not in failing.index and not bool(entry.get("violated", False)):
         some = ", ".join(map(str, failing.index[:5]))
@@ -54,13 +67,16 @@ def row_of(run: Run, row: Any) -> tuple[int, Any]:
     return number, entry
 
 
-def other_failures(run: Run, nominal: Nominal, number: int, most: int) -> Float[np.ndarray, "n d"]:
-    """Other counterexamples than row `number`, at most so many: half of them the nearest."""
+def select_others(run: Run, nominal: Nominal, number: int, most: int) -> Float[np.ndarray, "n d"]:
+    """Return the points of other counterexamples than row `number`, `most` of them at most.
+
+    Where there are more, half of them are the nearest, and the rest is spread over the others.
+    """
     failing = run.table.counterexamples
     failing = failing.loc[failing.index != number]
     if not len(failing):
         return np.zeros((0, nominal.space.dim), np.float32)
-    order = np.argsort(_roughly(nominal, failing), kind="stable")
+    order = np.argsort(_rough_distance(nominal, failing), kind="stable")
     if len(order) > most:
         half = most // 2
         rest = np.linspace(half, len(order) - 1, most - half).astype(int)
@@ -68,8 +84,8 @@ def other_failures(run: Run, nominal: Nominal, number: int, most: int) -> Float[
     return nominal.settle(nominal.space.points(failing.iloc[order]))
 
 
-def _roughly(nominal: Nominal, rows: Any) -> Float[np.ndarray, " n"]:
-    """About how far rows are from nominal, without their points, which take time to compute."""
+def _rough_distance(nominal: Nominal, rows: pd.DataFrame) -> Float[np.ndarray, " n"]:
+    """Estimate how far rows are from nominal from the table, since points take time to compute."""
     at = jax.jit(nominal.space.unflatten)(nominal.u)
     columns = nominal.space.rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], at))
     total = np.zeros(len(rows))
@@ -84,7 +100,7 @@ def _roughly(nominal: Nominal, rows: Any) -> Float[np.ndarray, " n"]:
 
 
 def columns_at(problem: Problem, u: Float[np.ndarray, " d"]) -> dict[str, Any]:
-    """The row of a table with the features at this point."""
+    """Return the row of a table with the features at a point."""
     features = jax.tree.map(
         lambda leaf: np.asarray(leaf)[None], jax.jit(problem.space.unflatten)(u)
     )

@@ -169,7 +169,7 @@ def _draw_bars(axes: Any, explained: "Explained") -> None:
         axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:.3g})")
         axes.set_title("what removes the failure", fontsize=9, loc="left")
     else:
-        sizes = [float(np.abs(np.nan_to_num(i.slope)).max(initial=0.0)) for i in shown]
+        sizes = [float(np.abs(np.nan_to_num(i.gradient)).max(initial=0.0)) for i in shown]
         axes.barh(where, sizes, color=QUIET, height=0.6)
         axes.set_xlabel("change of robustness over the feature's range")
         axes.set_title("steepest features", fontsize=9, loc="left")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.analysis.frequent_patterns import Recurrent
+from verifai_jax.analysis._frequent_patterns import FrequentPatterns
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.text import shorten
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -14,18 +14,18 @@ BARS = 16
 """Patterns drawn at most."""
 
 
-def plot_frequent_patterns(patterns: Recurrent, path: str | Path | None = None) -> Figure:
+def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None = None) -> Figure:
     """Draw the shares of the patterns with the greatest lift, and the shares expected.
 
     **Arguments:**
 
-    - `patterns`: what `analysis.recurrent` returned.
+    - `patterns`: what `analysis.frequent_patterns` returned.
     - `path`: of a picture to write; none when left out.
 
     **Returns:** the figure.
     """
     compared = patterns.against != "nothing"
-    shown = patterns.telling.head(BARS).sort_values("share", ascending=False, kind="stable")
+    shown = patterns.distinctive.head(BARS).sort_values("share", ascending=False, kind="stable")
     longest = max((len(text) for text in shown["combination"]), default=0)
     figure = new_figure(figsize=(5.2 + 0.055 * min(longest, 60), 1.5 + 0.34 * max(2, len(shown))))
     axes = figure.subplots()
@@ -55,5 +55,5 @@ def plot_frequent_patterns(patterns: Recurrent, path: str | Path | None = None) 
     tidy(axes)
     axes.grid(visible=False, axis="y")
     figure.legend(frameon=False, fontsize=8, loc="outside lower center", ncols=2)
-    figure.suptitle(f"Recurrent values, {patterns.samples.kind}", fontsize=10)
+    figure.suptitle(f"Frequent patterns, {patterns.samples.kind}", fontsize=10)
     return show_or_save(figure, path)

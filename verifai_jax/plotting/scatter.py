@@ -37,7 +37,7 @@ def plot_features(
     """
     table = run.table.all
     if features is None:
-        features = telling_features(run)[:most]
+        features = distinguishing_features(run)[:most]
     else:
         from verifai_jax.core.errors import check_names
 
@@ -87,7 +87,7 @@ def plot_features(
     return show_or_save(figure, path)
 
 
-def telling_features(run: "Run") -> list[str]:
+def distinguishing_features(run: "Run") -> list[str]:
     """Feature columns, those first whose distributions differ most between failing and safe rows.
 
     The difference is the Kolmogorov-Smirnov distance; without failing rows, the correlation of

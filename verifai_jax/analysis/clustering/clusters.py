@@ -1,4 +1,4 @@
-"""Clusters of failures: kinds of rows that lie together, and one row to look at for each.
+"""Clusters of failures: kinds of rows that lie together, with a typical row of each.
 
     found = clusters(run)
     found.table                  size, centre, a typical row and the worst row of each cluster
@@ -13,36 +13,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-import jax
 import numpy as np
-from jaxtyping import Int, Key
+import pandas as pd
+from jaxtyping import Int
 
 from verifai_jax.analysis.clustering.density import dbscan
 from verifai_jax.analysis.clustering.prototypes import prototypes
 from verifai_jax.analysis.data.samples import (
     Samples,
     Scale,
+    Seed,
+    Source,
     Which,
     beside,
     distances,
     generator,
 )
 from verifai_jax.core.checks import check_count, check_positive
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 Method = Literal["auto", "kmeans", "kmodes", "kprototypes", "dbscan"]
 METHODS = ("auto", "kmeans", "kmodes", "kprototypes", "dbscan")
 # Kaufman and Rousseeuw, Finding Groups in Data, 1990: below, there is no substantial structure.
 LEAST_SILHOUETTE = 0.25
-_JUDGED = 2000
+_SILHOUETTE_ROWS = 2000
 _TRIED = 5000
 _STARTS = 8
 
@@ -70,14 +70,12 @@ class Clusters:
         return int(self.assigned.max(initial=-1)) + 1
 
     @property
-    def labels(self) -> "pd.Series":
+    def labels(self) -> pd.Series:
         """Cluster of each row number of the table; -1 is noise."""
-        import pandas as pd
-
         return pd.Series(self.assigned, index=self.samples.frame.index, name="cluster")
 
     def rows(self, cluster: int) -> Int[np.ndarray, " size"]:
-        """Row numbers of a cluster.
+        """Return the row numbers of a cluster.
 
         **Raises:** `IndexError` for a cluster that does not exist.
         """
@@ -86,10 +84,8 @@ class Clusters:
         return self.samples.rows[self.assigned == cluster]
 
     @cached_property
-    def centres(self) -> "pd.DataFrame":
+    def centres(self) -> pd.DataFrame:
         """Mean of each ordered column, most frequent choice of each unordered one, by cluster."""
-        import pandas as pd
-
         kinds = np.unique(self.assigned)
         frame = self.samples.frame
         columns: dict[str, Any] = {}
@@ -105,15 +101,13 @@ class Clusters:
         return pd.DataFrame(columns, index=pd.Index(kinds, name="cluster"))
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """A row for each cluster, the largest first, noise (-1) last.
 
         Its centre in the features; `size` and `share` of the rows; `representative`: the row
         nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a
         feature has gets `_` added.
         """
-        import pandas as pd
-
         placed = _place(self.samples, self.scale, self.weight)
         centred = _place(self.samples, self.scale, self.weight, self.centres)
         rho = np.nan_to_num(self.samples.rho, nan=np.inf)
@@ -136,8 +130,15 @@ class Clusters:
         table = beside(self.centres, pd.DataFrame(own, index=self.centres.index))
         return table.loc[[*range(self.count), *([-1] if -1 in table.index else [])]]
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the clusters over the two columns that tell them apart best; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the clusters over the two columns that tell them apart best.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.clusters", "plot_clusters")(self, path)
 
     def __str__(self) -> str:
@@ -166,10 +167,10 @@ _OWN = ("size", "share", "representative", "worst", "worst_rho")
 
 
 def clusters(
-    source: Any,
+    source: Source,
     method: Method = "auto",
     count: int | None = None,
-    seed: "int | Key[jax.Array, '']" = 0,
+    seed: Seed = 0,
     columns: Sequence[str] | None = None,
     which: Which = "counterexamples",
     scale: Scale = "range",
@@ -177,9 +178,12 @@ def clusters(
     radius: float | None = None,
     space: Problem | FeatureSpace | None = None,
 ) -> Clusters:
-    """Clusters of rows.
+    """Find clusters of rows.
 
-    - `source`, `columns`, `which`, `space`: as in `Samples.of`; `scale` as in `Samples.scaling`.
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
     - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
       `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
       both, and finds the number of clusters and the noise itself.
@@ -188,8 +192,13 @@ def clusters(
       0.25, or there are less than three rows. It is chosen on at most 5000 rows.
     - `radius`: of DBSCAN, by default the knee of the distances to the k-th neighbour, where k is
       twice the number of columns, and 4 at least.
+    - `seed`: an integer, a NumPy generator or a `jax.random` key.
+    - `scale`: as in `Samples.scaling`.
+    - `most`: clusters at most, where `count` is left out.
 
-    The same seed gives the same clusters. **Raises:** `ValueError` for an unknown method; a method
+    **Returns:** `Clusters`; the same seed gives the same ones.
+
+    **Raises:** `ValueError` for an unknown method; a method
     without a column that it can use; a `count` above the number of different rows, or for DBSCAN; a
     radius that is not positive, or for another method.
     """
@@ -226,7 +235,7 @@ def clusters(
 
 
 def _weight(samples: Samples, scale: Scale) -> float:
-    """So that numbers and choices differ equally much on average over pairs of rows."""
+    """Return the weight with which numbers and choices differ equally on average."""
     coordinates, codes = samples.place(scale)
     apart = 2 * coordinates.var(axis=0).sum() / max(len(samples.ordered), 1)
     if not codes.shape[1] or apart <= 0:
@@ -236,15 +245,15 @@ def _weight(samples: Samples, scale: Scale) -> float:
 
 
 def _place(
-    samples: Samples, scale: Scale, weight: float, frame: "pd.DataFrame | None" = None
+    samples: Samples, scale: Scale, weight: float, frame: pd.DataFrame | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `Samples.place`, the coordinates divided so that a different choice has this weight."""
+    """Return `Samples.place`, divided so that a different choice has this weight."""
     coordinates, codes = samples.place(scale, frame)
     return coordinates / np.sqrt(weight), codes
 
 
 def _best_count(placed: tuple[np.ndarray, np.ndarray], most: int, rng: np.random.Generator) -> int:
-    """The number of clusters with the greatest silhouette, tried on at most 5000 rows."""
+    """Return the number of clusters with the greatest silhouette, tried on at most 5000 rows."""
     rows = rng.permutation(len(placed[0]))[:_TRIED]
     part = placed[0][rows], placed[1][rows]
     best, reached = 1, LEAST_SILHOUETTE
@@ -291,11 +300,11 @@ def _dense(
 def _silhouette(
     placed: tuple[np.ndarray, np.ndarray], labels: np.ndarray, rng: np.random.Generator
 ) -> float:
-    """On at most 2000 rows, noise left out; NaN where it is not defined."""
+    """Return the silhouette of at most 2000 rows, noise left out; NaN where it is not defined."""
     from sklearn.metrics import silhouette_score
 
     rows = np.flatnonzero(labels >= 0)
-    rows = rng.permutation(rows)[:_JUDGED]
+    rows = rng.permutation(rows)[:_SILHOUETTE_ROWS]
     kinds = len(np.unique(labels[rows]))
     if not 2 <= kinds < len(rows):
         return np.nan
@@ -305,7 +314,7 @@ def _silhouette(
 
 
 def _by_size(labels: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Renumbered, the largest cluster first; of equal ones that with the first row."""
+    """Renumber clusters, the largest first; of equal ones that with the first row."""
     kinds, first, counts = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
     order = np.lexsort((first, -counts))
     new = np.full(int(labels.max(initial=-1)) + 2, -1, np.int64)

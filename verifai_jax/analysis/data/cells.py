@@ -1,20 +1,18 @@
-"""Which cells of the feature space, of one feature and of two, have samples in them.
+"""Cells of the feature space, of one feature and of two, that have samples in them.
 
 Pairs of discrete values are those of t-wise coverage in combinatorial testing (Kuhn, Kacker and
 Lei, Introduction to combinatorial testing, 2013).
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.marginals import Marginal
 from verifai_jax.analysis.data.samples import Samples
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MOST_VALUES = 20
 """Values up to which each one of a discrete feature is a cell of its own."""
@@ -25,17 +23,21 @@ BLOCK = 4096
 
 
 class Cells(NamedTuple):
-    """One feature cut into cells: the cell of each row (-1 where absent), and their prior."""
+    """One feature cut into cells.
+
+    **Fields:** `name` of the feature; `ids` `[n]`: cell of each row, -1 where absent; `prior` of
+    the cells; `marginal` of the feature; `single_values`: whether each cell is one value.
+    """
 
     name: str
     ids: Int[np.ndarray, " n"]
     prior: Float[np.ndarray, " cells"]
     marginal: Marginal
-    listed: bool  # Whether each cell is one value.
+    single_values: bool
 
 
 def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
-    """The rows in cells: one for each value of a discrete feature, else `count` of a range."""
+    """Cut features into cells: one for each value of a discrete one, else `count` of its range."""
     found = []
     for part in parts:
         name = part.column.name
@@ -50,17 +52,21 @@ def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
     return found
 
 
-def occupied(
+def count_occupied(
     n: int, rows: list[Cells], allowed: list[Cells] | None = None
-) -> tuple["pd.DataFrame", "pd.DataFrame", int]:
-    """The tables of features and of what was never tried, and how much that is.
+) -> tuple[pd.DataFrame, pd.DataFrame, int]:
+    """Count the cells that have rows in them.
+
+    **Arguments:**
 
     - `n`: number of rows.
+    - `rows`: the features in cells.
     - `allowed`: samples of the prior in the same cells, where it is not uniform on all of them:
       cells in which none of them lies do not count.
-    """
-    import pandas as pd
 
+    **Returns:** a table with a row for each feature, a table of the values and pairs of values that
+    were never tried (1000 at most), and their number.
+    """
     most = min(len(rows), MOST_FEATURES)
     counts = np.array([len(cells.prior) for cells in rows])
     edges = np.concatenate([[0], np.cumsum(counts[:most])])
@@ -74,7 +80,7 @@ def occupied(
         prior = one.prior if allowed is None else _shares(_count(allowed[i], counts[i]))
         real = seen | (prior > 0)
         table[i, :3] = real.sum(), np.mean(seen[real]), np.mean(_chance(prior[real], n))
-        if one.listed:
+        if one.single_values:
             never = np.flatnonzero(real & ~seen)
             missing += len(never)
             untried += [(one.name, one.marginal.shown(int(cell)), "", "") for cell in never]
@@ -88,7 +94,7 @@ def occupied(
             pair = pair if allowed is None else _shares(possible[block])
             real = both | (pair > 0)
             shares.append((np.mean(both[real]), np.mean(_chance(pair[real], n))))
-            if i < j and one.listed and other.listed:
+            if i < j and one.single_values and other.single_values:
                 # A value that was never tried is not listed again with all of its partners.
                 alive = np.outer(both.any(axis=1), both.any(axis=0))
                 empty = np.argwhere(~both & real & alive)
@@ -119,17 +125,19 @@ def _count(cells: Cells, count: int) -> Int[np.ndarray, " cells"]:
     return np.bincount(cells.ids[cells.ids >= 0], minlength=count)
 
 
-def _shares(counts: Any) -> Any:
+def _shares(counts: np.ndarray) -> Float[np.ndarray, "..."]:
     return counts / max(counts.sum(), 1)
 
 
 def _chance(prior: Float[np.ndarray, "*cells"], n: int) -> Float[np.ndarray, "*cells"]:
-    """The probabilities that some of `n` samples of the prior lie in a cell."""
+    """Return the probabilities that some of `n` samples of the prior lie in a cell."""
     return 1 - (1 - prior) ** n
 
 
-def pair_counts(ids: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]) -> Any:
-    """How many rows lie in each two cells of all features, `[sum of counts] * 2`."""
+def pair_counts(
+    ids: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]
+) -> Float[np.ndarray, "cells cells"]:
+    """Count the rows in each two cells of all features."""
     edges = np.concatenate([[0], np.cumsum(counts)])[:-1]
     total = int(counts.sum())
     together = np.zeros((total, total))

@@ -1,12 +1,14 @@
-"""What a column of the error table is: numbers with an order, or choices without one."""
+"""Columns of the error table: numbers with an order, or choices without one."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
+from jaxtyping import Int
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.table import RESERVED
@@ -21,9 +23,6 @@ from verifai_jax.features import (
     VariableArray,
 )
 from verifai_jax.features.domain import Domain, as_scalar, indexed
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,11 @@ class Column:
     uniform: bool = False
     length: bool = False
 
-    def codes(self, entries: Any) -> np.ndarray:
-        """Places of the entries `[n]` (a Series) in `choices`, as int64; -1 for an absent one.
+    def codes(self, entries: pd.Series | pd.DataFrame) -> Int[np.ndarray, " n"]:
+        """Return the places of entries in `choices`; -1 for an absent one.
 
         **Raises:** `ValueError` for an entry that is none of the choices.
         """
-        import pandas as pd
-
         kinds, values = pd.factorize(entries)
         places = _places(self.choices)
         found = [places.get(value, places.get(str(value), -2)) for value in values.tolist()]
@@ -72,8 +69,8 @@ class Column:
         return codes
 
 
-def feature_columns(table: "pd.DataFrame", space: FeatureSpace | None) -> tuple[str, ...]:
-    """Names of the feature columns: those of the space, or all but verdicts and robustness.
+def feature_columns(table: pd.DataFrame, space: FeatureSpace | None) -> tuple[str, ...]:
+    """Return the feature columns: those of the space, or all but verdicts and robustness.
 
     **Raises:** `UnknownNameError` for a feature of the space that the table does not have.
     """
@@ -85,9 +82,9 @@ def feature_columns(table: "pd.DataFrame", space: FeatureSpace | None) -> tuple[
 
 
 def describe_columns(
-    table: "pd.DataFrame", names: Sequence[str], space: FeatureSpace | None
+    table: pd.DataFrame, names: Sequence[str], space: FeatureSpace | None
 ) -> tuple[Column, ...]:
-    """What each named column is: as the space says, otherwise as its entries are.
+    """Describe columns: as the space says, otherwise as their entries are.
 
     **Raises:** `UnknownNameError` for a column that the table does not have; `ValueError` for an
     ordered one with infinite entries.
@@ -98,8 +95,6 @@ def describe_columns(
 
 
 def _column(entries: Any, name: str, known: Mapping[str, Any]) -> Column:
-    import pandas as pd
-
     numbers = pd.api.types.is_numeric_dtype(entries) and not pd.api.types.is_bool_dtype(entries)
     if not known.get("ordered", numbers):
         choices = known.get("choices")
@@ -138,7 +133,7 @@ def _of_space(space: FeatureSpace) -> dict[str, dict[str, Any]]:
 
 
 def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
-    """What a domain says about its columns."""
+    """Return what a domain says about its columns."""
     if isinstance(domain, Struct):
         found: dict[str, dict[str, Any]] = {}
         for field, part in domain.fields:
@@ -174,7 +169,7 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _of_other_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
-    """Bounds from the ends of the coordinates, or those that the domain names.
+    """Return bounds from the ends of the coordinates, or those that the domain names.
 
     The range of a distribution without ends, such as a normal one, leaves out their thousandths.
     """
@@ -207,7 +202,7 @@ def _integers(low: int, high: int) -> dict[str, Any]:
 
 
 def _shown(domain: Categorical) -> tuple[Any, ...]:
-    """The choices as the table shows them, in the order of the space."""
+    """Return the choices as the table shows them, in the order of the space."""
     return domain.choices if domain.numeric else tuple(map(str, domain.choices))
 
 

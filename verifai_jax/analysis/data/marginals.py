@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.columns import Column
@@ -21,7 +22,7 @@ POINTS = 12  # As a power of two.
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """How one column is distributed by the prior.
+    """Prior distribution of one column.
 
     **Fields:** `column`; `edges`: ends `[values + 1]` of the cells of a discrete one in `[0, 1]`,
     None for a continuous one, whose distribution function goes through `knots` at `heights`.
@@ -38,7 +39,7 @@ class Marginal:
         return 0 if self.edges is None else len(self.edges) - 1
 
     def cells(self, samples: Samples) -> Int[np.ndarray, " n"]:
-        """Which value each row has, of a discrete column; -1 where absent."""
+        """Return the cell of each row, of a discrete column; -1 where absent."""
         entries = samples.frame[self.column.name]
         if not self.column.ordered:
             return self.column.codes(entries)
@@ -46,8 +47,10 @@ class Marginal:
         cells = np.clip(np.nan_to_num(values) - self.column.near, 0, self.count - 1)
         return np.where(np.isnan(values), -1, np.round(cells)).astype(np.int64)
 
-    def unit(self, samples: Samples, generator: Any = None) -> Float[np.ndarray, " n"]:
-        """Coordinates of the rows: mid-cell where discrete, or anywhere in it with a generator.
+    def unit(
+        self, samples: Samples, generator: np.random.Generator | None = None
+    ) -> Float[np.ndarray, " n"]:
+        """Return coordinates of the rows: mid-cell where discrete, or drawn in it by a generator.
 
         An absent entry is in the middle.
         """
@@ -60,15 +63,15 @@ class Marginal:
         unit = np.interp(np.nan_to_num(values), self.knots, self.heights, left=0, right=1)
         return np.where(np.isnan(values), 0.5, unit)
 
-    def snapped(self, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Coordinates moved to the middle of their cells, where there are any."""
+    def snap(self, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return coordinates moved to the middle of their cells, where there are any."""
         if self.edges is None:
             return u
         cells = np.clip(np.searchsorted(self.edges, u, side="right") - 1, 0, self.count - 1)
         return (self.edges[cells] + self.edges[cells + 1]) / 2
 
     def value(self, u: float) -> Any:
-        """The entry at a coordinate."""
+        """Return the entry at a coordinate."""
         if self.edges is not None:
             place = int(
                 np.clip(np.searchsorted(self.edges, u, side="right") - 1, 0, self.count - 1)
@@ -77,14 +80,14 @@ class Marginal:
         return float(np.interp(u, self.heights, self.knots))
 
     def shown(self, cell: int) -> Any:
-        """The value of a discrete column as the table shows it."""
+        """Return the value of a discrete column as the table shows it."""
         if not self.column.ordered:
             return self.column.choices[cell]
         return int(self.column.near + cell)
 
 
 def marginals(samples: Samples) -> tuple[Marginal, ...]:
-    """How the columns of `samples` are distributed by the prior, ordered ones first."""
+    """Return the prior distributions of the columns, ordered ones first."""
     prior = _prior(samples)
     return tuple(
         _marginal(column, prior.get(column.name))
@@ -97,7 +100,6 @@ def _prior(samples: Samples) -> dict[str, Any]:
         return {}
     import jax
     import jax.numpy as jnp
-    import pandas as pd
     from scipy.stats import qmc
 
     u = qmc.Sobol(samples.space.dim, rng=0).random_base2(POINTS)
@@ -117,7 +119,7 @@ def _uniform(domain: Domain) -> bool:
     return isinstance(domain, Box | DiscreteBox | Constant)
 
 
-def _marginal(column: Column, prior: Any) -> Marginal:
+def _marginal(column: Column, prior: pd.Series | None) -> Marginal:
     none = np.zeros(0)
     if not column.ordered or column.integer:
         count = round(column.far - column.near) + 1 if column.ordered else len(column.choices)

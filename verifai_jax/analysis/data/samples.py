@@ -13,15 +13,16 @@ looked at.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+import pandas as pd
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.analysis.data.columns import Column, describe_columns, feature_columns
-from verifai_jax.analysis.data.verdicts import chosen, nothing, verdicts
+from verifai_jax.analysis.data.verdicts import explain_empty, select_rows, verdicts
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.run import Run
@@ -29,13 +30,12 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 Which = Literal["counterexamples", "safe", "failed", "all"]
 Scale = Literal["range", "rows", "standard", "raw"]
 WHICH = ("counterexamples", "safe", "failed", "all")
 SCALES = ("range", "rows", "standard", "raw")
+Seed: TypeAlias = int | np.integer | np.random.Generator | jax.Array
+"""An integer, a NumPy generator or a `jax.random` key."""
 # With it an absent entry is 0.87 to 1 away from every present one of a column in [0, 1].
 _ABSENT = np.sqrt(3) / 2
 
@@ -49,46 +49,46 @@ class Samples:
     whole table; `space` of the features, if known.
 
     Entries that are missing (NaN, None) are absent items of arrays of variable length. `matrix`
-    takes the mean of the rows that have the item, so that an absent one adds nothing to a
+    takes the mean of the rows that have the item, so that an absent one adds explain_empty to a
     covariance; `codes` says -1; in `points`, absence is a value of its own.
     """
 
-    frame: "pd.DataFrame"
+    frame: pd.DataFrame
     columns: tuple[Column, ...]
     which: str
     name: str
-    table: "pd.DataFrame"
+    table: pd.DataFrame
     space: FeatureSpace | None = None
 
     @classmethod
     def of(
         cls,
-        source: "Run | ErrorTable | pd.DataFrame | Samples",
+        source: "Source",
         which: Which = "counterexamples",
         columns: Sequence[str] | None = None,
         space: Problem | FeatureSpace | None = None,
     ) -> "Samples":
-        """The samples of a run, of its table, or of any DataFrame with feature columns.
+        """Select samples of a run, of its table, or of any DataFrame with feature columns.
 
+        **Arguments:**
+
+        - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
+          `Samples`, which are taken as they are, with other `columns` where they are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
-          rows with a verdict. A DataFrame is judged by its columns `violated` and `status`, else
-          by `rho < 0`; without either, all of its rows are counterexamples.
+          rows with a verdict. Those of a DataFrame are told by its columns `violated` and
+          `status`, else by `rho < 0`; without either, all rows are counterexamples.
         - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
           robustness, are columns too, but only if named here.
         - `space`: says which columns are ordered and what their ranges are; a run knows its own.
-
-        `Samples` are taken as they are; only `columns` may select among the table's again.
 
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, no rows,
         row numbers that are not unique integers, unknown columns (with the nearest names), or
         columns named twice.
         """
-        import pandas as pd
-
         if isinstance(source, Samples):
             if columns is None:
                 return source
-            described = _described(source.table, columns, source.space)
+            described = _columns(source.table, columns, source.space)
             return replace(source, columns=described)
         if which not in WHICH:
             raise ValueError(f"which must be one of {', '.join(map(repr, WHICH))}; got {which!r}")
@@ -116,10 +116,10 @@ class Samples:
         if isinstance(source, ErrorTable | Run) and space is None:
             table_of = source.table if isinstance(source, Run) else source
             features = table_of.features
-        described = _described(table, features if columns is None else columns, space)
-        rows = chosen(table, which)
+        described = _columns(table, features if columns is None else columns, space)
+        rows = select_rows(table, which)
         if not rows.any():
-            raise ValueError(nothing(table, which))
+            raise ValueError(explain_empty(table, which))
         return cls(table.loc[rows], described, which, name, table, space)
 
     def __len__(self) -> int:
@@ -147,7 +147,7 @@ class Samples:
 
     @cached_property
     def failing(self) -> Bool[np.ndarray, " n"]:
-        """Which of the rows looked at are counterexamples."""
+        """Verdicts of the rows looked at: True for counterexamples."""
         return verdicts(self.table)[0][self.table.index.get_indexer(self.frame.index)]
 
     @cached_property
@@ -163,17 +163,17 @@ class Samples:
         return int(np.argmin(np.nan_to_num(self.rho, nan=np.inf)))
 
     def others(self, which: Which) -> "Samples":
-        """The same columns of other rows of the same table.
+        """Select the same columns of other rows of the same table.
 
         **Raises:** `ValueError` if there are no such rows.
         """
-        rows = chosen(self.table, which)
+        rows = select_rows(self.table, which)
         if not rows.any():
-            raise ValueError(nothing(self.table, which))
+            raise ValueError(explain_empty(self.table, which))
         return replace(self, frame=self.table.loc[rows], which=which)
 
-    def at(self, rows: "Sequence[int] | Int[np.ndarray, ' k']") -> "pd.DataFrame":
-        """Rows of the table by their numbers, in this order.
+    def at(self, rows: Sequence[int] | Int[np.ndarray, " k"]) -> pd.DataFrame:
+        """Return rows of the table by their numbers, in this order.
 
         **Raises:** `IndexError` for a row number that is not in the table.
         """
@@ -186,7 +186,7 @@ class Samples:
 
     @property
     def kind(self) -> str:
-        """What the rows are, in words: `"12 counterexamples of cart-pole"`."""
+        """Description of the rows: `"12 counterexamples of cart-pole"`."""
         what = {"failed": "rows without a verdict", "all": "rows", "safe": "safe rows"}
         one = len(self) == 1
         words = what.get(self.which, self.which)
@@ -194,14 +194,14 @@ class Samples:
         return f"{len(self):,} {words} of {self.name}"
 
     def values(self) -> Float[np.ndarray, "n k"]:
-        """Ordered columns as they are; NaN where absent."""
+        """Return the ordered columns as they are; NaN where absent."""
         names = [column.name for column in self.ordered]
         return self.frame[names].to_numpy(np.float64).reshape(len(self), len(names))
 
     def scaling(
         self, scale: Scale = "range"
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Offset and width of each ordered column: scaled is `(value - offset) / width`.
+        """Return offset and width of each ordered column: scaled is `(value - offset) / width`.
 
         - `"range"`: range in the feature space, or of the whole table where that is not known;
         - `"rows"`: least and greatest of the rows looked at (VerifAI's `build_normalized`);
@@ -226,7 +226,7 @@ class Samples:
         return offset, np.where(width > 0, width, 1.0)
 
     def matrix(self, scale: Scale = "range") -> Float[np.ndarray, "n k"]:
-        """Ordered columns, scaled; an absent entry is the mean of the present ones."""
+        """Return the ordered columns, scaled; an absent entry is the mean of the present ones."""
         offset, width = self.scaling(scale)
         scaled = (self.values() - offset) / width
         absent = np.isnan(scaled)
@@ -237,11 +237,11 @@ class Samples:
         return scaled
 
     def codes(self) -> Int[np.ndarray, "n m"]:
-        """Unordered columns as places in their `choices`; -1 where absent."""
+        """Return the unordered columns as places in their `choices`; -1 where absent."""
         return self.place()[1]
 
     def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:
-        """All columns, so that Euclidean distances treat ordered and unordered ones alike.
+        """Return all columns such that Euclidean distances treat ordered and unordered ones alike.
 
         The squared distance of two rows is the sum over ordered columns of squared scaled
         differences, and 1 for each unordered column in which they differ. Where only one of two
@@ -255,7 +255,7 @@ class Samples:
         return np.concatenate(parts, axis=1)
 
     def place(
-        self, scale: Scale = "range", frame: "pd.DataFrame | None" = None
+        self, scale: Scale = "range", frame: pd.DataFrame | None = None
     ) -> tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]]:
         """Coordinates of the ordered columns and codes of the unordered ones; see `distances`.
 
@@ -280,7 +280,10 @@ class Samples:
         )
 
     def need_ordered(self, purpose: str) -> None:
-        """Raise `ValueError` unless there is an ordered column; `purpose` begins the message."""
+        """Check that there is an ordered column, which `purpose` needs.
+
+        **Raises:** `ValueError` where there is none.
+        """
         if not self.ordered:
             raise ValueError(
                 f"{purpose} needs an ordered column (numbers); "
@@ -288,7 +291,10 @@ class Samples:
             )
 
     def need_unordered(self, purpose: str) -> None:
-        """Raise `ValueError` unless there is an unordered column."""
+        """Check that there is an unordered column, which `purpose` needs.
+
+        **Raises:** `ValueError` where there is none.
+        """
         if not self.unordered:
             raise ValueError(
                 f"{purpose} needs an unordered column (choices); "
@@ -312,13 +318,17 @@ def distances(
     return np.sqrt(squared)
 
 
-def beside(frame: "pd.DataFrame", own: "pd.DataFrame") -> "pd.DataFrame":
-    """The columns of `frame` and, after them, `own` ones, `_` added to a name that is taken."""
+Source: TypeAlias = Run | ErrorTable | pd.DataFrame | Samples
+"""A run, its table, a DataFrame with feature columns, or samples of one of them."""
+
+
+def beside(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
+    """Append the columns of `own` to those of `frame`, with `_` added to a name that is taken."""
     return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
 
 
-def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.Generator:
-    """A NumPy generator from a seed or a `jax.random` key; the same one for the same seed.
+def generator(seed: Seed) -> np.random.Generator:
+    """Make a NumPy generator from a seed or a `jax.random` key; the same for the same seed.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -331,8 +341,8 @@ def generator(seed: "int | np.random.Generator | Key[Array, '']") -> np.random.G
     return np.random.default_rng(check_count("the seed", seed, 0))
 
 
-def _described(
-    table: "pd.DataFrame", names: Sequence[str], space: FeatureSpace | None
+def _columns(
+    table: pd.DataFrame, names: Sequence[str], space: FeatureSpace | None
 ) -> tuple[Column, ...]:
     if isinstance(names, str):
         raise ValueError(f"columns are given as a list of names; got {names!r}")
@@ -356,7 +366,7 @@ def _statistics(values: np.ndarray, scale: str) -> tuple[float, float]:
     return float(present.mean()), deviation
 
 
-def _has_absent(entries: Any) -> bool:
+def _has_absent(entries: pd.Series | pd.DataFrame) -> bool:
     return bool(entries.isna().any())
 
 

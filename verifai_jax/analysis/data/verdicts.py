@@ -1,32 +1,30 @@
-"""Which rows of a table violate the property, which keep it, and which have no verdict."""
-
-from typing import TYPE_CHECKING
+"""Verdicts of the rows of a table: violated, safe, or none."""
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool
 
-if TYPE_CHECKING:
-    import pandas as pd
 
-
-def verdicts(table: "pd.DataFrame") -> tuple[np.ndarray, np.ndarray]:
-    """Which rows violate the property, and which keep it."""
-    judged = np.ones(len(table), bool)
+def verdicts(
+    table: pd.DataFrame,
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return the rows that violate the property, and those that keep it."""
+    ended = np.ones(len(table), bool)
     if "status" in table:
-        judged = np.asarray(table["status"] == "ok", bool)
+        ended = np.asarray(table["status"] == "ok", bool)
     if "violated" in table:
         violated = np.asarray(table["violated"], bool)
     elif "rho" in table:
         rho = np.asarray(table["rho"], np.float64)
-        judged = judged & ~np.isnan(rho)
+        ended = ended & ~np.isnan(rho)
         violated = rho < 0
     else:
         violated = np.ones(len(table), bool)
-    return judged & violated, judged & ~violated
+    return ended & violated, ended & ~violated
 
 
-def chosen(table: "pd.DataFrame", which: str) -> Bool[np.ndarray, " n"]:
-    """Which rows are `"counterexamples"`, `"safe"`, `"failed"` or `"all"` with a verdict."""
+def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
+    """Select rows: `"counterexamples"`, `"safe"`, `"failed"` or `"all"` with a verdict."""
     violating, safe = verdicts(table)
     if which == "counterexamples":
         return violating
@@ -35,8 +33,8 @@ def chosen(table: "pd.DataFrame", which: str) -> Bool[np.ndarray, " n"]:
     return violating | safe if which == "all" else ~(violating | safe)
 
 
-def nothing(table: "pd.DataFrame", which: str) -> str:
-    """What to say when no row is chosen."""
+def explain_empty(table: pd.DataFrame, which: str) -> str:
+    """Explain in words why a selection of rows is empty."""
     if not len(table):
         return "the table is empty: there are no simulations to analyse"
     violating, safe = (int(part.sum()) for part in verdicts(table))

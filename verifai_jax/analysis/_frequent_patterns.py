@@ -1,8 +1,8 @@
-"""Recurrent values: choices, and combinations of them, that counterexamples have in common.
+"""Frequent patterns: values, and combinations of them, that counterexamples have in common.
 
-    found = recurrent(run)
+    found = frequent_patterns(run)
     found.table                        combinations: how many, which share, how often they fail
-    found.top                          the most recurrent value of each feature
+    found.top                          the most frequent value of each feature
     found.rows(0)                      the row numbers that the first combination covers
 
 A combination is as frequent as its rarest part at most, so that rare parts need not be extended:
@@ -17,21 +17,20 @@ from itertools import combinations as subsets
 from itertools import pairwise
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Int
 
 from verifai_jax.analysis.data.columns import Column
-from verifai_jax.analysis.data.samples import Samples, Which
+from verifai_jax.analysis.data.samples import Samples, Source, Which
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MOST_COMBINATIONS = 50_000
 
@@ -47,12 +46,13 @@ class Item:
 
 
 @dataclass(frozen=True, eq=False)
-class Recurrent:
+class FrequentPatterns:
     """Frequent combinations of values among `samples`.
 
     **Fields:** `items`: the single values, also those that never occur; `combinations`: each a
     tuple of places in `items`; `counts` of rows; `minimum`: the least share that was looked for;
-    `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`.
+    `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`; `expected`:
+    the shares compared with.
     """
 
     samples: Samples
@@ -65,7 +65,7 @@ class Recurrent:
     _present: Bool[np.ndarray, "i n"]
 
     @cached_property
-    def table(self) -> "pd.DataFrame":
+    def table(self) -> pd.DataFrame:
         """A row for each combination, single values first, then the most frequent first.
 
         `count` and `share` of the rows looked at; `expected`: the share that the combination has
@@ -73,8 +73,6 @@ class Recurrent:
         many times as often as an average simulation one with these values is among the rows
         looked at (fails, for counterexamples). NaN where nothing is known to compare with.
         """
-        import pandas as pd
-
         share = self.counts / len(self.samples)
         lift = np.divide(
             share, self.expected, out=np.full(len(share), np.nan), where=self.expected > 0
@@ -93,10 +91,8 @@ class Recurrent:
         )
 
     @cached_property
-    def values(self) -> "pd.DataFrame":
+    def values(self) -> pd.DataFrame:
         """All values of each column, also rare ones: `column`, `value`, `count`, `share`."""
-        import pandas as pd
-
         counts = self._present.sum(axis=1)
         table = pd.DataFrame(
             {
@@ -112,12 +108,12 @@ class Recurrent:
 
     @cached_property
     def top(self) -> dict[str, Any]:
-        """The most recurrent value of each column; the first in the order of choices if equal."""
+        """The most frequent value of each column; the first in the order of choices if equal."""
         first = self.values.drop_duplicates("column")
         return dict(zip(first["column"], first["value"], strict=True))
 
     def rows(self, place: int) -> Int[np.ndarray, " count"]:
-        """Row numbers that the combination in row `place` of `table` covers.
+        """Return the row numbers that the combination in row `place` of `table` covers.
 
         **Raises:** `IndexError` for a place that is not in the table.
         """
@@ -127,22 +123,29 @@ class Recurrent:
             )
         return self.samples.rows[self._present[list(self.combinations[place])].all(axis=0)]
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the shares of the most telling combinations, and what was expected; the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the shares of the most distinctive combinations, and those expected.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.frequent_patterns", "plot_frequent_patterns")(self, path)
 
     def __str__(self) -> str:
         sizes = [len(one) for one in self.combinations]
         single = sizes.count(1)
         lines = [
-            f"{_number(single, 'value')} and {_number(len(sizes) - single, 'combination')} in at "
+            f"{_counted(single, 'value')} and {_counted(len(sizes) - single, 'combination')} in at "
             f"least {self.minimum:.3g} of {self.samples.kind}"
         ]
         for column, value in list(self.top.items())[:8]:
             share = self.values.loc[self.values["column"] == column, "share"].max()
-            lines.append(f"  most recurrent: {column}={value} ({format_percent(share)})")
+            lines.append(f"  most frequent: {column}={value} ({format_percent(share)})")
         against = {"table": "among all rows", "prior": "in the prior"}.get(self.against)
-        rows: Any = self.telling.head(5).itertuples()
+        rows: Any = self.distinctive.head(5).itertuples()
         for row in rows:
             if row.lift > 1:
                 lines.append(
@@ -152,7 +155,7 @@ class Recurrent:
         return "\n".join(lines)
 
     @cached_property
-    def telling(self) -> "pd.DataFrame":
+    def distinctive(self) -> pd.DataFrame:
         """Rows of `table` with the greatest lift first, without combinations that add nothing.
 
         A combination adds something if its lift is 1.1 times that of each of its parts. Where
@@ -171,8 +174,8 @@ class Recurrent:
         return table.iloc[np.argsort(-table["lift"].to_numpy(), kind="stable")]
 
 
-def recurrent(
-    source: Any,
+def frequent_patterns(
+    source: Source,
     columns: Sequence[str] | None = None,
     size: int = 2,
     minimum: float = 0.05,
@@ -180,10 +183,14 @@ def recurrent(
     against: Literal["auto", "table", "prior"] = "auto",
     which: Which = "counterexamples",
     space: Problem | FeatureSpace | None = None,
-) -> Recurrent:
-    """Values of unordered columns, and combinations of up to `size` of them, that occur often.
+) -> FrequentPatterns:
+    """Find frequent values of unordered columns, and combinations of up to `size` of them.
 
-    - `source`, `columns`, `which`, `space`: as in `Samples.of`.
+    **Arguments:**
+
+    - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
+    - `columns`, `which`, `space`: as in `Samples.of`.
+    - `size`: values that a combination has at most.
     - `minimum`: least share of the rows that a combination must have.
     - `bins`: takes ordered columns too, in so many equally wide cells of their range; whole
       numbers that have no more values are taken as they are.
@@ -191,7 +198,11 @@ def recurrent(
       probability. By default the table where it has rows with the other verdict, else the prior
       where it is known. After an active search both depend on where it went.
 
-    An absent item of an array has no value. **Raises:** `ValueError` for no unordered column and no
+    An absent item of an array has no value.
+
+    **Returns:** `FrequentPatterns`.
+
+    **Raises:** `ValueError` for no unordered column and no
     `bins`; a `size` or number of bins below 1; a minimum outside (0, 1]; `against="prior"` without
     a space that knows the prior; more than 50 000 combinations.
     """
@@ -202,7 +213,7 @@ def recurrent(
     if against not in ("auto", "table", "prior"):
         raise ValueError(f"against must be 'auto', 'table' or 'prior'; got {against!r}")
     if bins is None:
-        samples.need_unordered("recurrent values without bins=...")
+        samples.need_unordered("frequent patterns without bins=...")
     else:
         check_count("bins", bins)
     items, present = _items(samples, bins, samples.frame)
@@ -225,7 +236,7 @@ def recurrent(
     if against == "prior":
         expected = np.array([prod(items[i].prior or 0.0 for i in one) for one in combinations])
     order = sorted(range(len(counts)), key=lambda i: (len(combinations[i]), -counts[i], i))
-    return Recurrent(
+    return FrequentPatterns(
         samples=samples,
         items=items,
         combinations=tuple(combinations[i] for i in order),
@@ -238,7 +249,7 @@ def recurrent(
 
 
 def _has_both_verdicts(samples: Samples) -> bool:
-    """Whether some rows with a verdict are not looked at; looked at are all or one kind."""
+    """Return whether some rows with a verdict are not looked at."""
     if samples.which == "all":
         return False
     try:
@@ -250,8 +261,8 @@ def _has_both_verdicts(samples: Samples) -> bool:
 def _frequent(
     items: tuple[Item, ...], present: np.ndarray, elsewhere: np.ndarray, least: int, size: int
 ) -> tuple[list[tuple[int, ...]], np.ndarray, np.ndarray]:
-    """All combinations of at most `size` items, of different columns, with `least` rows."""
-    found: list[tuple[int, ...]] = []
+    """Return all combinations of at most `size` items, of different columns, with `least` rows."""
+    combinations: list[tuple[int, ...]] = []
     counts: list[int] = []
     shares: list[float] = []
 
@@ -263,26 +274,26 @@ def _frequent(
             count = int(np.count_nonzero(covered))
             if count < least:
                 continue
-            if len(found) == MOST_COMBINATIONS:
+            if len(combinations) == MOST_COMBINATIONS:
                 raise ValueError(
                     f"more than {MOST_COMBINATIONS:,} combinations of up to {size} values are in "
                     f"{least} rows or more; raise minimum, or lower size"
                 )
             beyond = others & elsewhere[i]
-            found.append((*one, i))
+            combinations.append((*one, i))
             counts.append(count)
             shares.append(float(beyond.mean()) if len(beyond) else np.nan)
             if len(one) + 1 < size:
                 extend((*one, i), covered, beyond)
 
     extend((), np.ones(present.shape[1], bool), np.ones(elsewhere.shape[1], bool))
-    return found, np.array(counts, np.int64), np.array(shares)
+    return combinations, np.array(counts, np.int64), np.array(shares)
 
 
 def _items(
-    samples: Samples, bins: int | None, frame: "pd.DataFrame"
+    samples: Samples, bins: int | None, frame: pd.DataFrame
 ) -> tuple[tuple[Item, ...], Bool[np.ndarray, "i n"]]:
-    """The values of all columns, and which rows of `frame` have them."""
+    """Return the values of all columns, and the rows of `frame` that have them."""
     items: list[Item] = []
     present: list[np.ndarray] = []
     for column in samples.columns:
@@ -305,7 +316,7 @@ def _items(
 def _cells(
     column: Column, values: np.ndarray, bins: int
 ) -> tuple[Sequence[Any], np.ndarray, Sequence[float] | None]:
-    """Labels of the cells of an ordered column, in which of them the values are, their prior."""
+    """Return labels of the cells of an ordered column, the cell of each value, and the prior."""
     width = column.far - column.near
     if column.integer and width + 1 <= bins:
         labels: list[Any] = list(range(int(column.near), int(column.far) + 1))
@@ -328,5 +339,5 @@ def _cells(
     return labels, codes, prior
 
 
-def _number(count: int, what: str) -> str:
+def _counted(count: int, what: str) -> str:
     return f"{count:,} {what}{'' if count == 1 else 's'}"
