@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from verifai_jax.statistics.least_distance import least_change
 from verifai_jax.statistics.max_min import max_min_step
-from verifai_jax.synthesis.optimize import least
+from verifai_jax.synthesis.optimize import worst_case
 from verifai_jax.synthesis.parametric import Pairs
 
 sizes = st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(0, 10_000))
@@ -81,12 +81,13 @@ def pairs(rho, failing=None, proper=None):
 
 
 def test_the_value_of_parameters():
-    np.testing.assert_array_equal(least(pairs([[1, 2], [-1, 3]])), [1, -1])
+    np.testing.assert_array_equal(worst_case(pairs([[1, 2], [-1, 3]])), [1, -1])
     # A pair that cannot happen says nothing; parameters of which none can are no choice.
-    np.testing.assert_array_equal(least(pairs([[np.inf, 2], [np.inf, np.inf]])), [2, -np.inf])
+    np.testing.assert_array_equal(worst_case(pairs([[np.inf, 2], [np.inf, np.inf]])), [2, -np.inf])
     # A simulation without a verdict is no robust one,
-    assert least(pairs([[1, np.nan], [1, 2]], proper=[[True, False], [True, True]]))[0] == -np.inf
+    unknown = pairs([[1, np.nan], [1, 2]], proper=[[True, False], [True, True]])
+    assert worst_case(unknown)[0] == -np.inf
     # unless the environment gives none to anybody.
-    assert least(pairs([[1, np.nan]], proper=[[True, False]]))[0] == 1
+    assert worst_case(pairs([[1, np.nan]], proper=[[True, False]]))[0] == 1
     # Zero that the Boolean semantics call a failure is below zero.
-    assert least(pairs([[0.0]], failing=[[True]]))[0] < 0 <= least(pairs([[0.0]]))[0]
+    assert worst_case(pairs([[0.0]], failing=[[True]]))[0] < 0 <= worst_case(pairs([[0.0]]))[0]

@@ -1,4 +1,4 @@
-"""How many simulations and seconds are left: one count for all parts of a synthesis."""
+"""A budget of simulations and seconds: one count for all parts of a synthesis."""
 
 import time
 from collections.abc import Callable
@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What may still be spent.
+class Budget:
+    """A budget of simulations, and perhaps of time.
 
     **Arguments:**
 
     - `spent()`: simulations so far.
-    - `most`: of them in all.
-    - `until`: a time of `time.perf_counter`, or None.
+    - `most`: simulations at most.
+    - `until`: a time of `time.perf_counter` in seconds, or None.
     """
 
     spent: Callable[[], int]
@@ -23,39 +23,47 @@ class Limits:
     @property
     def left(self) -> int:
         """Simulations left, none after the time."""
-        return 0 if self.late else max(0, self.most - self.spent())
+        return 0 if self.timed_out else max(0, self.most - self.spent())
 
     @property
-    def over(self) -> bool:
-        """Whether nothing is left."""
+    def exhausted(self) -> bool:
+        """True where nothing is left."""
         return self.left == 0
 
     @property
-    def late(self) -> bool:
-        """Whether the time is up."""
+    def timed_out(self) -> bool:
+        """True where the time is up."""
         return self.until is not None and time.perf_counter() >= self.until
 
     @property
-    def ended(self) -> str:
-        """What ends a work that nothing else has ended."""
-        return "max_seconds" if self.late else "budget"
+    def stopped_by(self) -> str:
+        """Reason for which the work stopped: `"max_seconds"` or `"budget"`."""
+        return "max_seconds" if self.timed_out else "budget"
 
-    def slice(self, simulations: int) -> "Limits":
-        """The same for a part that may spend so many simulations from now on."""
+    def slice(self, simulations: int) -> "Budget":
+        """Return the budget of a part of the work that may make `simulations` from now on."""
         return replace(self, most=min(self.most, self.spent() + simulations))
 
 
-SEARCHING = 0.8
+SEARCH_SHARE = 0.8
 """Share of `max_seconds` after which the search ends, so that time is left for the check."""
 
 
-def timed(
+def split_budget(
     spent: Callable[[], int], budget: int, started: float, max_seconds: float | None
-) -> tuple[Limits, Limits]:
-    """The limits of a search, and of the check after it, whose simulations are not limited."""
+) -> tuple[Budget, Budget]:
+    """Return the budget of a search and that of the check after it, which has no simulation limit.
+
+    **Arguments:**
+
+    - `spent()`: simulations so far.
+    - `budget`: simulations of the search at most.
+    - `started`: a time of `time.perf_counter` in seconds.
+    - `max_seconds`: of search and check together, or None.
+    """
     if max_seconds is None:
-        return Limits(spent, budget), Limits(lambda: 0, 1)
+        return Budget(spent, budget), Budget(lambda: 0, 1)
     return (
-        Limits(spent, budget, started + SEARCHING * max_seconds),
-        Limits(lambda: 0, 1, started + max_seconds),
+        Budget(spent, budget, started + SEARCH_SHARE * max_seconds),
+        Budget(lambda: 0, 1, started + max_seconds),
     )

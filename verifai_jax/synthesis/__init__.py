@@ -1,4 +1,4 @@
-"""Parameters for which a formula holds: found (`synthesize`), or mended (`repair`)."""
+"""Parameters for which a formula holds: chosen by `synthesize`, or changed by `repair`."""
 
 from verifai_jax.synthesis._repair import repair as repair
 from verifai_jax.synthesis._synthesize import synthesize as synthesize

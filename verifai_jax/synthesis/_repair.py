@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Limits, timed
+from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
@@ -27,19 +27,24 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.least_distance import least_change
 from verifai_jax.statistics.max_min import max_min_step
-from verifai_jax.synthesis._synthesize import ATTACK, attacker, check_numbers, feature_loop
+from verifai_jax.synthesis._synthesize import (
+    ATTACK,
+    attack_search,
+    check_numbers,
+    feature_parameters,
+)
 from verifai_jax.synthesis.adversary import attack
 from verifai_jax.synthesis.held_out import held_out
 from verifai_jax.synthesis.optimize import (
     LEAST_BATCH,
     Archive,
     Choice,
-    by_value,
     climb,
-    climbs,
+    cross_entropy,
+    evaluate,
     explore,
-    judged,
-    narrow,
+    has_gradients,
+    value_merit,
 )
 from verifai_jax.synthesis.parametric import ArrayParameters, Parametric
 from verifai_jax.synthesis.results import Repair, Round
@@ -70,7 +75,7 @@ def repair(
     precision: str = "float32",
     backend: str | None = None,
 ) -> Repair:
-    """Change parameters as little as makes the formula hold in all environments that are found.
+    """Change parameters as little as makes the formula hold in all counterexamples.
 
     **Arguments:**
 
@@ -88,7 +93,7 @@ def repair(
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - the others as in `falsify`.
 
-    Ctrl-C ends it and returns what is finished, without the check.
+    **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
 
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
     nominal value, no environment, options out of range, or arrays of a system without gradients.
@@ -103,26 +108,28 @@ def repair(
     check_numbers(margin, rounds=rounds, held_out=held_out)
     loop: Parametric
     if system_of is not None:
-        loop = _arrays(whole, parameters, system_of, nominal, gradient, batch, precision, seed)
+        loop = _array_parameters(
+            whole, parameters, system_of, nominal, gradient, batch, precision, seed
+        )
         start = loop.start
     else:
-        loop, start = _features(
+        loop, start = _feature_parameters(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
-    search = attacker(whole, attack, loop)
-    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
+    search = attack_search(whole, attack, loop)
+    limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     work = _Repair(loop, start, search, limits, margin, seed)
     try:
         if run is not None:
             work.add_run(run)
-        work.go(rounds)
+        work.run(rounds)
         stopped = work.stopped
     except KeyboardInterrupt:
         stopped = "interrupted"
     before = after = None
     searched = loop.simulations
     if stopped != "interrupted" and held_out:
-        before, after = _checked(loop, start, work.now.theta, held_out, margin, seed, checking)
+        before, after = _check(loop, start, work.now.theta, held_out, margin, seed, checking)
     robustness = work.robustness
     if after is not None and after.least is not None:
         robustness = min(robustness, after.least)
@@ -150,8 +157,8 @@ def repair(
     )
 
 
-def _checked(
-    loop: Any, start: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
+def _check(
+    loop: Any, start: Any, theta: Any, count: int, margin: float, seed: int, limits: Budget
 ) -> Any:
     try:
         # What was repaired first: it matters more where time is short.
@@ -161,7 +168,7 @@ def _checked(
         return None, None
 
 
-def _arrays(
+def _array_parameters(
     problem: Any,
     parameters: Any,
     system_of: Any,
@@ -186,7 +193,7 @@ def _arrays(
     )
 
 
-def _features(
+def _feature_parameters(
     problem: Any,
     names: Any,
     nominal: Any,
@@ -205,7 +212,7 @@ def _features(
             "parameters must be names of features, at least one; arrays need "
             f"system_of=function that makes the system of them; got {names!r}"
         )
-    loop = feature_loop(problem, names, gradient, batch, budget, precision, backend, seed)
+    loop = feature_parameters(problem, names, gradient, batch, budget, precision, backend, seed)
     if loop.environment is None:
         raise ValueError(
             "all features are parameters, so that nothing can vary to find counterexamples in; "
@@ -226,14 +233,14 @@ def _features(
 
 
 class _Repair:
-    """The work of a repair, of which all that is finished can be had at any time."""
+    """State of a repair, from which a result can be made at any time."""
 
     def __init__(
         self,
         loop: Parametric,
         start: Float[np.ndarray, " p"],
         search: Search,
-        limits: Limits,
+        limits: Budget,
         margin: float,
         seed: int,
     ) -> None:
@@ -266,74 +273,76 @@ class _Repair:
             failing = pairs.violates(self.margin)[0]
             self.environments = points[failing][: 2 * ADDED].astype(np.float32)
             if failing.any():
-                self.seen(pairs.rho[0])
+                self.set_aim(pairs.rho[0])
         self.notes.append(
             f"{len(self.environments)} counterexamples came from the run of {run.name!r}"
         )
 
-    def seen(self, rho: Any) -> None:
-        """How badly the nominal parameters fail, and where they do not, how well they do."""
+    def set_aim(self, rho: Float[np.ndarray, " n"]) -> None:
+        """Set how far above the margin to aim, by the robustness of the nominal parameters."""
         if self.deficit is not None:
             return
         rho = rho[np.isfinite(rho)] - self.margin
-        kept = rho[rho > 0]
+        positive = rho[rho > 0]
         self.deficit = max(-float(np.min(rho, initial=0.0)), 1e-6)
         # A pole that has fallen has a deficit far beyond any margin that can be had.
-        self.slack = SLACK * min(self.deficit, float(np.median(kept)) if len(kept) else np.inf)
+        self.slack = SLACK * min(
+            self.deficit, float(np.median(positive)) if len(positive) else np.inf
+        )
 
     @property
     def aim(self) -> float:
-        """The robustness that a repair goes for."""
+        """Robustness that a repair aims for."""
         return self.margin + self.slack
 
     @property
     def enough(self) -> float:
-        """The robustness at which it is content."""
+        """Robustness that is enough."""
         return self.margin + 0.5 * self.slack
 
-    def go(self, rounds: int) -> None:
-        """Attack and mend in turn."""
-        if len(self.environments) and not self.mend():
+    def run(self, rounds: int) -> None:
+        """Attack and repair in turn."""
+        if len(self.environments) and not self.repair_set():
             return
         for number in range(1, rounds + 1):
-            if self.limits.over:
+            if self.limits.exhausted:
                 break
-            found = attack(
+            result = attack(
                 self.loop, self.now.theta, self.margin, self.limits.slice(self.share),
                 search=self.search, batch=self.batch, seed=self.seed + 7919 * number,
                 scale=self.deficit or 1.0,
             )  # fmt: skip
-            count = int(found.violating.sum())
+            count = int(result.violating.sum())
             change = float(np.linalg.norm(self.now.theta - self.start))
-            self.turns.append(Round(len(found.rho), count, found.worst, change))
-            self.robustness = min(found.worst, self.now.value)
+            self.turns.append(Round(len(result.rho), count, result.worst, change))
+            self.robustness = min(result.worst, self.now.value)
             if not count:
                 # What a handful of simulations does not find says nothing.
-                thorough = not self.limits.over or len(found.rho) >= self.share // 2
-                self.stopped = "repaired" if thorough else self.limits.ended
-                if not np.isfinite(found.rho).any():
+                thorough = not self.limits.exhausted or len(result.rho) >= self.share // 2
+                self.stopped = "repaired" if thorough else self.limits.stopped_by
+                if not np.isfinite(result.rho).any():
                     self.stopped = "no verdict"
                 return
-            self.seen(found.rho)
-            self.environments = np.concatenate([self.environments, found.chosen(ADDED)])
+            self.set_aim(result.rho)
+            self.environments = np.concatenate([self.environments, result.select(ADDED)])
             self.environments = self.environments.astype(np.float32)
-            if not self.mend():
+            if not self.repair_set():
                 return
-        self.stopped = self.limits.ended if self.limits.over else "rounds"
+        self.stopped = self.limits.stopped_by if self.limits.exhausted else "rounds"
 
-    def mend(self) -> bool:
-        """Go to the nearest parameters that keep the whole set; whether there are any."""
+    def repair_set(self) -> bool:
+        """Move to the nearest parameters that keep the whole set; return whether there are any."""
         # What was near and what was robust in the old set may still be in this one.
-        old = self.archive.best(4, self.merit) + self.archive.best(8, by_value, apart=0.05)
+        old = self.archive.best(4, self.merit) + self.archive.best(8, value_merit, apart=0.05)
         self.archive = archive = Archive()
         if self.limits.left < LEAST_BATCH * len(self.environments):
-            self.archive, self.stopped = archive, self.limits.ended
+            self.archive, self.stopped = archive, self.limits.stopped_by
             return False
         starts = np.stack([self.start, self.now.theta, *(choice.theta for choice in old)])
         affordable = max(2, self.limits.left // 4 // len(self.environments))
-        judged(self.loop, starts[:affordable], self.environments, archive)
+        evaluate(self.loop, starts[:affordable], self.environments, archive)
         scale = self.deficit or 1.0
-        if climbs(self.loop):
+        if has_gradients(self.loop):
             # From where it is now, and from the start anew: the nearest may lie elsewhere.
             starts = [self.now.theta] if np.all(self.now.theta == self.start) else [
                 self.now.theta, self.start
@@ -344,7 +353,7 @@ class _Repair:
                 scale=scale, radius=0.1 if self.loop.bounded else 0.1 * self.size,
             )  # fmt: skip
         best = archive.best(1, self.merit)[0]
-        followed = climbs(self.loop) and self.loop.free.all()
+        followed = has_gradients(self.loop) and self.loop.free.all()
         if self.loop.bounded and (best.value < self.enough or not followed):
             best = self.without_gradients(archive)
         if self.margin <= best.value < self.enough:
@@ -356,7 +365,7 @@ class _Repair:
         if best.value >= self.enough:
             return True
         if self.limits.left < LEAST_BATCH * len(self.environments):
-            self.stopped = self.limits.ended
+            self.stopped = self.limits.stopped_by
             return False
         self.stopped = "no parameters"
         if not self.loop.bounded:
@@ -365,27 +374,31 @@ class _Repair:
 
     @property
     def size(self) -> float:
-        """Of an ordinary number in the arrays."""
+        """Size of an ordinary number in the arrays."""
         return float(np.sqrt(np.mean(self.start**2))) or 1.0
 
-    def merit(self, theta: Any, value: float) -> tuple[float, ...]:
-        """First enough robustness, then the nearer the better."""
+    def merit(self, theta: np.ndarray, value: float) -> tuple[float, ...]:
+        """Return the merit of a repair: first enough robustness, then the nearer the better."""
         far = float(np.linalg.norm(theta - self.start))
         return (1.0, -far) if value >= self.enough else (0.0, value)
 
-    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
+    def propose(
+        self, theta: np.ndarray, rho: np.ndarray, gradients: np.ndarray, radius: float
+    ) -> list[np.ndarray]:
         loop = self.loop
         step = least_change(
-            theta, self.start, rho, slopes, self.aim, free=loop.free, bounded=loop.bounded
+            theta, self.start, rho, gradients, self.aim, free=loop.free, bounded=loop.bounded
         )
         steps = [] if step is None else [step * share for share in (1.0, 0.5, 0.2, 0.05)]
         if np.min(rho, initial=np.inf) < self.enough:
             if loop.dim <= 64:
                 steps.append(
-                    max_min_step(theta, rho, slopes, radius, free=loop.free, bounded=loop.bounded)
+                    max_min_step(
+                        theta, rho, gradients, radius, free=loop.free, bounded=loop.bounded
+                    )
                 )
             else:
-                worst = slopes[int(np.argmin(rho))]
+                worst = gradients[int(np.argmin(rho))]
                 size = np.linalg.norm(worst)
                 if size > 0:
                     steps.append(radius * np.sqrt(loop.dim) * worst / size)
@@ -393,7 +406,7 @@ class _Repair:
         return [np.clip(m, 0.0, 1.0) for m in moved] if loop.bounded else moved
 
     def without_gradients(self, archive: Archive) -> Choice:
-        """Cross-entropy over the whole space where nothing is known, then nearer and nearer."""
+        """Search by cross-entropy, over the whole space where nothing is known, then nearer."""
         limits = self.limits.slice(max(self.limits.most // 8, self.limits.left // 8))
         if archive.best(1, self.merit)[0].value < self.enough:
             explore(
@@ -401,18 +414,20 @@ class _Repair:
                 merit=self.merit, batch=CANDIDATES, rng=self.rng,
             )  # fmt: skip
         best = archive.best(6, self.merit)
-        narrow(
+        cross_entropy(
             self.loop, [c.theta for c in best], self.environments, archive,
             limits.slice(limits.left // 2),
             merit=self.merit, batch=CANDIDATES, rng=self.rng, rounds=40,
         )  # fmt: skip
         best = archive.best(1, self.merit)[0]
         if best.value >= self.enough:
-            self.back(best.theta, archive, limits)
+            self.move_to_nominal(best.theta, archive, limits)
         return archive.best(1, self.merit)[0]
 
-    def back(self, theta: Any, archive: Archive, limits: Limits) -> None:
-        """Towards the nominal parameters: each coordinate alone first, then all together."""
+    def move_to_nominal(
+        self, theta: Float[np.ndarray, " p"], archive: Archive, limits: Budget
+    ) -> None:
+        """Move towards the nominal parameters: each coordinate alone first, then all together."""
         blocks = [np.arange(self.loop.dim) == i for i in range(self.loop.dim)]
         for block in [*blocks, np.ones(self.loop.dim, bool)]:
             block = block & self.loop.free if block.sum() > 1 else block
@@ -423,7 +438,7 @@ class _Repair:
                         for s in shares]  # fmt: skip
                 if limits.left < len(ways) * len(self.environments) or high - low < 1e-3:
                     return
-                values = judged(self.loop, ways, self.environments, archive)
+                values = evaluate(self.loop, ways, self.environments, archive)
                 good = values >= self.enough
                 # Nearest above which all are good, so that it is not an island.
                 upper = len(good) - int(np.argmin(np.append(good[::-1], False)))

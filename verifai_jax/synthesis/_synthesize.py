@@ -16,9 +16,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.budget import Limits, timed
+from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
@@ -28,20 +29,20 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.synthesis.adversary import attack
-from verifai_jax.synthesis.held_out import drawn, held_out
+from verifai_jax.synthesis.held_out import HeldOut, draw, held_out
 from verifai_jax.synthesis.optimize import (
     Archive,
     Choice,
-    by_value,
     climb,
-    climbs,
+    cross_entropy,
+    evaluate,
     explore,
-    judged,
-    least,
-    narrow,
-    scale_of,
+    has_gradients,
+    typical_size,
+    value_merit,
+    worst_case,
 )
-from verifai_jax.synthesis.parametric import FeatureParameters, rows_of
+from verifai_jax.synthesis.parametric import FeatureParameters, Parametric, rows_of
 from verifai_jax.synthesis.results import Synthesis
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ def synthesize(
 
     **Arguments:**
 
+    - `problem`: the system, its features and formulas.
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
     - `budget`: simulations at most, the check not counted.
@@ -93,19 +95,21 @@ def synthesize(
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
     - the others as in `falsify`.
 
-    Ctrl-C ends it and returns what is finished, without the check.
+    **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
 
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()
     check_options(budget, batch, seed, max_seconds, None)
     check_numbers(margin, environments=environments, held_out=held_out)
-    loop = feature_loop(problem, parameters, gradient, batch, budget, precision, backend, seed)
-    search = attacker(problem, attack, loop)
-    limits, checking = timed(lambda: loop.simulations, budget, started, max_seconds)
-    work = _Search(loop, search, limits, margin, environments, seed)
+    loop = feature_parameters(
+        problem, parameters, gradient, batch, budget, precision, backend, seed
+    )
+    search = attack_search(problem, attack, loop)
+    limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
+    work = _Synthesis(loop, search, limits, margin, environments, seed)
     try:
-        work.go()
+        work.run()
         stopped = work.stopped
     except KeyboardInterrupt:
         stopped = "interrupted"
@@ -118,7 +122,7 @@ def synthesize(
     searched = loop.simulations
     checked = None
     if stopped != "interrupted" and held_out and (loop.environment is not None or problem.draws()):
-        checked = _held_out_or_none(loop, best.theta, held_out, margin, seed, checking)
+        checked = _check(loop, best.theta, held_out, margin, seed, checking)
     if checked is not None and checked.least is not None:
         robustness = min(robustness, checked.least)
     return Synthesis(
@@ -139,23 +143,28 @@ def synthesize(
     )
 
 
-def _held_out_or_none(
-    loop: Any, theta: Any, count: int, margin: float, seed: int, limits: Limits
-) -> Any:
+def _check(
+    loop: Parametric,
+    theta: Float[np.ndarray, " p"],
+    count: int,
+    margin: float,
+    seed: int,
+    limits: Budget,
+) -> HeldOut | None:
     try:
         return held_out(loop, theta, count, margin, (seed, 1), limits)
     except KeyboardInterrupt:
         return None
 
 
-class _Search:
-    """The work of a synthesis, of which all that is finished can be had at any time."""
+class _Synthesis:
+    """State of a synthesis, from which a result can be made at any time."""
 
     def __init__(
         self,
         loop: FeatureParameters,
         search: Search,
-        limits: Limits,
+        limits: Budget,
         margin: float,
         environments: int,
         seed: int,
@@ -175,13 +184,13 @@ class _Search:
         self.environments: Any = np.zeros((1, 0), np.float32)
         if loop.environment is not None:
             environments = max(1, min(environments, limits.left // 4))
-            self.environments = drawn(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
+            self.environments = draw(loop, np.full(loop.dim, 0.5), environments, (seed, 3))
             if not len(self.environments):
                 # The constraint wants other parameters: it is asked with each of them.
                 rng = np.random.default_rng((seed, 3))
                 self.environments = rng.random((environments, loop.environment.dim), np.float32)
 
-    def go(self) -> None:
+    def run(self) -> None:
         whole = self.limits
         if self.loop.environment is not None:
             # A tenth is kept for comparing the candidates over the whole set at last.
@@ -192,95 +201,97 @@ class _Search:
             self.limits = whole
 
     def rounds(self) -> None:
-        """All but the conclusion."""
+        """Choose parameters and attack them in turn."""
         total = self.limits.left
         alone = self.loop.environment is None
         most = EXPLORED if alone else 1000 * len(self.environments)
         first = self.limits.slice(min(most, int((0.5 if alone else 0.15) * total)))
         explore(
             self.loop, self.environments, self.archive, first,
-            merit=by_value, batch=CANDIDATES, rng=self.rng,
+            merit=value_merit, batch=CANDIDATES, rng=self.rng,
         )  # fmt: skip
         if not self.archive.choices:
-            # Not even one choice fits into the share: at least one is judged.
-            judged(self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive)
-        self.scale = scale_of([choice.value for choice in self.archive.choices])
+            # Not even one choice fits into the share: at least one is evaluated.
+            evaluate(self.loop, np.full((1, self.loop.dim), 0.5), self.environments, self.archive)
+        self.scale = typical_size([choice.value for choice in self.archive.choices])
         if self.loop.environment is None:
             self.improve(self.limits, 2 * STARTS)
-            self.stopped = self.limits.ended if self.limits.over else "converged"
+            self.stopped = self.limits.stopped_by if self.limits.exhausted else "converged"
             return
         number = 0
-        while not self.limits.over:
+        while not self.limits.exhausted:
             number += 1
             # A quarter of what is left: later sets deserve as much as the first.
             self.improve(self.limits.slice(self.limits.left // 4), STARTS if number == 1 else 1)
-            choice = self.archive_best()
+            choice = self.best_in_archive()
             if not np.isfinite(choice.value):
                 break
             level = choice.value - 1e-3 * self.scale
             share = max(self.limits.left // 4, min(self.limits.left, 256))
             share = min(share, ATTACK)
-            found = attack(
+            result = attack(
                 self.loop, choice.theta, level, self.limits.slice(share), search=self.search,
                 batch=self.batch, seed=self.seed + 7919 * number,
                 scale=self.scale,
             )  # fmt: skip
-            worst = min(choice.value, found.worst)
+            worst = min(choice.value, result.worst)
             name = choice.theta.tobytes()
-            self.attacks[name] = self.attacks.get(name, 0) + len(found.rho)
+            self.attacks[name] = self.attacks.get(name, 0) + len(result.rho)
             self.attacked.append(choice._replace(value=worst))
-            if not found.violating.any():
+            if not result.violating.any():
                 # What a handful of simulations does not find says nothing.
-                thorough = len(found.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
-                self.stopped = "converged" if thorough else self.limits.ended
+                thorough = len(result.rho) >= min(ATTACK // 2, max(32, self.limits.most // 20))
+                self.stopped = "converged" if thorough else self.limits.stopped_by
                 return
-            self.extend(found.chosen(ADDED))
-        self.stopped = self.limits.ended if self.limits.over else "no verdict"
+            self.extend(result.select(ADDED))
+        self.stopped = self.limits.stopped_by if self.limits.exhausted else "no verdict"
 
-    def improve(self, limits: Limits, starts: int) -> None:
-        best = self.archive.best(starts, by_value, apart=1e-3)
-        if climbs(self.loop):
+    def improve(self, limits: Budget, starts: int) -> None:
+        best = self.archive.best(starts, value_merit, apart=1e-3)
+        if has_gradients(self.loop):
             part = limits if self.loop.differentiable else limits.slice(limits.left // 2)
             climb(
                 self.loop, [c.theta for c in best], self.environments, self.archive, part,
-                propose=self.propose, merit=by_value, scale=self.scale, radius=0.1,
+                propose=self.propose, merit=value_merit, scale=self.scale, radius=0.1,
             )  # fmt: skip
         if not self.loop.free.all() or not self.loop.differentiable:
-            best = self.archive.best(2, by_value) + self.archive.best(6, by_value, apart=0.05)
-            narrow(
+            best = self.archive.best(2, value_merit) + self.archive.best(6, value_merit, apart=0.05)
+            cross_entropy(
                 self.loop, [c.theta for c in best], self.environments, self.archive, limits,
-                merit=by_value, batch=CANDIDATES, rng=self.rng, rounds=1000
+                merit=value_merit, batch=CANDIDATES, rng=self.rng, rounds=1000
                 if self.loop.environment is None else 12,
             )  # fmt: skip
 
-    def propose(self, theta: Any, rho: Any, slopes: Any, radius: float) -> list[Any]:
-        def step(radius: float) -> Any:
+    def propose(
+        self, theta: np.ndarray, rho: np.ndarray, gradients: np.ndarray, radius: float
+    ) -> list[np.ndarray]:
+        def step(radius: float) -> np.ndarray:
             moved = theta + max_min_step(
-                theta, rho, slopes, radius, free=self.loop.free, bounded=True
+                theta, rho, gradients, radius, free=self.loop.free, bounded=True
             )
             return np.clip(moved, 0.0, 1.0)
 
         return [step(radius), step(radius / 3), step(radius / 10)]
 
-    def extend(self, points: Any) -> None:
-        """Add environments to the set; what was judged over the old one starts anew."""
+    def extend(self, points: Float[np.ndarray, "n d"]) -> None:
+        """Add environments `[n, d]` to the set, and evaluate the best choices over the new one."""
         self.environments = np.concatenate([self.environments, points]).astype(np.float32)
-        best = self.archive.best(4, by_value, apart=1e-3)
-        best += self.archive.best(12, by_value, apart=0.1)
+        best = self.archive.best(4, value_merit, apart=1e-3)
+        best += self.archive.best(12, value_merit, apart=0.1)
         affordable = min(len(best), self.limits.left // len(self.environments))
-        kept, self.archive = best[:affordable], Archive()
-        if kept:
-            judged(self.loop, [c.theta for c in kept], self.environments, self.archive)
+        again, self.archive = best[:affordable], Archive()
+        if again:
+            evaluate(self.loop, [c.theta for c in again], self.environments, self.archive)
             return
         # Old values bound the new ones from above; the attacked ones are known best.
         self.archive.choices = best
 
-    def archive_best(self) -> Choice:
-        return self.archive.best(1, by_value)[0]
+    def best_in_archive(self) -> Choice:
+        return self.archive.best(1, value_merit)[0]
 
     @property
     def best(self) -> Choice:
-        """The choice that has stood up best to all that was tried against it."""
+        """The choice of parameters with the greatest least robustness in all attacks."""
         if self.attacked:
             known: dict[bytes, Choice] = {}
             for choice in self.attacked:
@@ -289,36 +300,36 @@ class _Search:
                     known[name] = choice
             return max(known.values(), key=lambda choice: choice.value)
         if self.archive.choices:
-            return self.archive_best()
+            return self.best_in_archive()
         return Choice(np.full(self.loop.dim, 0.5), -np.inf, 0)
 
     @property
     def robustness(self) -> float:
-        """Of the best, the least that was seen."""
+        """Least robustness of the best choice."""
         return self.best.value
 
     def conclude(self) -> None:
-        """With what is left: judge the attacked and the best other choices over the whole set."""
+        """Evaluate the attacked and the best other choices over the whole set."""
         if self.loop.environment is None:
             return
         pool = Archive()
-        pool.choices = [*self.attacked, *self.archive.best(CANDIDATES, by_value, apart=1e-3)]
+        pool.choices = [*self.attacked, *self.archive.best(CANDIDATES, value_merit, apart=1e-3)]
         thetas: dict[bytes, Any] = {}
-        for choice in pool.best(len(pool.choices), by_value):
+        for choice in pool.best(len(pool.choices), value_merit):
             thetas.setdefault(choice.theta.tobytes(), choice)
         affordable = max(0, self.limits.most - self.loop.simulations) // len(self.environments)
         chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
         if not chosen:
             return
         pairs = self.loop.judge(np.stack([c.theta for c in chosen]), self.environments)
-        values = least(pairs)
+        values = worst_case(pairs)
         self.final = [
             Choice(c.theta, float(v), len(self.environments))
             for c, v in zip(chosen, values, strict=True)
         ]
-        seen = {c.theta.tobytes(): c.value for c in self.final}
+        values_by_name = {c.theta.tobytes(): c.value for c in self.final}
         self.attacked = [
-            c._replace(value=min(c.value, seen.get(c.theta.tobytes(), c.value)))
+            c._replace(value=min(c.value, values_by_name.get(c.theta.tobytes(), c.value)))
             for c in self.attacked
         ]
         names = [c.theta.tobytes() for c in self.final]
@@ -326,9 +337,9 @@ class _Search:
             self.rho = pairs.rho[names.index(name)]
 
     def table(self) -> "pd.DataFrame":
-        """The candidates, best first."""
+        """Return the candidates, best first."""
         if self.loop.environment is None:
-            pool = self.archive.best(len(self.archive.choices), by_value)
+            pool = self.archive.best(len(self.archive.choices), value_merit)
             chosen = [c for i, c in enumerate(pool) if c.value >= self.margin or i < CANDIDATES]
         else:
             chosen = sorted(self.final or [self.best], key=lambda c: c.value, reverse=True)
@@ -339,13 +350,13 @@ class _Search:
         )
 
     def environment_table(self) -> "pd.DataFrame":
-        """The set, with the robustness of the best parameters where it is known."""
+        """Return the set, with the robustness of the best parameters where it is known."""
         rho = self.rho if self.rho is not None else np.full(len(self.environments), np.nan)
         return rows_of(self.loop.environment, self.environments).assign(rho=rho)
 
 
-def check_numbers(margin: Any, **counts: Any) -> None:
-    """Refuse numbers out of range.
+def check_numbers(margin: float, **counts: int) -> None:
+    """Check that numbers are in range.
 
     **Raises:** `ValueError`.
     """
@@ -355,9 +366,9 @@ def check_numbers(margin: Any, **counts: Any) -> None:
         check_count(name, count, 0 if name == "held_out" else 1)
 
 
-def feature_loop(
-    problem: Any,
-    parameters: Any,
+def feature_parameters(
+    problem: Problem,
+    parameters: Sequence[str] | str | None,
     gradient: bool | None,
     batch: int,
     budget: int,
@@ -365,7 +376,7 @@ def feature_loop(
     backend: str | None,
     seed: int,
 ) -> FeatureParameters:
-    """The problem, checked and on its backend, with these features as parameters.
+    """Return the problem, checked and on its backend, with these features as parameters.
 
     **Raises:** `ValueError` for what does not fit, before anything compiles.
     """
@@ -392,8 +403,8 @@ def feature_loop(
     )
 
 
-def attacker(problem: Problem, search: Any, loop: Any) -> Search:
-    """The search over the environment, if it can work there.
+def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> Search:
+    """Return the search over the environment, if it can work there.
 
     **Raises:** `ValueError` for one that needs gradients where there are none, or of clauses.
     """

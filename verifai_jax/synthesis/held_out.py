@@ -1,32 +1,36 @@
-"""Chosen parameters in environments that nobody has looked at: a failure rate that means something.
+"""Failure rates of chosen parameters in fresh environments.
 
-What an active search does not find proves nothing. Environments drawn from the prior after the
+An active search that finds nothing proves nothing. Environments drawn from the prior after the
 parameters are fixed are independent of how they were chosen, so that an exact binomial interval
 holds.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Limits
+from verifai_jax.core.budget import Budget
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 from verifai_jax.synthesis.parametric import Parametric
 
 MOST_DRAWS = 1000
+"""Batches of draws at most where the constraint refuses nearly all."""
 ROUND = 256
-"""Simulations between two looks at the clock."""
+"""Simulations between two readings of the clock."""
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How parameters did in `simulations` fresh environments.
+    """Verdicts of parameters in fresh environments.
 
-    - `failures`: that broke a formula; `short`: that kept it, but by less than the wanted margin.
+    **Fields:**
+
+    - `simulations` made.
+    - `failures`: simulations that broke a formula.
+    - `short`: simulations that kept it, but by less than the wanted margin.
     - `without_verdict`: simulations that did not end properly; they are in no rate.
-    - `least`: robustness, None without a verdict.
+    - `least` robustness, None without a verdict.
     - `rate`: of failures among the simulations with a verdict, with its 95 % interval.
     """
 
@@ -39,7 +43,7 @@ class HeldOut:
 
     @property
     def passed(self) -> bool:
-        """Whether all were simulated and none fails or falls short of the margin."""
+        """True where all were simulated and none fails or falls short of the margin."""
         return self.simulations > 0 and not (self.failures or self.short or self.without_verdict)
 
     @property
@@ -49,14 +53,14 @@ class HeldOut:
             return None
         return clopper_pearson(self.rate.failures, self.rate.simulations, 0.9).high
 
-    def told(self, what: str = "environments") -> str:
-        """For people, such as `0 of 2000 held-out environments fail: ...`."""
+    def describe(self, what: str = "environments") -> str:
+        """Describe the verdicts: `0 of 2000 held-out environments fail: ...`."""
         if not self.simulations:
             return f"no time was left for held-out {what}"
         if self.rate is None:
             return f"none of {self.simulations} held-out {what} gave a verdict"
-        judged = self.rate.simulations
-        text = f"{self.failures} of {judged} held-out {what} fail"
+        verdicts = self.rate.simulations
+        text = f"{self.failures} of {verdicts} held-out {what} fail"
         if self.failures:
             text += f": failure probability {self.rate}"
         else:
@@ -73,17 +77,26 @@ def held_out(
     theta: Float[np.ndarray, " p"],
     count: int,
     margin: float,
-    seed: Any,
-    limits: Limits | None = None,
+    seed: tuple[int, int],
+    limits: Budget | None = None,
 ) -> HeldOut:
-    """Simulate `count` environments drawn from the prior, which the seed alone decides.
+    """Simulate environments drawn from the prior.
 
-    Fewer where the constraint of the space refuses nearly all, or where `limits` end it first.
+    **Arguments:**
+
+    - `loop`: the system with its parameters.
+    - `theta` `[p]`: the parameters.
+    - `count`: environments; fewer where the constraint of the space refuses nearly all.
+    - `margin`: robustness that is wanted.
+    - `seed`: alone decides the environments.
+    - `limits`: time at which to stop early.
+
+    **Returns:** a `HeldOut`.
     """
-    points = drawn(loop, theta, count, seed)
+    points = draw(loop, theta, count, seed)
     parts = []
     for start in range(0, len(points), ROUND):
-        if limits is not None and limits.late:
+        if limits is not None and limits.timed_out:
             break
         pairs = loop.judge(theta[None], points[start : start + ROUND])
         short = pairs.violates(margin) & ~pairs.failing
@@ -92,29 +105,29 @@ def held_out(
     rho, proper, failing, short = (
         np.concatenate(column) for column in zip(none, *parts, strict=True)
     )
-    judged, failures = int(proper.sum()), int(failing.sum())
+    verdicts, failures = int(proper.sum()), int(failing.sum())
     return HeldOut(
         simulations=len(rho),
         failures=failures,
         short=int(short.sum()),
-        without_verdict=len(rho) - judged,
-        least=float(np.min(rho[proper])) if judged else None,
-        rate=clopper_pearson(failures, judged) if judged else None,
+        without_verdict=len(rho) - verdicts,
+        least=float(np.min(rho[proper])) if verdicts else None,
+        rate=clopper_pearson(failures, verdicts) if verdicts else None,
     )
 
 
-def drawn(
-    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, seed: Any
+def draw(
+    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, seed: tuple[int, int]
 ) -> Float[np.ndarray, "n d"]:
-    """Environments from the prior, given that the constraint accepts them with these parameters."""
+    """Draw environments from the prior that the constraint accepts with these parameters."""
     d = loop.environment.dim if loop.environment is not None else 0
     rng = np.random.default_rng(seed)
-    parts, have = [np.zeros((0, d), np.float32)], 0
+    parts, count_so_far = [np.zeros((0, d), np.float32)], 0
     for _ in range(MOST_DRAWS):
-        if have >= count:
+        if count_so_far >= count:
             break
         points = rng.random((max(count, 64), d), np.float32)
         points = points[loop.happens(theta, points)]
         parts.append(points)
-        have += len(points)
+        count_so_far += len(points)
     return np.concatenate(parts)[:count]

@@ -1,33 +1,36 @@
-"""Parameters for a fixed set of environments: explored, climbed along gradients, or narrowed.
+"""Optimisation of parameters over a fixed set of environments.
 
-The value of parameters is their least robustness over the set. All that is judged goes to the
-`Archive`. A `merit` says which of two choices is better: the value alone for a synthesis, first the
-value and then the distance from the nominal parameters for a repair.
+The value of parameters is their least robustness over the set. All that were evaluated are in the
+`Archive`. A `merit` orders choices: by the value alone for a synthesis, first by the value and then
+by the distance from the nominal parameters for a repair.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.budget import Limits
+from verifai_jax.core.budget import Budget
 from verifai_jax.synthesis.parametric import Pairs, Parametric, accepted
 
 ACTIVE = 16
-"""Environments, the least robust ones, that decide a step; all of them judge its result."""
+"""Environments, the least robust ones, that decide a step; its result is evaluated in all."""
 FIRST = 6
-"""Of the hardest environments, in which candidates are judged before the others."""
+"""Hardest environments, in which candidates are evaluated before the others."""
 EXPLORED = 0.2
 """Share of the candidates of cross-entropy that are drawn from anywhere."""
 LEAST_BATCH = 8
-"""Candidates below which a round of cross-entropy is not worth having."""
+"""Candidates below which a round of cross-entropy is not made."""
 LEAST_RADIUS = 1e-5
+"""Share of the first radius below which a climb ends."""
 MOST_DIFFERENCES = 12
-"""Parameters up to which slopes are taken from differences where there are no gradients."""
+"""Parameters up to which differences take the place of gradients."""
 MOST_REFUSED = 1000
 """Draws in a row without one that the constraint accepts, after which no more are made."""
 
+Thetas: TypeAlias = Float[np.ndarray, "k p"] | Sequence[Float[np.ndarray, " p"]]
+Environments: TypeAlias = Float[np.ndarray, "n d"]
 Merit = Callable[[np.ndarray, float], tuple[float, ...]]
 Propose = Callable[[np.ndarray, np.ndarray, np.ndarray, float], list[np.ndarray]]
 
@@ -41,24 +44,24 @@ class Choice(NamedTuple):
 
 
 class Archive:
-    """All parameters that were judged, newest last."""
+    """All parameters that were evaluated, newest last."""
 
     def __init__(self) -> None:
         self.choices: list[Choice] = []
 
-    def add(self, thetas: Any, values: Any, environments: int) -> None:
-        """Keep these."""
+    def add(self, thetas: Thetas, values: Iterable[float], environments: int) -> None:
+        """Add choices of parameters `[k, p]` with their values `[k]`."""
         for theta, value in zip(np.asarray(thetas), values, strict=True):
             self.choices.append(Choice(theta, float(value), environments))
 
     def best(self, count: int, merit: Merit, apart: float = 0.0) -> list[Choice]:
-        """The best, no two the same, or nearer than `apart` in each coordinate."""
+        """Return the best choices, no two the same, or nearer than `apart` in each coordinate."""
         taken: list[Choice] = []
-        seen: set[bytes] = set()
+        names: set[bytes] = set()
         for choice in sorted(self.choices, key=lambda c: merit(c.theta, c.value), reverse=True):
-            if (name := choice.theta.tobytes()) in seen:
+            if (name := choice.theta.tobytes()) in names:
                 continue
-            seen.add(name)
+            names.add(name)
             if not apart or all(np.abs(choice.theta - t.theta).max() > apart for t in taken):
                 taken.append(choice)
             if len(taken) == count:
@@ -66,13 +69,13 @@ class Archive:
         return taken
 
 
-def by_value(theta: np.ndarray, value: float) -> tuple[float, ...]:
-    """The merit of a synthesis."""
+def value_merit(theta: np.ndarray, value: float) -> tuple[float, ...]:
+    """Return the merit of a synthesis: the value."""
     return (value,)
 
 
-def least(pairs: Pairs) -> Float[np.ndarray, " k"]:
-    """The value of each choice of parameters: negative where one fails somewhere.
+def worst_case(pairs: Pairs) -> Float[np.ndarray, " k"]:
+    """Return the value of each choice of parameters: negative where one fails somewhere.
 
     Minus infinity where a simulation has no verdict in an environment in which others have one, or
     where none of the environments can happen.
@@ -85,18 +88,18 @@ def least(pairs: Pairs) -> Float[np.ndarray, " k"]:
     return np.where(np.isposinf(value), -np.inf, value)
 
 
-def scale_of(rho: Any) -> float:
-    """The size of ordinary robustnesses, positive."""
+def typical_size(rho: Sequence[float]) -> float:
+    """Return the size of ordinary robustnesses, positive."""
     sizes = np.abs(np.asarray(rho, float))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     return float(np.median(sizes)) if len(sizes) else 1.0
 
 
-def judged(
-    loop: Parametric, thetas: Any, environments: Any, archive: Archive | None = None
+def evaluate(
+    loop: Parametric, thetas: Thetas, environments: Environments, archive: Archive | None = None
 ) -> Float[np.ndarray, " k"]:
-    """The values of these parameters over the set."""
-    values = least(loop.judge(thetas, environments))
+    """Evaluate parameters `[k, p]` over the set; return their values."""
+    values = worst_case(loop.judge(thetas, environments))
     if archive is not None:
         archive.add(thetas, values, len(environments))
     return values
@@ -104,15 +107,15 @@ def judged(
 
 def explore(
     loop: Parametric,
-    environments: Any,
+    environments: Environments,
     archive: Archive,
-    limits: Limits,
+    limits: Budget,
     *,
     merit: Merit,
     batch: int,
     rng: np.random.Generator,
 ) -> None:
-    """Look over the whole space of the parameters, which are features, then around the best."""
+    """Evaluate parameters over their whole space, then around the best."""
     size, half = max(1, len(environments)), limits.slice(limits.left // 2)
     refused = 0
     while half.left >= size and refused < MOST_REFUSED:
@@ -126,10 +129,10 @@ def explore(
         if len(thetas):
             known = archive.best(max(4, batch // 5), merit)
             level = merit(known[-1].theta, known[-1].value) if len(known) > 3 else (-np.inf,)
-            _promising(loop, thetas, np.asarray(environments), archive, merit, level)
+            _screen(loop, thetas, np.asarray(environments), archive, merit, level)
     best = archive.best(max(4, batch // 5), merit)
     if best:
-        narrow(
+        cross_entropy(
             loop, [c.theta for c in best], environments, archive, limits,
             merit=merit, batch=batch, rng=rng, rounds=1000,
         )  # fmt: skip
@@ -137,10 +140,10 @@ def explore(
 
 def climb(
     loop: Parametric,
-    thetas: Any,
-    environments: Any,
+    thetas: Thetas,
+    environments: Environments,
     archive: Archive,
-    limits: Limits,
+    limits: Budget,
     *,
     propose: Propose,
     merit: Merit,
@@ -150,7 +153,9 @@ def climb(
 ) -> list[Choice]:
     """Follow the gradients of the least robust environments from each start, all in step.
 
-    - `propose(theta, rho, slopes, radius)`: candidates for a step, the boldest first.
+    **Arguments:**
+
+    - `propose(theta, rho, gradients, radius)`: candidates for a step, the boldest first.
 
     A step is taken where simulations show that it is better; the radius follows its success.
     """
@@ -158,7 +163,7 @@ def climb(
     if not len(thetas):
         return []
     rho = loop.judge(thetas, environments)
-    now = [Choice(t, v, len(environments)) for t, v in zip(thetas, least(rho), strict=True)]
+    now = [Choice(t, v, len(environments)) for t, v in zip(thetas, worst_case(rho), strict=True)]
     rhos = [np.where(ok, r, np.inf) for r, ok in zip(rho.rho, rho.proper, strict=True)]
     archive.add(thetas, [choice.value for choice in now], len(environments))
     radii = np.full(len(now), radius)
@@ -169,25 +174,25 @@ def climb(
         if not alive:
             break
         for i in alive:
-            few = np.asarray(environments)[np.argsort(rhos[i], kind="stable")[:ACTIVE]]
+            hardest = np.asarray(environments)[np.argsort(rhos[i], kind="stable")[:ACTIVE]]
             tries = 8 if loop.differentiable else 9 + int(loop.free.sum())
-            if limits.left < tries * len(few) + len(environments):
+            if limits.left < tries * len(hardest) + len(environments):
                 return now
             # Cooler as steps get shorter: the kinks of the robustness matter then.
             warmth = scale * max(0.001, 0.02 * min(1.0, radii[i] / radius))
-            values, slopes = _slopes(loop, now[i].theta, few, warmth, 0.1 * radii[i])
-            candidates = propose(now[i].theta, values, slopes, radii[i])
+            values, gradients = _gradients(loop, now[i].theta, hardest, warmth, 0.1 * radii[i])
+            candidates = propose(now[i].theta, values, gradients, radii[i])
             candidates = [c for c in candidates if np.any(c != now[i].theta)]
             if not candidates:
                 radii[i] = 0.0
                 continue
-            tried = judged(loop, candidates, few)
+            tried = evaluate(loop, candidates, hardest)
             order = sorted(
                 range(len(candidates)), key=lambda j: merit(candidates[j], tried[j]), reverse=True
             )
             winner = candidates[order[0]]
             whole = loop.judge(winner[None], environments)
-            value = float(least(whole)[0])
+            value = float(worst_case(whole)[0])
             archive.add([winner], [value], len(environments))
             before, after = merit(now[i].theta, now[i].value), merit(winner, value)
             if after > before:
@@ -203,44 +208,44 @@ def climb(
     return now
 
 
-def climbs(loop: Parametric) -> bool:
-    """Whether slopes are to be had: from gradients, or from differences of a few parameters."""
+def has_gradients(loop: Parametric) -> bool:
+    """Return whether there are gradients, or few enough parameters for differences."""
     return loop.differentiable or (loop.bounded and 0 < loop.free.sum() <= MOST_DIFFERENCES)
 
 
-def _slopes(
-    loop: Parametric, theta: np.ndarray, environments: Any, warmth: float, gap: float
+def _gradients(
+    loop: Parametric, theta: np.ndarray, environments: Environments, warmth: float, gap: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Robustness `[n]`, infinite where there is no verdict, and its slopes `[n, p]`, zero there."""
+    """Return robustness `[n]`, infinite without a verdict, and gradients `[n, p]`, zero there."""
     if loop.differentiable:
-        seen = loop.judge(theta[None], environments, warmth)
-        assert seen.by_parameters is not None
-        return np.where(seen.proper[0], seen.rho[0], np.inf), seen.by_parameters[0]
+        pairs = loop.judge(theta[None], environments, warmth)
+        assert pairs.by_parameters is not None
+        return np.where(pairs.proper[0], pairs.rho[0], np.inf), pairs.by_parameters[0]
     places = np.flatnonzero(loop.free)
     # Away from the nearer end of the cube; wide enough that float32 has digits left.
     gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
     beside = np.repeat(theta[None], len(places), axis=0)
     beside[np.arange(len(places)), places] += gaps
-    seen = loop.judge(np.concatenate([theta[None], beside]), environments)
-    rho = np.where(seen.proper & np.isfinite(seen.rho), seen.rho, np.nan)
-    slopes = np.zeros((len(environments), loop.dim))
-    slopes[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
-    return np.where(np.isnan(rho[0]), np.inf, rho[0]), slopes
+    pairs = loop.judge(np.concatenate([theta[None], beside]), environments)
+    rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)
+    gradients = np.zeros((len(environments), loop.dim))
+    gradients[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
+    return np.where(np.isnan(rho[0]), np.inf, rho[0]), gradients
 
 
-def narrow(
+def cross_entropy(
     loop: Parametric,
-    thetas: Any,
-    environments: Any,
+    thetas: Thetas,
+    environments: Environments,
     archive: Archive,
-    limits: Limits,
+    limits: Budget,
     *,
     merit: Merit,
     batch: int,
     rng: np.random.Generator,
     rounds: int = 8,
 ) -> None:
-    """Cross-entropy around good parameters, without gradients: sample, keep an elite, narrow.
+    """Search around good parameters without gradients: sample, keep an elite, narrow.
 
     De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
     3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.
@@ -251,7 +256,7 @@ def narrow(
         return
     points = np.array(thetas, np.float64)[: max(1, affordable // 3)]
     pairs = loop.judge(points, environments)
-    values = least(pairs)
+    values = worst_case(pairs)
     archive.add(points, values, len(environments))
     # What is hard for the best is hard for most: with these first, few are simulated in all.
     best = max(range(len(points)), key=lambda j: merit(points[j], values[j]))
@@ -282,11 +287,11 @@ def narrow(
         drawn = drawn[[merit(theta, np.inf) > level for theta in drawn]][:count]
         if not len(drawn):
             return
-        drawn, found = _promising(loop, drawn, environments, archive, merit, level)
-        points, values = np.concatenate([points, drawn]), np.concatenate([values, found])
+        drawn, fresh = _screen(loop, drawn, environments, archive, merit, level)
+        points, values = np.concatenate([points, drawn]), np.concatenate([values, fresh])
 
 
-def _promising(
+def _screen(
     loop: Parametric,
     thetas: np.ndarray,
     environments: np.ndarray,
@@ -294,14 +299,14 @@ def _promising(
     merit: Merit,
     level: tuple[float, ...],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Those whose merit may exceed `level`, and their values: the first environments rule out."""
+    """Return parameters whose merit may exceed `level` after the first environments, and values."""
     if len(environments) < 2 * FIRST:
-        return thetas, judged(loop, thetas, environments, archive)
-    bounds = judged(loop, thetas, environments[:FIRST])
+        return thetas, evaluate(loop, thetas, environments, archive)
+    bounds = evaluate(loop, thetas, environments[:FIRST])
     left = [j for j, pair in enumerate(zip(thetas, bounds, strict=True)) if merit(*pair) > level]
     thetas, bounds = thetas[left], bounds[left]
     if not left:
         return thetas, bounds
-    values = np.minimum(bounds, judged(loop, thetas, environments[FIRST:]))
+    values = np.minimum(bounds, evaluate(loop, thetas, environments[FIRST:]))
     archive.add(thetas, values, len(environments))
     return thetas, values

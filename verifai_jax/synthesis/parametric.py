@@ -39,7 +39,7 @@ ROWS = 64
 
 
 class Pairs(NamedTuple):
-    """What came of `k` parameters in `n` environments each.
+    """Verdicts of `k` parameters in `n` environments each.
 
     - `rho`: least robustness of the formulas; NaN without a verdict, infinite where the constraint
       refuses the pair.
@@ -56,7 +56,7 @@ class Pairs(NamedTuple):
     by_environment: Float[np.ndarray, "k n d"] | None = None
 
     def violates(self, margin: float) -> Bool[np.ndarray, "k n"]:
-        """Which pairs break a formula, or keep it with less than this margin."""
+        """Return the pairs that break a formula, or keep it with less than this margin."""
         return self.proper & (self.failing | (self.rho < margin))
 
 
@@ -151,7 +151,7 @@ class FeatureParameters:
         return Pairs(*(x.reshape(k, n) for x in (rho, failing, proper)), *slopes)
 
     def values(self, theta: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """Parameter name -> value, as a person writes it."""
+        """Return the values of the parameters by name, as a person writes them."""
         columns = {c: entries[0] for c, entries in columns_of(self.space, theta[None]).items()}
         values = {name: _plain(self.space[name], name, columns) for name in self.names}
         if self.start is None:
@@ -164,7 +164,7 @@ class FeatureParameters:
         return values
 
     def begin(self, nominal: dict[str, Any]) -> Float[np.ndarray, " p"]:
-        """The coordinates of these values, by name, which `values` gives back unrounded."""
+        """Return the coordinates of values by name, which `values` gives back unrounded."""
         ordered = {name: nominal[name] for name in self.names}
         fields = [(self.space[name], value) for name, value in ordered.items()]
         parts = [np.ravel(np.asarray(d.to_unit(d.coerce(value)), float)) for d, value in fields]
@@ -172,11 +172,11 @@ class FeatureParameters:
         return self.start
 
     def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
-        """The problem with these features fixed."""
+        """Return the problem with these features fixed."""
         return held(self.problem, self.values(theta))
 
     def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
-        """Which environments the constraint accepts with these parameters."""
+        """Return the environments that the constraint accepts with these parameters."""
         return accepted(self.problem.space, self._rows(np.asarray(theta)[None], environments))
 
     def _rows(self, thetas: Any, environments: Any) -> Float[np.ndarray, "kn d"]:
@@ -267,7 +267,7 @@ class ArrayParameters:
         return Pairs(*stacked)
 
     def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
-        """Which environments the constraint accepts."""
+        """Return the environments that the constraint accepts."""
         return accepted(self.problem.space, np.asarray(environments, np.float32))
 
     def _one(self, theta: np.ndarray, environments: Any, temperature: float | None) -> Pairs:
@@ -298,11 +298,11 @@ class ArrayParameters:
         return Pairs(rho, failing, proper, *slopes)
 
     def values(self, theta: Float[np.ndarray, " p"]) -> Any:
-        """The pytree."""
+        """Return the parameters as a pytree."""
         return self._restore(jnp.asarray(theta, jnp.float32))
 
     def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
-        """The problem with the system of these parameters."""
+        """Return the problem with the system of these parameters."""
         return replace(self.problem, system=self.system_of(self.values(theta)))
 
     @cached_property
@@ -348,13 +348,13 @@ Parametric = FeatureParameters | ArrayParameters
 
 
 def held(problem: Problem, values: dict[str, Any]) -> Problem:
-    """The problem with these features fixed, and nominal there if it has nominal features."""
+    """Return the problem with these features fixed, and nominal if it has nominal features."""
     nominal = None if problem.nominal is None else {**problem.nominal, **values}
     return replace(problem, space=problem.space.fixed(**values), nominal=nominal)
 
 
 def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Which points the constraint of the space accepts."""
+    """Return the points that the constraint of the space accepts."""
     if space.where is None or not len(rows):
         return np.ones(len(rows), bool)
     # A power of two, so that few shapes compile.
@@ -364,7 +364,7 @@ def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.nda
 
 
 def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:
-    """The columns of a table for the features at these points of the space's cube."""
+    """Return the columns of a table for the features at points of the space's cube."""
     u = np.asarray(points, np.float32).reshape(len(points), space.dim)
     padded = np.pad(u, ((0, -len(u) % ROWS), (0, 0)), constant_values=0.5)
     parts = [
@@ -379,7 +379,7 @@ def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:
 
 
 def rows_of(space: FeatureSpace | None, points: Any) -> "pd.DataFrame":
-    """A table of the features at these points of the space's cube."""
+    """Return a table of the features at points of the space's cube."""
     import pandas as pd
 
     if space is None:
@@ -393,7 +393,7 @@ def _unflatten(space: FeatureSpace) -> Any:
 
 
 def _plain(domain: Any, name: str, columns: dict[str, Any]) -> Any:
-    """One feature of a table's row as a person writes it."""
+    """Return one feature of a table's row as a person writes it."""
     if name in columns:
         return columns[name].item() if hasattr(columns[name], "item") else columns[name]
     return jax.tree.map(lambda leaf: np.asarray(leaf).tolist(), domain.from_columns(columns, name))

@@ -1,4 +1,4 @@
-"""What a synthesis and a repair return: parameters, and how sure it is that they hold."""
+"""Results of a synthesis and of a repair: parameters, and the evidence that they hold."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.problem.problem import Problem
 from verifai_jax.synthesis.held_out import HeldOut
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """What `synthesize` returns.
+    """Result of `synthesize`: parameters for which a formula holds.
 
-    **Fields:** `parameters`: the best found, by name; `robustness`: the least that was seen with
+    **Fields:** `parameters`: the best found, by name; `robustness`: the least with
     them, over all `environments` of the set and all attacks (minus infinity without a verdict);
     `margin` that was wanted; `candidates`: a table of the best parameters with their `rho` over
     that many `environments`, all over the same set; `environments`: a table of the set, with the
@@ -49,7 +50,7 @@ class Synthesis:
 
     @property
     def holds(self) -> bool:
-        """Whether the formula kept its margin in every simulation with the best parameters."""
+        """True where the formula kept its margin in every simulation with the best parameters."""
         kept = self.robustness >= self.margin
         return kept and (self.held_out is None or self.held_out.passed)
 
@@ -64,7 +65,9 @@ class Synthesis:
         return self.candidates.loc[self.candidates["rho"] >= self.margin]
 
     def __str__(self) -> str:
-        shown = ", ".join(f"{name} = {short(value)}" for name, value in self.parameters.items())
+        shown = ", ".join(
+            f"{name} = {format_value(value)}" for name, value in self.parameters.items()
+        )
         wanted = f" by the margin of {self.margin:g}" if self.margin else ""
         lines = [f"synthesis for {self.problem.name}: {shown}"]
         around = self.environments.shape[1] > 1
@@ -82,7 +85,9 @@ class Synthesis:
                 f"{self.robustness:.4g}, {missing:.4g} too little"
             )
         if self.held_out is not None:
-            lines.append(f"  check: {self.held_out.told('environments' if around else 'repeats')}")
+            lines.append(
+                f"  check: {self.held_out.describe('environments' if around else 'repeats')}"
+            )
         elif around:
             lines.append("  not checked in held-out environments")
         found, of = len(self.robust), len(self.candidates)
@@ -91,10 +96,10 @@ class Synthesis:
             lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
         else:
             lines.append(f"  {found} of the points simulated keep it (.robust)")
-        lines.append(f"  {self._told()}")
+        lines.append(f"  {self._costs()}")
         return "\n".join(lines)
 
-    def _told(self) -> str:
+    def _costs(self) -> str:
         text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
         if self.without_verdict:
             text += f"; {self.without_verdict} gave no verdict"
@@ -103,8 +108,8 @@ class Synthesis:
         return text
 
 
-def short(value: Any) -> str:
-    """A parameter's value, for people."""
+def format_value(value: object) -> str:
+    """Write the value of a parameter."""
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, int | str | bool):
@@ -117,7 +122,9 @@ def short(value: Any) -> str:
 
 
 class Round(NamedTuple):
-    """One turn: what the attack on the present parameters found.
+    """One round of a repair: the attack on the present parameters.
+
+    **Fields:**
 
     - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
     - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
@@ -132,11 +139,11 @@ class Round(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """What `repair` returns.
+    """Result of `repair`: parameters changed as little as removes the failures.
 
     **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
     pytree; `rounds`: a `Round` each; `held_out_before`, `held_out_after`: how both did in the same
-    number of fresh samples, None without a check; `robustness`: the least seen with the repaired
+    number of fresh samples, None without a check; `robustness`: the least with the repaired
     parameters; `environments`: how many are in the set of counterexamples; `margin` that was
     wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
     found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
@@ -196,9 +203,9 @@ class Repair:
                 f"{self.environments} counterexamples so far"
             )
         if self.held_out_before is not None:
-            lines.append(f"  before: {self.held_out_before.told()}")
+            lines.append(f"  before: {self.held_out_before.describe()}")
         if self.held_out_after is not None:
-            lines.append(f"  after:  {self.held_out_after.told()}")
+            lines.append(f"  after:  {self.held_out_after.describe()}")
         else:
             lines.append("  not checked in held-out environments")
         if self.found and self.held_out_after is not None and not self.held_out_after.passed:
@@ -221,13 +228,20 @@ class Repair:
             return f"arrays changed by {self.change:.4g} (Euclidean)"
         pairs = []
         for name, value in self.parameters.items():
-            same = short(self.before[name]) == short(value)
-            shown = "unchanged" if same else f"-> {short(value)}"
-            pairs.append(f"{name} {short(self.before[name])} {shown}")
+            same = format_value(self.before[name]) == format_value(value)
+            shown = "unchanged" if same else f"-> {format_value(value)}"
+            pairs.append(f"{name} {format_value(self.before[name])} {shown}")
         return ", ".join(pairs)
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the worst robustness that each attack found; returns the figure."""
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the worst robustness that each attack found.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+
+        **Returns:** the figure.
+        """
         return late("verifai_jax.plotting.repair", "plot_repair")(self, path)
 
 
