@@ -195,7 +195,8 @@ class FunctionSystem(System):
     def __hash__(self) -> int:
         return id(self.function)
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
+    # A function may return anything; what simulates it refuses anything but a Trace.
+    def __call__(self, features: Features, key: Seed = None) -> Any:
         return self.function(features, key)
 
     def check(self, features: Features) -> None:

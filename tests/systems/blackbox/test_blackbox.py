@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.systems.blackbox import blackbox
@@ -33,7 +34,8 @@ def test_seed_is_a_function_of_the_key():
 
 
 def test_refuses_what_cannot_be_called():
-    with pytest.raises(ValueError, match=r"needs a function \(features\) -> Trace; got 3"):
+    message = r"needs a function \(features\) -> Trace; got 3"
+    with unchecked(), pytest.raises(ValueError, match=message):
         blackbox(3)  # pyright: ignore[reportArgumentType]
 
 

@@ -38,7 +38,7 @@ def tank(level, **changes):
         "step": step,
         "decide": policy_function(lambda observation: 0.0),
         "memory": None,
-        "see": lambda time, moment, action: {"level": moment.state, "time": time},
+        "signals": lambda time, moment, action: {"level": moment.state, "time": time},
         "steps": 30,
         "dt": 0.1,
     }
@@ -94,8 +94,8 @@ def test_types_of_the_start_give_way_to_those_of_a_step():
         return Moment(after, after["n"][None], 1, jnp.float32(0))
 
     start = Moment({"n": 0, "one": True}, jnp.zeros(1, int), 0, False)
-    see = {"see": lambda time, moment, action: {"n": moment.state["n"]}}
-    trace = rollout(tank(jnp.ones(()), start=lambda key: start, step=step, **see), KEY)
+    signals = {"signals": lambda time, moment, action: {"n": moment.state["n"]}}
+    trace = rollout(tank(jnp.ones(()), start=lambda key: start, step=step, **signals), KEY)
     np.testing.assert_allclose(trace["n"], np.arange(31) / 2)
 
 
@@ -118,7 +118,7 @@ def test_types_of_the_start_give_way_to_those_of_a_step():
             r"tank: the reward must be one number; got float32\[2\]",
         ),
         (
-            {"see": lambda t, m, a: {"x": jnp.zeros((2, 2))}},
+            {"signals": lambda t, m, a: {"x": jnp.zeros((2, 2))}},
             r"signal 'x' must be a scalar or a vector at each sample",
         ),
     ],
@@ -131,11 +131,11 @@ def test_parts_that_do_not_fit(changes, message):
 def test_random_policies_get_a_key_of_each_step():
     seen = []
 
-    def see(time, moment, action):
+    def signals(time, moment, action):
         return {"action": action}
 
     decide = policy_function(lambda observation, key: jax.random.normal(key))
-    trace = rollout(tank(jnp.float32(9.0), decide=decide, see=see), KEY)
+    trace = rollout(tank(jnp.float32(9.0), decide=decide, signals=signals), KEY)
     for k in range(31):
         seen.append(jax.random.normal(jax.random.fold_in(episode_keys(KEY).decide, k)))
     np.testing.assert_allclose(trace["action"], seen, rtol=1e-6)

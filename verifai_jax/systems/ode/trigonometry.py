@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 # pi / 2 in three parts; the first two have so few bits that their products with a quadrant number
@@ -23,7 +24,7 @@ _COSINE = tuple(np.float32(c) for c in (4.166664568298827e-2, -1.388731625493765
 
 @jax.custom_jvp
 def sin_cos(
-    angle: Float[Array, "*shape"],
+    angle: Float[Array, "*shape"] | Float[np.ndarray, "*shape"] | float,
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Return `(sin(angle), cos(angle))`, faster in float32 than two calls.
 
@@ -56,9 +57,7 @@ def sin_cos(
 
 
 @sin_cos.defjvp
-def _sin_cos_jvp(
-    primals: tuple[Float[Array, "*shape"]], tangents: tuple[Float[Array, "*shape"]]
-) -> Any:
+def _sin_cos_jvp(primals: tuple[ArrayLike], tangents: tuple[ArrayLike]) -> Any:
     sin, cos = sin_cos(*primals)
     return (sin, cos), (cos * tangents[0], -sin * tangents[0])
 
