@@ -36,7 +36,7 @@ Controller = Callable[[Array, State, Mapping[str, Any]], Float[Array, ""]]
 
 
 def brake(target: float, stiffness: float = 10.0, damping: float = 6.0) -> Controller:
-    """A push of at most 2 N that brings the ball to a halt at `target` (m).
+    """Return a push of at most 2 N that brings the ball to a halt at `target` (m).
 
     - `stiffness`, `damping`: N per m, and N per m/s.
     """
@@ -54,7 +54,7 @@ def ball(
     duration: float = 2.0,
     backend: str = "auto",
 ) -> MuJoCo:
-    """The ball as a system with signals `x`, `z`, `speed` (forwards) and `hit`.
+    """Make the ball a system with signals `x`, `z`, `speed` (forwards) and `hit`.
 
     - `controller(time, state, features) -> push` in N, forwards; none when left out.
     - `features`: which of `PLACES` the feature space has.
@@ -86,5 +86,5 @@ def ball(
 def _on_the_lawn(
     features: Mapping[str, Any], key: Any, qpos: Array, qvel: Array
 ) -> tuple[Array, Array]:
-    """A ball of another size lies higher or lower."""
+    """Place a ball of another size higher or lower."""
     return qpos.at[2].set(jnp.asarray(features.get("radius", 0.1), qpos.dtype)), qvel

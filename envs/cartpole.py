@@ -74,17 +74,17 @@ class State(NamedTuple):
 
 
 def feature(features: Features, name: str) -> Any:
-    """A feature's value, or CartPole-v1's where it is missing."""
+    """Return a feature's value, or CartPole-v1's where it is missing."""
     return features.get(name, NOMINAL[name])
 
 
 def initial(features: Features, key: Any = None) -> State:
-    """The state at time 0."""
+    """Return the state at time 0."""
     return State(*(feature(features, name) for name in ("x0", "x_dot0", "theta0", "theta_dot0")))
 
 
 def dynamics(time: Scalar | float, state: State, force: Scalar, features: Features) -> State:
-    """Slope of the state under `force` (N) on the cart.
+    """Return the derivative of the state under `force` (N) on the cart.
 
     Source: Florian, Correct equations for the dynamics of the cart-pole system (2007), eqs. 23-24
     without friction, as in Gymnasium.
@@ -106,7 +106,7 @@ def dynamics(time: Scalar | float, state: State, force: Scalar, features: Featur
 
 
 def pushed(time: Scalar | float, push_time: Scalar | float) -> Scalar:
-    """The part of the 0.02 s around `time` during which the push acts, in `[0, 1]`.
+    """Return the part of the 0.02 s around `time` during which the push acts, in `[0, 1]`.
 
     Continuous in `push_time`, so that a gradient search can shift the push; the same push at any
     step of the integration.
@@ -119,12 +119,12 @@ def pushed(time: Scalar | float, push_time: Scalar | float) -> Scalar:
 
 
 def terminated(state: State, features: Features) -> Bool[Array, ""]:
-    """Whether CartPole-v1's episode is over: off the track, or more than 12 degrees away."""
+    """Return True where CartPole-v1's episode is over: off the track, or beyond 12 degrees."""
     return (jnp.abs(state.x) > X_LIMIT) | (jnp.abs(state.theta) > THETA_LIMIT)
 
 
 def linear(gains: Sequence[float] = LQR_GAINS) -> Controller:
-    """A linear state feedback, saturated at the `force_mag` of the features.
+    """Make a linear state feedback, saturated at the `force_mag` of the features.
 
     - `gains`: N per m, m/s, rad and rad/s.
     """
@@ -146,7 +146,7 @@ def neural(
     action: str = "argmax",
     straight_through: bool = True,
 ) -> Controller:
-    """A trained network with two actions, push left and push right, at the features' `force_mag`.
+    """Load a trained network with two actions, left and right, at the features' `force_mag`.
 
     - `policy`: a `Policy` or the file of one; the one that is shipped when left out. JAX may trace
       its weights: then one program simulates any policy of the same form.
@@ -183,7 +183,7 @@ def neural(
 
 
 def either(*controllers: Controller) -> Controller:
-    """The controller whose place the feature `controller` names: a `Categorical` of as many."""
+    """Make the controller that the feature `controller`, a `Categorical`, selects by its place."""
     if not controllers:
         raise ValueError("either needs at least one controller; got none")
 
@@ -195,12 +195,12 @@ def either(*controllers: Controller) -> Controller:
 
 
 def _known(policy: Policy) -> bool:
-    """Whether its numbers are constants, not being traced."""
+    """Return True where its numbers are constants, not being traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(policy))
 
 
 def _preferring(policy: Policy) -> Layers:
-    """The network with one output, how much it prefers right to left; on raw observations."""
+    """Return the network with one output, its preference for right; on raw observations."""
     layers = [(np.asarray(weight), np.asarray(bias)) for weight, bias in policy.layers]
     if policy.mean is not None and policy.scale is not None:
         mean, (weight, bias) = np.asarray(policy.mean), layers[0]
@@ -218,7 +218,7 @@ def _sign(preference: Scalar) -> Scalar:
 
 @jax.custom_jvp
 def sign(preference: Scalar) -> Scalar:
-    """1 where positive, else -1, with the derivative of `tanh(preference / 2)`."""
+    """Return 1 where positive, else -1, with the derivative of `tanh(preference / 2)`."""
     return _sign(preference)
 
 
@@ -229,7 +229,7 @@ def _sign_jvp(primals: Any, tangents: Any) -> Any:
 
 
 class Episode(NamedTuple):
-    """A state, and the features that this episode has."""
+    """A state, and the features of this episode."""
 
     state: State
     features: dict[str, Scalar]
@@ -269,11 +269,11 @@ class CartPoleTask:
 
     @property
     def action(self) -> Discrete:
-        """0 pushes to the left, 1 to the right."""
+        """The two actions: 0 pushes to the left, 1 to the right."""
         return Discrete(2)
 
     def reset(self, key: Key[Array, ""]) -> Episode:
-        """Each part of the state uniform in +-0.05, or in its range."""
+        """Draw each part of the state uniformly in +-0.05, or in its range."""
         state = State(*jax.random.uniform(key, (4,), minval=-0.05, maxval=0.05))
         for name, farthest in (("x", self.x0_range), ("theta", self.theta0_range)):
             if farthest is not None:
@@ -289,7 +289,7 @@ class CartPoleTask:
     def step(
         self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
-        """One step of 0.02 s."""
+        """Take one step of 0.02 s."""
         before, features = state
         force = jnp.where(action == 1, 1.0, -1.0) * NOMINAL["force_mag"]
         time = jnp.zeros(())
@@ -301,7 +301,7 @@ class CartPoleTask:
         return Episode(after, features), reward, over
 
     def observe(self, state: Episode) -> Float[Array, "4"]:
-        """The state itself."""
+        """Return the state itself."""
         return jnp.stack(state.state)
 
 
@@ -317,7 +317,7 @@ def cartpole(
     method: str = "euler",
     dt: float = DT,
 ) -> Ode:
-    """The closed loop as a system with signals `x`, `x_dot`, `theta`, `theta_dot` and `force`.
+    """Make the closed loop, with signals `x`, `x_dot`, `theta`, `theta_dot` and `force`.
 
     - `controller(time, state, features) -> force` in N; `linear()` when left out.
     - `duration`: simulated seconds, a multiple of `dt`.

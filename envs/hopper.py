@@ -83,12 +83,12 @@ class State(NamedTuple):
 
 
 def observe(qpos: Float[Array, "6"], qvel: Float[Array, "6"]) -> Float[Array, "11"]:
-    """What the network sees: hip height, pitch, joint angles, and all speeds; not the place."""
+    """Return the network's input: hip height, pitch, joint angles and all speeds; not the place."""
     return jnp.concatenate([qpos[1:], jnp.clip(qvel, -10.0, 10.0)])
 
 
 def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
-    """A trained network; the one that is shipped when left out."""
+    """Load a trained network; the one that is shipped when left out."""
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     if policy.action != Continuous(-1.0, 1.0, 3) or policy.layers[0][0].shape[0] != 11:
         raise ValueError(
@@ -103,7 +103,7 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
 
 
 def lying(state: Any, features: Any) -> Bool[Array, ""]:
-    """Whether it has fallen so far that knee or torso are about to touch the floor."""
+    """Return True where knee or torso are about to touch the floor."""
     return (state.qpos[1] < 0.45) | (jnp.abs(state.qpos[2]) > 1.5)
 
 
@@ -113,7 +113,7 @@ def hopper(
     duration: float = 4.0,
     backend: str = "auto",
 ) -> MuJoCo:
-    """The closed loop as a system with signals `x`, `height`, `pitch` and `speed`.
+    """Make the closed loop, with signals `x`, `height`, `pitch` and `speed`.
 
     Begins at rest in `STANCE`, and ends when it lies on the floor. `x` and `height` (m) are the
     hip's, `speed` (m/s) the hip's forward, `pitch` (rad) the torso's, positive when it nods.
@@ -151,7 +151,7 @@ def hopper(
 
 @dataclass(frozen=True)
 class HopperTask:
-    """Run at 1.5 m/s, upright, with little torque; 6 s, cut short by a fall.
+    """A task: run at 1.5 m/s, upright, with little torque; 6 s, cut short by a fall.
 
     Each episode has a hopper of its own, drawn from `TRAINED_FOR`.
 
@@ -166,11 +166,11 @@ class HopperTask:
 
     @property
     def action(self) -> Continuous:
-        """Hip, knee and ankle, in parts of the motors' greatest torques."""
+        """The torques of hip, knee and ankle, in parts of the motors' greatest ones."""
         return Continuous(-1.0, 1.0, 3)
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Near `STANCE`, nearly at rest."""
+        """Start near `STANCE`, nearly at rest."""
         pose, speed, body = jax.random.split(key, 3)
         spread = jnp.array([0.0, 0.0, 0.05, 0.05, 0.05, 0.05])
         qpos = jnp.asarray(STANCE, jnp.float32) + spread * _even(pose, 6)
@@ -182,7 +182,7 @@ class HopperTask:
     def step(
         self, key: Key[Array, ""], state: State, action: Float[Array, "3"]
     ) -> tuple[State, Scalar, Bool[Array, ""]]:
-        """One control period."""
+        """Take one control period."""
         from mujoco import mjx
 
         model, data = _mjx(state.body)
@@ -201,7 +201,7 @@ class HopperTask:
         return after, reward, fallen
 
     def observe(self, state: State) -> Float[Array, "11"]:
-        """See `observe`."""
+        """Return the network's input; see `observe`."""
         return observe(state.qpos, state.qvel)
 
 
@@ -211,7 +211,7 @@ def _even(key: Key[Array, ""], size: int) -> Array:
 
 @cache
 def model() -> Any:
-    """The compiled `mujoco.MjModel`; not to be changed.
+    """Return the compiled `mujoco.MjModel`, which must not be changed.
 
     **Raises:** `MissingExtra` without MuJoCo.
     """
@@ -219,7 +219,7 @@ def model() -> Any:
 
 
 def _mjx(body: Float[Array, "4"]) -> tuple[Any, Any]:
-    """The model of one episode, and a blank state, in MJX.
+    """Return the model of one episode, and a blank state, in MJX.
 
     Constants that MuJoCo derives from masses soften contacts a little; they stay as they are.
     """

@@ -65,7 +65,7 @@ NOMINAL = {
 
 
 class State(NamedTuple):
-    """Where the car is relative to its lane; see the module."""
+    """The car relative to its lane; see the module."""
 
     offset: Scalar
     heading: Scalar
@@ -75,13 +75,13 @@ class State(NamedTuple):
 
 
 def feature(features: Features, name: str, at: Any = None) -> Any:
-    """A feature's value, or the nominal one; of a function of time or distance, that `at` there."""
+    """Return a feature's value or the nominal one; of a function of time or distance, that `at`."""
     value = features.get(name, NOMINAL[name])
     return value(at) if isinstance(value, Waveform) else value
 
 
 def initial(features: Features, key: Any = None) -> State:
-    """The state at time 0, the wheels turned as the road's curvature asks."""
+    """Return the state at time 0, the wheels turned as the road's curvature asks."""
     curvature = feature(features, "curvature", 0.0)
     return State(
         offset=feature(features, "offset0"),
@@ -93,7 +93,7 @@ def initial(features: Features, key: Any = None) -> State:
 
 
 def path_curvature(time: Scalar | float, state: State, features: Features) -> Scalar:
-    """Curvature of the rear axle's path, 1/m: what the wheels ask for and the tyres can give."""
+    """Return the curvature of the rear axle's path, 1/m, limited by the tyres' grip."""
     wanted = jnp.tan(state.steer + feature(features, "bias", time)) / feature(features, "wheelbase")
     # The lateral acceleration is speed^2 times curvature, and at most friction times gravity.
     limit = feature(features, "friction", time) * GRAVITY / jnp.maximum(state.speed**2, 1.0)
@@ -101,7 +101,7 @@ def path_curvature(time: Scalar | float, state: State, features: Features) -> Sc
 
 
 def dynamics(time: Scalar | float, state: State, command: Scalar, features: Features) -> State:
-    """Slope of the state under a steering `command` (rad).
+    """Return the derivative of the state under a steering `command` (rad).
 
     Source: the simple car of LaValle, Planning Algorithms (2006), eq. 13.15, whose reference is the
     rear axle, in the coordinates of a path: Micaelli and Samson, Trajectory tracking for
@@ -122,7 +122,7 @@ def dynamics(time: Scalar | float, state: State, command: Scalar, features: Feat
 
 
 def steer_rate(state: State, command: Scalar, features: Features) -> Scalar:
-    """The steering follows its command, saturated, with a first-order lag; rad/s."""
+    """Return the steering's rate (rad/s): a first-order lag behind its saturated command."""
     wanted = jnp.clip(command, -STEER_LIMIT, STEER_LIMIT)
     return (wanted - state.steer) / feature(features, "lag")
 
@@ -130,7 +130,7 @@ def steer_rate(state: State, command: Scalar, features: Features) -> Scalar:
 def signals(
     time: Scalar | float, state: State, command: Scalar, features: Features
 ) -> dict[str, Scalar]:
-    """What formulas see: the state, the command, and what the driver and the lane notice.
+    """Return the signals: the state, the command, and quantities of the driver and the lane.
 
     - `left`, `right`: m between the car's body and the lane marking on that side, negative beyond.
     - `lateral_acceleration` in m/s^2, `lateral_jerk` in m/s^3.
@@ -161,7 +161,7 @@ def signals(
 
 
 class Seen(NamedTuple):
-    """What a controller knows: the measured offset, its own steering and speed, and the map."""
+    """The controller's knowledge: the measured offset, its own steering and speed, and the map."""
 
     offset: Scalar
     heading: Scalar
@@ -171,7 +171,7 @@ class Seen(NamedTuple):
 
 
 def measured(time: Scalar | float, state: State, features: Features) -> Seen:
-    """The state as sensors and the map give it."""
+    """Return the state as sensors and the map give it."""
     return Seen(
         offset=state.offset + feature(features, "noise", time),
         heading=state.heading,
@@ -182,7 +182,7 @@ def measured(time: Scalar | float, state: State, features: Features) -> Seen:
 
 
 def lqr(gains: Sequence[float] = LQR_GAINS) -> Controller:
-    """A linear-quadratic regulator around the steering angle that the nominal car needs.
+    """Make a linear-quadratic regulator around the steering angle that the nominal car needs.
 
     - `gains`: rad per m of offset, per rad of heading, and per rad of steering.
     """
@@ -200,7 +200,7 @@ def lqr(gains: Sequence[float] = LQR_GAINS) -> Controller:
 
 
 def observation(seen: Seen) -> list[Scalar]:
-    """What the network sees: the same numbers, each of the order of one."""
+    """Return the network's input: the same numbers, each of the order of one."""
     return [
         seen.offset,
         10 * seen.heading,
@@ -211,7 +211,7 @@ def observation(seen: Seen) -> list[Scalar]:
 
 
 def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
-    """A trained network from what is measured to a command of at most `STEER_LIMIT`.
+    """Load a trained network from measurements to a command of at most `STEER_LIMIT`.
 
     - `policy`: a `Policy` or the file of one; the one that is shipped when left out.
     """
@@ -239,7 +239,7 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
 
 
 class Drive(NamedTuple):
-    """A car in training: where it is, and the road that it is on."""
+    """A car in training: its state, and the road that it is on."""
 
     car: State
     road: Waveform
@@ -261,7 +261,7 @@ class LaneKeepingTask:
         return Continuous(-STEER_LIMIT, STEER_LIMIT)
 
     def reset(self, key: Key[Array, ""]) -> Drive:
-        """Somewhere in the lane on a road of 300 m with radii of at least 300 m."""
+        """Start somewhere in the lane, on a road of 300 m with radii of at least 300 m."""
         place, road = jax.random.split(key)
         offset, heading, speed = jax.random.uniform(place, (3,), minval=-1.0, maxval=1.0)
         knots = jax.random.uniform(road, (7,), minval=-1 / 300, maxval=1 / 300)
@@ -277,7 +277,7 @@ class LaneKeepingTask:
     def step(
         self, key: Key[Array, ""], state: Drive, action: Float[Array, "1"]
     ) -> tuple[Drive, Scalar, Bool[Array, ""]]:
-        """One step of 0.04 s."""
+        """Take one step of 0.04 s."""
         features = {"curvature": state.road}
         before, command, time = state.car, action[0], jnp.zeros(())
         rates = dynamics(time, before, command, features)
@@ -286,7 +286,7 @@ class LaneKeepingTask:
         return Drive(after, state.road), reward, jnp.abs(after.offset) > LANE_WIDTH / 2
 
     def observe(self, state: Drive) -> Float[Array, "5"]:
-        """What `neural` gives to the network."""
+        """Return the input that `neural` gives to the network."""
         seen = measured(jnp.zeros(()), state.car, {"curvature": state.road})
         return jnp.stack(observation(seen))
 
@@ -294,7 +294,7 @@ class LaneKeepingTask:
 def lane_keeping(
     controller: Controller | None = None, *, duration: float = 10.0, dt: float = DT
 ) -> Ode:
-    """The closed loop as a system; see `signals` for what it shows.
+    """Make the closed loop a system; `signals` documents its signals.
 
     - `controller(time, state, features) -> command` in rad; `lqr()` when left out.
     - `duration`: simulated seconds, a multiple of 0.04.

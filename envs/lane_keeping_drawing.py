@@ -73,7 +73,7 @@ class _Road:
         self.y = y - np.interp(here, self.distance, y)
 
     def place(self, distance: Any, offset: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Points of the plane at distances along the road and offsets to its left."""
+        """Return points of the plane at distances along the road and offsets to its left."""
         x, y, direction = (
             np.interp(distance, self.distance, values)
             for values in (self.x, self.y, self.direction)
@@ -83,13 +83,13 @@ class _Road:
     def line(
         self, offset: float, begin: float | None = None, end: float | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A line beside the road's middle."""
+        """Draw a line beside the road's middle."""
         first = self.first if begin is None else begin
         last = self.last if end is None else end
         return self.place(np.linspace(first, last, 60), offset)
 
     def band(self, right: float, left: float, color: str) -> Any:
-        """The surface between two offsets."""
+        """Fill the surface between two offsets."""
         from matplotlib.patches import Polygon
 
         here = np.stack(self.line(right), axis=1)
@@ -98,7 +98,7 @@ class _Road:
 
 
 def _car(axes: Any, now: Mapping[str, float], wheelbase: float, color: str) -> None:
-    """The body with its windscreen and wheels, rear axle at the offset."""
+    """Draw the body with its windscreen and wheels, rear axle at the offset."""
     from matplotlib.patches import FancyBboxPatch, Polygon, Rectangle
     from matplotlib.transforms import Affine2D
 

@@ -57,7 +57,7 @@ NOMINAL_CONTINUOUS = {**NOMINAL, "power": 0.0015}
 
 
 class State(NamedTuple):
-    """Where the car is, from -1.2 to 0.6 (the valley's lowest point is -pi/6), and its velocity."""
+    """The car's place, from -1.2 to 0.6 (the valley's lowest point is -pi/6), and its velocity."""
 
     position: Scalar
     velocity: Scalar
@@ -71,7 +71,7 @@ def moved(
     friction: Scalar | float = 0.0,
     max_speed: Scalar | float = MAX_SPEED,
 ) -> State:
-    """The state one step later, under a throttle from -1 to 1. The left wall stops the car."""
+    """Return the state after a step at a throttle from -1 to 1; the left wall stops the car."""
     uphill = gravity * sin_cos(3 * state.position)[1]
     velocity = state.velocity + (throttle * power - uphill) - friction * state.velocity
     velocity = jnp.clip(velocity, -max_speed, max_speed)
@@ -81,25 +81,25 @@ def moved(
 
 
 def arrived(state: State, continuous: bool) -> Bool[Array, ""]:
-    """Whether the car is at the goal, not rolling back."""
+    """Return True where the car is at the goal and not rolling back."""
     goal = GOAL["continuous" if continuous else "discrete"]
     return (state.position >= goal) & (state.velocity >= 0)
 
 
 def energy(state: State, gravity: Scalar | float = NOMINAL["gravity"]) -> Scalar:
-    """Mechanical energy: 0 at rest at the bottom, 1 at rest at the height of the right summit."""
+    """Return the energy: 0 at rest at the bottom, 1 at rest at the height of the right summit."""
     potential = gravity / 3 * (1 + sin_cos(3 * state.position)[0])
     return (state.velocity**2 / 2 + potential) / (2 * gravity / 3)
 
 
 def observed(state: State) -> Float[Array, "2"]:
-    """What a network sees: position and velocity, each from about -1 to 1."""
+    """Return a network's input: position and velocity, each from about -1 to 1."""
     middle, half = (LEFT + RIGHT) / 2, (RIGHT - LEFT) / 2
     return jnp.stack([(state.position - middle) / half, state.velocity / MAX_SPEED])
 
 
 def along(enough: float = math.inf) -> Controller:
-    """Full throttle the way the car rolls, to the right from rest: what climbs the hill.
+    """Return full throttle the way the car rolls, to the right from rest: it climbs the hill.
 
     - `enough`: of `energy`, from which on it rolls back without throttle. 0.4 keeps it clear of the
       wall on the left, where Gymnasium's car would hit it.
@@ -115,7 +115,7 @@ def along(enough: float = math.inf) -> Controller:
 def neural(
     policy: Policy | str | Path, *, raw: bool = False, straight_through: bool = True
 ) -> Controller:
-    """A trained network, with 3 actions (left, none, right) or with a throttle from -1 to 1.
+    """Load a trained network, with 3 actions (left, none, right) or a throttle from -1 to 1.
 
     - `policy`: a `Policy` or the file of one. JAX may trace its weights.
     - `raw`: it sees position and velocity as they are, as Gymnasium's do, not as `observed` does.
@@ -147,7 +147,7 @@ def neural(
 def mountain_car(
     controller: Controller | None = None, *, continuous: bool = False, steps: int | None = None
 ) -> Stepped:
-    """The closed loop as a system with signals `position`, `velocity` and `throttle`.
+    """Make the closed loop, with signals `position`, `velocity` and `throttle`.
 
     - `controller(time, state, features) -> throttle` from -1 to 1; `along()` when left out. Its
       state is what the sensors show.
@@ -191,7 +191,7 @@ FARTHEST = {"start_range": -0.5 - LEFT, "start_speed_range": MAX_SPEED, "shaping
 
 
 class Episode(NamedTuple):
-    """A state, and the physics that this episode has."""
+    """A state, and the physics of this episode."""
 
     state: State
     power: Scalar
@@ -231,21 +231,21 @@ class MountainCarTask:
 
     @property
     def action(self) -> Discrete:
-        """0 accelerates to the left, 2 to the right, 1 not."""
+        """The three actions: 0 accelerates to the left, 2 to the right, 1 not."""
         return Discrete(3)
 
     def reset(self, key: Key[Array, ""]) -> Episode:
-        """At rest at the bottom of the valley, as the ranges say."""
+        """Start at rest at the bottom of the valley, or as the ranges say."""
         return _reset(self, key, NOMINAL["power"])
 
     def step(
         self, key: Key[Array, ""], state: Episode, action: Int[Array, ""]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
-        """One step."""
+        """Take one step."""
         return _step(self, state, action - 1.0, lambda there: -1.0, continuous=False)
 
     def observe(self, state: Episode) -> Float[Array, "2"]:
-        """Position and velocity as `observed`."""
+        """Return position and velocity as `observed`."""
         return observed(state.state)
 
 
@@ -274,13 +274,13 @@ class ContinuousMountainCarTask:
         return Continuous(-1.0, 1.0)
 
     def reset(self, key: Key[Array, ""]) -> Episode:
-        """At rest at the bottom of the valley, as the ranges say."""
+        """Start at rest at the bottom of the valley, or as the ranges say."""
         return _reset(self, key, NOMINAL_CONTINUOUS["power"])
 
     def step(
         self, key: Key[Array, ""], state: Episode, action: Float[Array, "1"]
     ) -> tuple[Episode, Scalar, Bool[Array, ""]]:
-        """One step."""
+        """Take one step."""
         throttle = jnp.clip(action[0], -1.0, 1.0)
 
         def reward(there: Bool[Array, ""]) -> Scalar:
@@ -289,7 +289,7 @@ class ContinuousMountainCarTask:
         return _step(self, state, throttle, reward, continuous=True)
 
     def observe(self, state: Episode) -> Float[Array, "2"]:
-        """Position and velocity as `observed`."""
+        """Return position and velocity as `observed`."""
         return observed(state.state)
 
 

@@ -38,13 +38,13 @@ PLACES: dict[str, Any] = {
 
 
 def observed(state: State) -> analytic.State:
-    """The state in the order of `envs.cartpole`, for its controllers."""
+    """Return the state in the order of `envs.cartpole`, for its controllers."""
     (x, theta), (x_dot, theta_dot) = state.qpos, state.qvel
     return analytic.State(x, x_dot, theta, theta_dot)
 
 
 def terminated(state: State, features: Mapping[str, Any]) -> Bool[Array, ""]:
-    """Whether CartPole-v1's episode is over: off the track, or more than 12 degrees away."""
+    """Return True where CartPole-v1's episode is over: off the track, or beyond 12 degrees."""
     return analytic.terminated(observed(state), features)
 
 
@@ -56,7 +56,7 @@ def cartpole(
     terminate: bool = False,
     backend: str = "auto",
 ) -> MuJoCo:
-    """The closed loop with signals `x`, `x_dot`, `theta`, `theta_dot` and `force`.
+    """Make the closed loop, with signals `x`, `x_dot`, `theta`, `theta_dot` and `force`.
 
     - `controller(time, state, features) -> force` in N, of `envs.cartpole`; `linear()` when left
       out.

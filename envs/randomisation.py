@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 
 def factor(unit: Float[Array, ""], spread: Float[Array, ""] | float) -> Float[Array, ""]:
-    """From `1 / (1 + spread)` to `1 + spread` for `unit` from -1 to 1, even in the logarithm."""
+    """Map `unit` from -1 to 1 to `1 / (1 + spread)` to `1 + spread`, evenly in the logarithm."""
     return jnp.exp(unit * jnp.log1p(spread))
 
 

@@ -85,7 +85,7 @@ LOAD = 3  # The number of the body.
 
 
 def observe(data: Any) -> Float[Array, "10"]:
-    """What a network sees: both angles by sine and cosine, speeds, the target, the way to it."""
+    """Return a network's input: angles by sine and cosine, speeds, the target, the way to it."""
     angles, tip, goal = data.qpos[:2], data.site_xpos[0, :2], data.site_xpos[1, :2]
     return jnp.concatenate(
         [jnp.sin(angles), jnp.cos(angles), 0.2 * data.qvel[:2], goal, 5.0 * (goal - tip)]
@@ -93,12 +93,12 @@ def observe(data: Any) -> Float[Array, "10"]:
 
 
 def distance(data: Any) -> Float[Array, ""]:
-    """From the tip to the target, in m."""
+    """Return the distance from the tip to the target, in m."""
     return jnp.sqrt(jnp.sum((data.site_xpos[1, :2] - data.site_xpos[0, :2]) ** 2) + 1e-12)
 
 
 def spring(stiffness: float = 60.0, damping: float = 1.0) -> Controller:
-    """A spring from the tip to the target (N/m), and a brake in the joints (N m s/rad).
+    """Make a spring from the tip to the target (N/m), with a brake in the joints (N m s/rad).
 
     Source: Hogan, Impedance control: an approach to manipulation (1985), part II.
     """
@@ -115,7 +115,7 @@ def spring(stiffness: float = 60.0, damping: float = 1.0) -> Controller:
 
 
 def neural(policy: Policy | str) -> Controller:
-    """A trained network, or the file of one. JAX may trace its weights."""
+    """Load a trained network, or take one. JAX may trace its weights."""
     policy = policy if isinstance(policy, Policy) else load_policy(policy)
     if policy.action != Continuous(-1.0, 1.0, 2) or policy.layers[0][0].shape[0] != 10:
         raise ValueError(
@@ -131,7 +131,7 @@ def reacher(
     duration: float = 2.0,
     backend: str = "auto",
 ) -> MuJoCo:
-    """The closed loop as a system with signals `distance` (m), `shoulder` and `elbow` (rad).
+    """Make the closed loop, with signals `distance` (m), `shoulder` and `elbow` (rad).
 
     - `varied`: the features that it has, of those in `BINDINGS`.
     - `controller(time, state, features) -> control`: two torques in parts of the motors' greatest,
@@ -170,7 +170,7 @@ def reacher(
 def reacher_task(
     *, effort: float = 0.02, load_range: float = 0.0, strength_range: float = 0.0
 ) -> MjxTask:
-    """Bring the tip to a target anywhere within reach, and keep it there; 2 s.
+    """Make the task: bring the tip to a target within reach, and keep it there; 2 s.
 
     Each step of 0.04 s earns up to 2, half of it from afar and half at the target, less `effort`
     times the squares of the motors' signals.

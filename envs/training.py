@@ -13,7 +13,7 @@ from verifai_jax.rl import PPO, Task, evaluate, save_policy, train
 
 @dataclass(frozen=True)
 class Training:
-    """A task, how it is trained, and when it counts as learned.
+    """A task, the options of its training, and the return at which it counts as learned.
 
     - `steps`, `seed`: of the network that is shipped in `file`.
     - `solved`: the mean return to reach, of at most `most`, over `episodes` that it was not
@@ -31,7 +31,7 @@ class Training:
     episodes: int = 1000
 
     def main(self, about: str | None, arguments: list[str] | None = None) -> int:
-        """Train, measure, and write the weights; returns the exit status."""
+        """Train, measure, write the weights, and return the exit status."""
         parser = argparse.ArgumentParser(
             description=about, formatter_class=argparse.RawTextHelpFormatter
         )

@@ -119,7 +119,7 @@ gusts = vj.Problem(
 
 
 def balance_with(policy: Policy) -> vj.Problem:
-    """`balance` for any policy with two actions; JAX may trace its weights."""
+    """Return `balance` for any policy with two actions; JAX may trace its weights."""
     return vj.Problem(
         "balance",
         paper,

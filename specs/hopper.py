@@ -14,7 +14,7 @@ UPRIGHT = "always[0, 4] (height >= 0.8 & abs(pitch) <= 0.8)"
 
 
 def nominal(*features: str) -> dict[str, float]:
-    """These features on an ordinary day."""
+    """Return these features' nominal values."""
     return {name: NOMINAL[name] for name in features}
 
 

@@ -25,7 +25,7 @@ as_built = {"speed0": 20.0, "wheelbase": 2.7, "lag": 0.1, "friction": 0.9}
 
 
 def road(sharpest: float) -> vj.Signal:
-    """A road whose curvature (1/m) is anything up to `sharpest` at every 50 m."""
+    """Return a road whose curvature (1/m) is anything up to `sharpest` at every 50 m."""
     return vj.Signal(vj.Box(-sharpest, sharpest), knots=7, hold="linear", duration=ROAD)
 
 

@@ -88,7 +88,7 @@ careful = _careful(along(enough=0.4))
 
 
 def climb_with(policy: Policy) -> vj.Problem:
-    """The climb under a policy: `climb_continuous` or `climb`, as its actions are.
+    """Return the climb under a policy: `climb_continuous` or `climb`, as its actions are.
 
     JAX may trace its weights.
     """
@@ -97,12 +97,12 @@ def climb_with(policy: Policy) -> vj.Problem:
 
 
 def careful_with(policy: Policy) -> vj.Problem:
-    """`careful` under a policy with either kind of action; JAX may trace its weights."""
+    """Return `careful` under a policy with either kind of action; JAX may trace its weights."""
     return _careful(neural(policy))
 
 
 def trained_on(size: float) -> MountainCarTask:
-    """The task that trainings see: other starts, engines and gravities too, and shaped rewards."""
+    """Return the task of trainings: other starts, engines and gravities too, shaped rewards."""
     return MountainCarTask(potential=size, start_range=0.4, power_range=0.2, gravity_range=0.1)
 
 

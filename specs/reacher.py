@@ -33,5 +33,5 @@ reach = _reach()
 
 
 def reach_with(policy: Policy) -> vj.Problem:
-    """`reach` for a policy; JAX may trace its weights."""
+    """Return `reach` for a policy; JAX may trace its weights."""
     return _reach(neural(policy))

@@ -17,7 +17,7 @@ from envs.cartpole_drawing import draw
 
 
 def decay(features, key=None) -> vj.Trace:
-    """The solution of x' = -k x + w from x0, every 0.1 s for 4 s; `u` is the force k x."""
+    """Return the solution of x' = -k x + w from x0, every 0.1 s for 4 s; `u` is the force k x."""
     time = jnp.arange(41) * 0.1
     fading = jnp.exp(-features["k"] * time)
     x = features["x0"] * fading + features["w"] / features["k"] * (1 - fading)
@@ -25,7 +25,7 @@ def decay(features, key=None) -> vj.Trace:
 
 
 def feedback(time, state, features):
-    """A linear state feedback with the gains of the features, saturated at 10 N."""
+    """Return a linear state feedback with the gains of the features, saturated at 10 N."""
     force = (
         features["k_x"] * state.x
         + features["k_x_dot"] * state.x_dot

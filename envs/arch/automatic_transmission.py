@@ -123,12 +123,12 @@ def _of_gear(choices: Sequence[Any], gear: Scalar) -> Any:
 
 
 def speed(state: State) -> Scalar:
-    """Speed of the car in mph."""
+    """Return the speed of the car in mph."""
     return state.wheel * MPH_PER_WHEEL_RPM
 
 
 def shifted(state: State, throttle: Scalar) -> State:
-    """The shift chart at one of its ticks."""
+    """Return the shift chart after one of its ticks."""
     v, gear = speed(state), state.gear
     up = _of_gear(interpolated(_UP, throttle), gear)
     down = _of_gear(interpolated(_DOWN, throttle), gear)
@@ -148,7 +148,7 @@ def shifted(state: State, throttle: Scalar) -> State:
 
 
 def driven(state: State, throttle: Scalar, brake: Scalar, dt: Any = DT) -> State:
-    """One step of the engine and the wheels, in a gear that stays."""
+    """Take one step of the engine and the wheels, in a gear that stays."""
     dtype = real()
     ratio = _of_gear(GEAR_RATIO, state.gear).astype(dtype)
     engine_torque = _ENGINE.along(throttle)
@@ -181,7 +181,7 @@ def driven(state: State, throttle: Scalar, brake: Scalar, dt: Any = DT) -> State
 
 
 def initial(features: Features) -> State:
-    """Idling in first gear, at rest."""
+    """Return the state at time 0: idling in first gear, at rest."""
     dtype = real()
     return State(
         jnp.asarray(1000.0, dtype),
@@ -193,7 +193,7 @@ def initial(features: Features) -> State:
 
 
 def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 1) -> State:
-    """From sample `k` to the next, whose gear is the one after the chart has run there."""
+    """Step from sample `k` to the next, in the gear after the chart has run there."""
     time = k.astype(real()) * DT
     throttle, brake = value(features["throttle"], time), value(features["brake"], time)
     state = repeated(lambda _, s: driven(s, throttle, brake, DT / substeps), state, substeps)
@@ -204,12 +204,12 @@ def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any =
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
-    """What the requirements speak of."""
+    """Return the signals of the requirements."""
     return {"speed": speed(state), "rpm": state.engine, "gear": state.gear}
 
 
 def automatic_transmission(duration: float = 30.0, *, substeps: Any = 1) -> Stepped:
-    """The model as a system.
+    """Make the model a system.
 
     - `duration`: simulated seconds, a multiple of 0.01. The competition has 50 s; its requirements
       look 30 s ahead (AT1, AT2, AT6) or 32.7 s (AT5).

@@ -49,7 +49,7 @@ class State(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """`v' = push - drag v` and `y' = sign v`, from a place and a speed on."""
+    """A motion `v' = push - drag v` and `y' = sign v`, from a place and a speed on."""
 
     place: Scalar
     speed: Scalar
@@ -58,7 +58,7 @@ class Motion(NamedTuple):
     sign: Any
 
     def at(self, t: Scalar | float) -> tuple[Scalar, Scalar]:
-        """Place and speed after `t` seconds, at most a step."""
+        """Return place and speed after `t` seconds, at most a step."""
         z = self.drag * t
         rate = self.push - self.drag * self.speed
         # (z - 1 + exp(-z)) / z^2, which has a value where z is 0.
@@ -78,7 +78,7 @@ class Path(NamedTuple):
 
 
 def _motion(mode: Any, place: Scalar, speed: Scalar) -> Motion:
-    """What a follower does in a mode: note that it moves up where it keeps its distance."""
+    """Return a follower's motion in a mode: note that it moves up where it keeps its distance."""
     dtype = real()
     push = jnp.where(mode == CHASING, 1.0, 0.0).astype(dtype)
     drag = jnp.where(mode == BRAKING, 1.0, 0.0).astype(dtype)
@@ -87,7 +87,7 @@ def _motion(mode: Any, place: Scalar, speed: Scalar) -> Motion:
 
 
 def _threshold(mode: Any, gap: Scalar) -> tuple[Scalar, Any, Any]:
-    """The gap at which a mode ends, whether it has, and the mode that follows."""
+    """Return the gap at which a mode ends, True if it has, and the next mode."""
     wide = gap > 10
     threshold = jnp.where(
         mode == CHASING, 10.0, jnp.where(mode == BRAKING, 20.0, jnp.where(wide, 15.0, 5.0))
@@ -101,7 +101,7 @@ def _threshold(mode: Any, gap: Scalar) -> tuple[Scalar, Any, Any]:
 
 
 def _followed(leader: Path, car: Any, dt: Any) -> tuple[Path, Any]:
-    """The path of a car behind `leader` over one step, and its mode at the end."""
+    """Return the path of a car behind `leader` over one step, and its mode at the end."""
     gap, speed, mode = car
     own = _motion(mode, jnp.zeros_like(gap), speed)
 
@@ -139,7 +139,7 @@ def _followed(leader: Path, car: Any, dt: Any) -> tuple[Path, Any]:
 
 
 def initial(features: Features) -> State:
-    """Ten apart, at rest, keeping their distance."""
+    """Return the state at time 0: ten apart, at rest, keeping their distance."""
     zero = jnp.zeros((), real())
     return State(
         zero, zero, jnp.full(4, 10.0, real()), jnp.zeros(4, real()), jnp.full(4, KEEPING, jnp.int32)
@@ -158,7 +158,7 @@ def _first(middle: Scalar, state: State, features: Features, dt: Any) -> Path:
 def advance(
     k: Int[Array, ""], state: State, features: Features, substeps: Any = 1, located: bool = True
 ) -> State:
-    """A hundredth of a second, with transitions within its steps or at their ends."""
+    """Step a hundredth of a second, with transitions within its steps or at their ends."""
     step, dt = _located if located else _unlocated, DT / substeps
 
     def substep(j: Any, state: State) -> State:
@@ -192,7 +192,7 @@ def _unlocated(carry: Any, car: Any, dt: Any) -> Any:
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
-    """The positions of the cars."""
+    """Return the positions of the cars."""
     places = [state.y1]
     for car in range(4):
         places.append(places[-1] + state.gaps[car])
@@ -200,7 +200,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
 
 
 def chasing_cars(duration: float = 100.0, *, located: bool = True, substeps: Any = 1) -> Stepped:
-    """The model as a system.
+    """Make the model a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
     - `located`: find transitions within the step; otherwise they wait for its end.

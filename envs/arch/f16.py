@@ -47,7 +47,7 @@ NOMINAL = {
 
 
 class State(NamedTuple):
-    """The plane, what the automatic pilot does, and for how many samples it has."""
+    """The plane, the automatic pilot's mode, and the number of samples in it."""
 
     plane: Plane
     mode: Int[Array, ""]
@@ -59,12 +59,12 @@ def _wrapped(angle: Scalar) -> Scalar:
 
 
 def nose_high(plane: Plane) -> Bool[Array, ""]:
-    """Whether the path leads up."""
+    """Return True where the path leads up."""
     return _wrapped(plane.theta - plane.alpha) > 0
 
 
 def decided(state: State) -> State:
-    """The automatic pilot's mode from a sample on."""
+    """Return the automatic pilot's mode from a sample on."""
     plane = state.plane
     level = (jnp.abs(_wrapped(plane.phi)) < LEVEL_PHI) & (jnp.abs(plane.p) < LEVEL_P)
     low = ~nose_high(plane) & (plane.altitude < FLIGHT_DECK)
@@ -78,14 +78,14 @@ def decided(state: State) -> State:
 
 
 def reference(plane: Plane, mode: Any) -> Reference:
-    """What the automatic pilot asks of the inner loop."""
+    """Return the automatic pilot's demand on the inner loop."""
     zero = jnp.zeros_like(plane.p)
     levelling = -PROPORTIONAL * _wrapped(plane.phi) - DERIVATIVE * plane.p
     return Reference(jnp.where(mode == PULL, LOAD, zero), jnp.where(mode == ROLL, levelling, zero))
 
 
 def initial(features: Features) -> State:
-    """The plane at first, about to roll its wings level."""
+    """Return the state at time 0, about to roll its wings level."""
     zero = jnp.zeros((), real())
     plane = Plane(*(zero,) * len(Plane._fields))
     given = {name: jnp.asarray(features[name], real()) for name in NOMINAL}
@@ -93,13 +93,13 @@ def initial(features: Features) -> State:
 
 
 def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 1) -> State:
-    """A thirtieth of a second, at whose end the automatic pilot thinks again."""
+    """Step a thirtieth of a second, at whose end the automatic pilot decides again."""
     plane = repeated(lambda _, p: _flown(p, state.mode, DT / substeps), state.plane, substeps)
     return decided(State(plane, state.mode, state.since + 1))
 
 
 def _flown(start: Plane, mode: Int[Array, ""], dt: Any) -> Plane:
-    """One step of the classical Runge-Kutta method."""
+    """Take one step of the classical Runge-Kutta method."""
 
     # A scan over the four stages of the classical method: XLA takes minutes for the derivative of
     # stages that are written out.
@@ -121,14 +121,14 @@ def _moved(plane: Plane, rate: Plane, seconds: Scalar) -> Plane:
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
-    """The altitude, and what else describes the flight."""
+    """Return the altitude, and other quantities of the flight."""
     names = ("altitude", "phi", "theta", "psi", "vt", "alpha")
     flight = {name: getattr(state.plane, name) for name in names}
     return {**flight, "mode": state.mode.astype(real())}
 
 
 def f16(duration: float = 15.0, *, substeps: Any = 1) -> Stepped:
-    """The model as a system.
+    """Make the model a system.
 
     - `duration`: simulated seconds, a multiple of 1/30.
     - `substeps`: integration steps in 1/30 s, the period of the automatic pilot.

@@ -108,7 +108,7 @@ class Plane(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """What the inner loop is to follow: normal load in g beyond 1, and roll rate in rad/s.
+    """The inner loop's reference: normal load in g beyond 1, and roll rate in rad/s.
 
     Side load plus yaw rate is to be zero, and so is the throttle beyond its trim.
     """
@@ -127,7 +127,7 @@ class Surfaces(NamedTuple):
 
 
 class Coefficients(NamedTuple):
-    """Of forces along the body's axes, and of moments about them."""
+    """Coefficients of forces along the body's axes, and of moments about them."""
 
     x: Scalar
     y: Scalar
@@ -138,7 +138,7 @@ class Coefficients(NamedTuple):
 
 
 def inner_loop(state: Plane) -> Surfaces:
-    """The surfaces that the inner loop sets."""
+    """Return the surfaces that the inner loop sets."""
     longitudinal = (state.alpha - TRIM_ALPHA, state.q, state.load_error)
     lateral = (state.beta, state.p, state.r, state.roll_error, state.side_error)
 
@@ -155,7 +155,7 @@ def inner_loop(state: Plane) -> Surfaces:
 
 
 def air_data(vt: Scalar, altitude: Scalar) -> tuple[Scalar, Scalar]:
-    """Mach number and dynamic pressure."""
+    """Return Mach number and dynamic pressure."""
     factor = 1 - 0.703e-5 * altitude
     temperature = jnp.where(altitude >= 35_000, 390.0, 519 * factor)
     density = 2.377e-3 * factor**4.14
@@ -163,7 +163,7 @@ def air_data(vt: Scalar, altitude: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def power_slope(power: Scalar, throttle: Scalar) -> Scalar:
-    """The engine's lag behind its throttle."""
+    """Return the rate of the engine's power, which lags behind its throttle."""
     wanted = jnp.where(throttle <= 0.77, 64.94 * throttle, 217.38 * throttle - 117.38)
 
     def rate(difference: Scalar) -> Scalar:
@@ -177,7 +177,7 @@ def power_slope(power: Scalar, throttle: Scalar) -> Scalar:
 
 
 def thrust(power: Scalar, altitude: Scalar, mach: Scalar) -> Scalar:
-    """Of the engine, in pounds."""
+    """Return the engine's thrust in pounds."""
     altitude = jnp.where(altitude < 0, 0.01, altitude)
     idle, military, maximum = (t.along(altitude)(mach) for t in (_IDLE, _MILITARY, _MAXIMUM))
     below = idle + (military - idle) * power * 0.02
@@ -192,7 +192,7 @@ def _polynomial(x: Scalar, *coefficients: float) -> Scalar:
 
 
 def aerodynamics(state: Plane, surfaces: Surfaces) -> Coefficients:
-    """Morelli's polynomials."""
+    """Evaluate Morelli's polynomials."""
     a, b = state.alpha, state.beta
     de, da, dr = (jnp.deg2rad(angle) for angle in surfaces[1:])
     p, r = (rate * SPAN / (2 * state.vt) for rate in (state.p, state.r))
@@ -247,7 +247,7 @@ def aerodynamics(state: Plane, surfaces: Surfaces) -> Coefficients:
 
 
 def damped(state: Plane, c: Coefficients) -> Coefficients:
-    """The same with the tabulated damping."""
+    """Return the same coefficients with the tabulated damping."""
     p, r = (rate * SPAN / (2 * state.vt) for rate in (state.p, state.r))
     q = state.q * CHORD / (2 * state.vt)
     d = interpolated(_DAMPING, jnp.rad2deg(state.alpha))
@@ -262,7 +262,7 @@ def damped(state: Plane, c: Coefficients) -> Coefficients:
 
 
 def slope(state: Plane, reference: Reference) -> Plane:
-    """The slope of the plane with its inner loop, which follows a reference."""
+    """Return the derivative of the plane with its inner loop, which follows a reference."""
     s, surfaces = state, inner_loop(state)
     mach, pressure = air_data(s.vt, s.altitude)
     c = damped(s, aerodynamics(s, surfaces))

@@ -113,7 +113,7 @@ B4 = 0.8636776698074995
 
 
 class State(NamedTuple):
-    """Position and velocity of the magnet; what the controller remembers, normalised.
+    """Position and velocity of the magnet, and the controller's normalised memory.
 
     `position_before` is the position one control period ago, `currents` the outputs one and two
     periods ago.
@@ -130,7 +130,7 @@ def _normalised(x: Scalar, low: float, high: float) -> Scalar:
 
 
 def controlled(state: State, reference: Scalar) -> Scalar:
-    """The current that the controller decides on."""
+    """Return the current that the controller decides on."""
     inputs = (_normalised(state.position, MINT, MAXT), state.position_before, *state.currents)
 
     def layer(weights: np.ndarray, bias: np.ndarray, out: np.ndarray, out_bias: float) -> Scalar:
@@ -149,14 +149,14 @@ def controlled(state: State, reference: Scalar) -> Scalar:
 
 
 def slope(state: tuple[Scalar, Scalar], current: Scalar) -> tuple[Scalar, Scalar]:
-    """Slope of (position, velocity) under a current."""
+    """Return the derivative of (position, velocity) under a current."""
     position, velocity = state
     force = 15 * current * current * jnp.sign(current) / (3 * position)
     return velocity, force - 9.8 - 12 * velocity / 3
 
 
 def initial(features: Features) -> State:
-    """Half a unit up, at rest, with delays of zero."""
+    """Return the state at time 0: half a unit up, at rest, with delays of zero."""
     zero = jnp.zeros((), real())
     return State(jnp.asarray(0.5, real()), zero, zero, (zero, zero))
 
@@ -166,7 +166,7 @@ def _decided(k: Int[Array, ""], state: State, features: Features) -> Scalar:
 
 
 def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any = 10) -> State:
-    """One control period."""
+    """Take one control period."""
     current = _decided(k, state, features)
 
     def substep(_: Any, plant: Any) -> Any:
@@ -182,7 +182,7 @@ def advance(k: Int[Array, ""], state: State, features: Features, substeps: Any =
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
-    """What the requirements speak of, and the control."""
+    """Return the signals of the requirements, and the control."""
     return {
         "Pos": state.position,
         "Ref": value(features["Ref"], k.astype(real()) * DT),
@@ -191,7 +191,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
 
 
 def neural_network_controller(duration: float = 40.0, *, substeps: Any = 10) -> Stepped:
-    """The model as a system.
+    """Make the model a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
     - `substeps`: integration steps in a control period.

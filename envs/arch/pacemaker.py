@@ -26,7 +26,7 @@ NOMINAL = {"LRL": 60.0}
 
 
 class State(NamedTuple):
-    """Whether it paces (else it charges), ms since then, and the count of paces."""
+    """The mode (pacing or charging), ms since its start, and the count of paces."""
 
     pacing: Bool[Array, ""]
     since: Int[Array, ""]
@@ -34,12 +34,12 @@ class State(NamedTuple):
 
 
 def initial(features: Features) -> State:
-    """Charging, with no pace yet."""
+    """Return the state at time 0: charging, with no pace yet."""
     return State(jnp.array(False), jnp.int32(0), jnp.int32(0))
 
 
 def advance(k: Int[Array, ""], state: State, features: Features) -> State:
-    """Ten ticks of the chart."""
+    """Run ten ticks of the chart."""
 
     def tick(state: State, j: Int[Array, ""]) -> tuple[State, None]:
         limit = value(features["LRL"], (k * TICKS + j + 1).astype(real()) * TICK)
@@ -52,7 +52,7 @@ def advance(k: Int[Array, ""], state: State, features: Features) -> State:
 
 
 def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Float[Array, ""]]:
-    """What the requirement speaks of, and the input."""
+    """Return the signals of the requirement, and the input."""
     return {
         "paces": state.paces.astype(real()),
         "LRL": value(features["LRL"], k.astype(real()) * DT),
@@ -60,7 +60,7 @@ def signals(k: Int[Array, ""], state: State, features: Features) -> dict[str, Fl
 
 
 def pacemaker(duration: float = 10.0) -> Stepped:
-    """The model as a system.
+    """Make the model a system.
 
     - `duration`: simulated seconds, a multiple of 0.01.
     """

@@ -1,9 +1,9 @@
-"""A system given by what happens between two samples: its own solver, its own state machine.
+"""A system given by its step between two samples: its own solver, its own state machine.
 
     Stepped(initial, advance, signals, dt=0.01, steps=3000, nominal={"throttle": 50.0})
 
 The benchmark models prescribe solvers, and let discrete logic run at instants of its own, which
-`verifai_jax.systems.ode._ode` has no words for.
+`vj.ode` does not offer.
 """
 
 import math
@@ -13,12 +13,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
-from verifai_jax.systems.base import System
+from verifai_jax.systems.base import Carry, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor
 
@@ -61,7 +62,7 @@ class Stepped(System):
         return self.steps * self.dt
 
     def refined(self, factor: int) -> "Stepped":
-        """The same model, sampled and decided as before, with a `factor` times smaller step.
+        """Return the same model, sampled and decided as before, at a `factor` times smaller step.
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
@@ -73,19 +74,28 @@ class Stepped(System):
         """Refuse features that the model does not have; it would ignore them."""
         check_names("feature", features, self.nominal)
 
-    def __call__(self, features: Features, key: Any = None) -> Trace:
+    def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once; nothing is random."""
-        last, _, samples = self._run(features, None, lambda _, seen: (None, seen))
+        last, _, samples = self._run(features, None, lambda _, sample: (None, sample))
         return Trace(samples, dt=self.dt, status=_status(last))
 
     def fold(
-        self, features: Features, key: Any, carry: Any, update: Callable[[Any, Any], Any]
-    ) -> tuple[Any, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample: none is kept."""
-        last, carry, _ = self._run(features, carry, lambda c, seen: (update(c, seen), None))
+        self,
+        features: Features,
+        key: Seed,
+        carry: Carry,
+        update: Callable[[Carry, dict[str, Array]], Carry],
+    ) -> tuple[Carry, Int[Array, ""]]:
+        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored."""
+        last, carry, _ = self._run(features, carry, lambda c, sample: (update(c, sample), None))
         return carry, _status(last)
 
-    def _run(self, features: Features, kept: Any, keep: Any) -> tuple[Any, Any, Any]:
+    def _run(
+        self,
+        features: Features,
+        collected: PyTree,
+        collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
+    ) -> tuple[Any, Any, Any]:
         self.check(features)
         features = bound({**self.nominal, **features}, self.duration)
 
@@ -93,32 +103,32 @@ class Stepped(System):
         # quarter faster where a step has stages, and quicker to compile.
         advance = jax.checkpoint(self.advance, prevent_cse=False)
 
-        def sample(carry: Any, k: Int[Array, ""]) -> Any:
-            state, kept = carry
-            kept, output = keep(kept, self.signals(k, state, features))
+        def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
+            state, collected = carry
+            collected, output = collect(collected, self.signals(k, state, features))
             following = advance(k, state, features)
             # One iteration more than there are steps samples the last state and stays there: it
             # costs less than appending one sample to all others.
             state = jax.tree.map(lambda a, b: jnp.where(k < self.steps, a, b), following, state)
-            return (state, kept), output
+            return (state, collected), output
 
-        start = (self.initial(features), kept)
-        (last, kept), outputs = checkpointed_scan(sample, start, self.steps + 1)
-        return last, kept, outputs
+        start = (self.initial(features), collected)
+        (last, collected), outputs = checkpointed_scan(sample, start, self.steps + 1)
+        return last, collected, outputs
 
 
-def value(feature: Any, time: Scalar | float) -> Any:
-    """A feature at a time: a function of time, or a number that holds always."""
+def value(feature: Callable[[Any], Any] | ArrayLike, time: Scalar | float) -> Any:
+    """Return a feature at a time, be it a function of time or a number."""
     return feature(time) if callable(feature) else jnp.asarray(feature, real())
 
 
 def real() -> Any:
-    """The floating type of this process: double where JAX's x64 is on."""
+    """Return the floating type of this process: double where JAX's x64 is on."""
     return jnp.result_type(float)
 
 
-def repeated(step: Callable[[Any, Any], Any], state: Any, count: Any) -> Any:
-    """`state = step(j, state)` for `j` below `count`.
+def repeated(step: Callable[[Any, Any], Any], state: PyTree, count: int | Int[Array, ""]) -> Any:
+    """Apply `state = step(j, state)` for `j` below `count`.
 
     JAX may trace the count; then there is no derivative in reverse mode.
     """
@@ -128,7 +138,7 @@ def repeated(step: Callable[[Any, Any], Any], state: Any, count: Any) -> Any:
 
 
 def whole(seconds: float, dt: float, name: str) -> int:
-    """How many periods of `dt` make `seconds`.
+    """Return the number of periods of `dt` in `seconds`.
 
     **Raises:** `ValueError`, naming the argument, unless it is a whole number of at least 1.
     """
@@ -138,7 +148,7 @@ def whole(seconds: float, dt: float, name: str) -> int:
     return steps
 
 
-def _status(last: Any) -> Int[Array, ""]:
+def _status(last: PyTree) -> Int[Array, ""]:
     finite = jnp.array(True)
     for leaf in jax.tree.leaves(last):
         if jnp.issubdtype(leaf.dtype, jnp.inexact):

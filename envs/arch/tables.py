@@ -32,14 +32,14 @@ class Hinges(NamedTuple):
 
 
 def hinges(x: npt.ArrayLike, y: npt.ArrayLike) -> Hinges:
-    """The interpolations of the columns of `y[i]` at increasing `x[i]`."""
+    """Interpolate the columns of `y[i]` at increasing `x[i]`."""
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     slopes = np.diff(ys, axis=0) / np.diff(xs)[:, None]
     return Hinges(float(xs[0]), ys[0], slopes[0], xs[1:-1], np.diff(slopes, axis=0))
 
 
 def interpolated(table: Hinges, x: Scalar) -> list[Scalar]:
-    """The value of each column at `x`."""
+    """Return the value of each column at `x`."""
     over = [jnp.maximum(x - float(at), 0) for at in table.at]
     # Column by column: XLA makes one loop over the lanes of it.
     return [
@@ -59,7 +59,7 @@ class Bilinear(NamedTuple):
     at: np.ndarray
 
     def along(self, x: Scalar) -> Callable[[Scalar], Scalar]:
-        """The function of the second number that is left at `x`."""
+        """Return the function of the second number that is left at `x`."""
         level, tilt, *bends = interpolated(self.coefficients, x)
 
         def value(y: Scalar) -> Scalar:
@@ -72,7 +72,7 @@ class Bilinear(NamedTuple):
 
 
 def bilinear(x: npt.ArrayLike, y: npt.ArrayLike, z: npt.ArrayLike) -> Bilinear:
-    """The interpolation of the values `z[i, j]` at `x[i], y[j]`."""
+    """Interpolate the values `z[i, j]` at `x[i], y[j]`."""
     rows = hinges(y, np.transpose(z))
     coefficients = np.concatenate([rows.base[None], rows.slope[None], rows.bend])
     return Bilinear(hinges(x, coefficients.T), rows.x0, rows.at)

@@ -1,4 +1,4 @@
-"""What a user's functions must return, and the errors that say so before anything compiles.
+"""Checks of what a user's functions return, before anything compiles.
 
 States, controls and memories are pytrees; here they are compared leaf by leaf, by name.
 """

@@ -1,4 +1,4 @@
-"""A pool of processes that simulate: one that hangs or dies takes nothing with it but itself.
+"""A pool of processes that simulate: a hang or a crash costs one simulation, not the run.
 
 Each worker is a fresh Python, so that nothing of this process (threads, JAX, locks) is half copied
 into it, and in a session of its own: Ctrl-C reaches this process only, and a worker that is ended

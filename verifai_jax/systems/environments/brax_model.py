@@ -1,4 +1,4 @@
-"""Parts of a Brax environment that features set, and where it starts.
+"""Paths to the parts of a Brax environment, and copies of it with parts set.
 
 place = system_place(env, "link.inertia.mass[pole]", "hopper")
 env = with_system(env, with_value(env.unwrapped.sys, place, 2.0, "mass"))

@@ -1,4 +1,4 @@
-"""What all stepping environments share: a policy in the loop, one trace of one episode.
+"""One trace of one episode: a policy in the loop around any environment that steps.
 
     rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key)
 

@@ -1,4 +1,4 @@
-"""Which numbers of a MuJoCo model, its initial state and what acts on it the features set.
+"""Bindings from features to numbers of a MuJoCo model, its initial state, forces and controls.
 
     bind={"masspole": "body/pole/mass", "wind": "body/cart/force[0]", "x0": "joint/slider/qpos"}
     bind={"grip": ["geom/left/friction[0]", "geom/right/friction[0]"]}    # one feature, several

@@ -1,7 +1,7 @@
-"""The closed loop around a MuJoCo model, whatever engine steps it: state, control, signals, end.
+"""The closed loop around a MuJoCo model, for both engines: state, control, signals, end.
 
 Both backends call `sample` between control periods, the native one on a whole batch under `vmap`.
-What it computes is therefore the same on both, down to the order of operations.
+It is therefore the same computation on both, down to the order of operations.
 """
 
 from collections.abc import Callable, Mapping

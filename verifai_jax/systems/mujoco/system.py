@@ -1,4 +1,4 @@
-"""A MuJoCo model in a closed loop as a system: `(features, key) -> Trace`, on one of two engines.
+"""A MuJoCo model in a closed loop as a system `(features, key) -> Trace`, on one of two engines.
 
 mujoco("envs/mujoco_cartpole.xml", duration=4.0, control_period=0.02,
 bind={"masspole": "body/pole/mass", "x0": "joint/slider/qpos"},

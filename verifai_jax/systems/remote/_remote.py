@@ -1,4 +1,4 @@
-"""Simulators in other processes, languages and machines: a run hands them points over TCP.
+"""Simulators in other processes, languages and machines, to which a run sends points over TCP.
 
     with remote(port=4567) as system:                    # and there: serve(simulate, port=4567)
         falsify(Problem("cars", space, system, "always x <= 2"))
@@ -157,7 +157,7 @@ def remote(
     - `retries`: how often a point is handed out again if the client vanishes that simulates it.
     - `patience`: seconds without any client after which the points that are left become rows with
       status `error`; waits, and says so in the log, when left out.
-    - `signals`, `dt`, `length`: what every trace must have; see `blackbox.Declared`. A client that
+    - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
       sends another gets an error, and the row has status `error`.
     - `most_bytes`: of one message from a client.
 

@@ -1,6 +1,6 @@
-"""One client of the server: what it said of itself, what it has, and what it is owed.
+"""One client of the server: its hello, its points, and the bytes that wait to be sent to it.
 
-Nothing here waits: what is sent is kept until the socket takes it.
+Nothing here blocks: bytes wait in a buffer until the socket takes them.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""The server thread of `remote`: who is connected, which point is where, and whose time is up.
+"""The server thread of `remote`: its clients, the points that each of them has, and timeouts.
 
 Clients come and go while the run goes on: the points of one that vanishes go to others. One thread
 owns all sockets and points, so that nothing is locked; the run's thread only puts points into its

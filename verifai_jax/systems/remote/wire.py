@@ -1,4 +1,4 @@
-"""What goes over the wire between a run and its simulators; `docs/remote.md` says it for clients.
+"""Messages between a run and its simulators; `docs/remote.md` describes them for clients.
 
 A frame is a length (4 bytes, big-endian), that many bytes of UTF-8 JSON, and, where the JSON has a
 number `"bytes"`, that many raw bytes, in which the JSON's arrays may lie:
