@@ -21,7 +21,7 @@ CHECKED_ROOMS: list[str] = ["estimation"]
 
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")
 
-import verifai_jax  # noqa: E402, F401 - before any test starts JAX's backend, as users should
+import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
 
 LONG_FILES: tuple[str, ...] = ()
 """Test files that take longest, the longest first: what begins last must be short."""

@@ -57,7 +57,7 @@ def test_falsify_and_replay(call, tmp_path):
     command = next(line for line in output.splitlines() if "verifai-jax replay" in line)
     again = call(*command.split("verifai-jax ")[1].split())
     assert "violated" in again
-    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures")
+    call("falsify", "specs/ramp.py:ramp", "--search", "grid", "--budget", 20, "--no-pictures")
     assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
 
 
@@ -102,7 +102,8 @@ def test_ends_and_warm_start(call):
     assert "whenever stopped" in output
     output = call(*ramp, "--search", "uniform", "--decide", 0.6, "--folder", "decided")
     assert "stopped by stop_when" in output
-    output = call(*ramp, "--warm-start", "prior", "--budget", 64, "--folder", "warm")
+    learning = ("--search", "cross_entropy", "--warm-start", "prior")
+    output = call(*ramp, *learning, "--budget", 64, "--folder", "warm")
     assert "64 simulations" in output
     assert "give one" in call(*ramp, "--within", 0.1, "--decide", 0.1, code=2)
     assert "needs independent samples" in call(*ramp, "--within", 0.1, code=1)
@@ -136,7 +137,7 @@ def test_list(call):
         (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
         (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
         (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
-        (["falsify", "specs/ramp.py:ramp", "--set", "slope=1"], "did you mean 'slopes"),
+        (["falsify", "specs/ramp.py:ramp", "--set", "gradient=1"], "did you mean 'gradients"),
         (["falsify", "specs/ramp.py:ramp", "--set", "elite"], "--set needs NAME=VALUE"),
         (
             ["falsify", "specs/ramp.py:ramp", "--budget", "0"],
@@ -155,7 +156,8 @@ def test_mistakes_get_one_line(call, arguments, message):
 
 
 def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
-    call("falsify", "specs/ramp.py:ramp", "--budget", 20, "--no-pictures", "--folder", "r")
+    start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--no-pictures"]
+    call(*start, "--budget", 20, "--folder", "r")
     record = json.loads((tmp_path / "r" / "run.json").read_text())
     evil = tmp_path / "r" / "evil.py"
     evil.write_text("raise SystemExit('ran')")
@@ -168,7 +170,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
 
 
 def test_precision_of_a_run(call, tmp_path):
-    where = ("--folder", tmp_path / "run", "--no-pictures")
+    where = ("--search", "uniform", "--folder", tmp_path / "run", "--no-pictures")
     call("falsify", "specs/ramp.py:ramp", "--budget", 32, "--precision", "float64", *where)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["precision"], record["backend"]) == ("float64", None)

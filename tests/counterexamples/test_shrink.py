@@ -94,6 +94,7 @@ def edges():
     return vj.falsify(problem_of("edge", 3, edge), "uniform", 512, batch=512, progress=False)
 
 
+@pytest.mark.slow
 def test_the_edge_of_two_half_spaces(edges):
     for seed, row in enumerate(starts(edges, 3)):
         checked(edges, row, EDGE, EDGE[1], seed=seed)

@@ -5,6 +5,7 @@ import pytest
 from verifai_jax.rl.shuffling import permutation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 96, 1024, 1600, 2048])
 def test_the_orders_of_jax(n):
     keys = jax.random.split(jax.random.key(7), 100)
