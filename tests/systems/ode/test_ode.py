@@ -307,7 +307,7 @@ def test_state_takes_the_precision_of_its_features():
             {"controller": lambda t, s, f: 0.0, "control_period": 0.015},
             r"control_period must be a positive multiple of dt; got \(control_period=0.015, dt",
         ),
-        ({"unroll": 0}, r"unroll must be at least 1; got 0"),
+        ({"unroll": 0}, r"unroll must be an integer of at least 1; got 0"),
     ],
 )
 def test_refuses_what_does_not_fit(options, message):

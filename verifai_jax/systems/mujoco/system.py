@@ -7,7 +7,6 @@ mjx(...)                              # the same in JAX: vmap, gradients, GPU
 native(...)                           # the same in C: all cores, a batch in lock-step
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +22,7 @@ from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import Features, Seed, System
+from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
 from verifai_jax.systems.mujoco.mjx_rollout import has_constraints, reverse_hint, rollout, why_not
@@ -244,8 +244,8 @@ def mujoco(
         signals=signals,
         terminate=terminate,
         control_period=float(control_period),
-        periods=_whole(duration, control_period, "duration", "control_period"),
-        substeps=_whole(control_period, timestep, "control_period", "the model's timestep"),
+        periods=count_periods(duration, control_period, "duration", "control_period"),
+        substeps=count_periods(control_period, timestep, "control_period", "the model's timestep"),
     )
     _ = loop.places
     system = MuJoCo(loop)
@@ -260,14 +260,3 @@ def mjx(model: ModelSource, **options: Any) -> MuJoCo:
 def native(model: ModelSource, **options: Any) -> MuJoCo:
     """Make a system of a MuJoCo model that C steps on all cores; arguments as `mujoco`."""
     return mujoco(model, backend="native", **options)
-
-
-def _whole(seconds: float, part: float, name: str, of: str) -> int:
-    """Return how many times `part` goes into `seconds`; refuse anything but a whole number >= 1."""
-    number = isinstance(seconds, int | float) and math.isfinite(seconds) and part > 0
-    count = round(seconds / part) if number else 0
-    if count < 1 or abs(count * part - seconds) > 1e-6 * part:
-        raise ValueError(
-            f"{name} must be a positive multiple of {of}; got ({name}={seconds}, {of}={part})"
-        )
-    return count

@@ -23,6 +23,7 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import bound
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
+from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.ode.integrators import Time, check_factor, integrator
 from verifai_jax.systems.pytree_checks import (
     as_floating,
@@ -305,16 +306,6 @@ def _is_pair(value: object) -> bool:
     return isinstance(value, tuple) and len(value) == 2
 
 
-def _whole(seconds: float, dt: float, name: str) -> int:
-    """Return the number of steps of `dt` in `seconds`; refuse anything but a whole number >= 1."""
-    steps = round(seconds / dt) if math.isfinite(seconds) else 0
-    if steps < 1 or abs(steps * dt - seconds) > 1e-6 * dt:
-        raise ValueError(
-            f"{name} must be a positive multiple of dt; got ({name}={seconds}, dt={dt})"
-        )
-    return steps
-
-
 @suggests_options
 def ode(
     dynamics: Callable[..., Any],
@@ -367,7 +358,7 @@ def ode(
         raise ValueError(f"give either duration or steps; got (duration={duration}, steps={steps})")
     if steps is None:
         assert duration is not None
-        steps = _whole(duration, dt, "duration")
+        steps = count_periods(duration, dt, "duration")
     check_count("steps", steps)
     integrator(method)
     if controller is None and (control_period is not None or controller_memory is not None):
@@ -381,7 +372,7 @@ def ode(
         dt=float(dt),
         steps=steps,
         steps_per_control=(
-            1 if control_period is None else _whole(control_period, dt, "control_period")
+            1 if control_period is None else count_periods(control_period, dt, "control_period")
         ),
         method=method,
         signals=signals,
