@@ -1,6 +1,7 @@
 """The house: layers of rooms, no circle of files, few files at the root, light imports."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,7 +39,7 @@ FILES = {module_name(file): file for file in sorted(PACKAGE.rglob("*.py"))}
 
 
 def imports_of(source: str, files: set[str]) -> set[str]:
-    """The modules of this package that a file imports, late and type-checking imports counted."""
+    """Return the modules of this package that a file imports, late and type-checking ones too."""
     found = set()
 
     def nearest(name: str) -> None:
@@ -150,3 +151,28 @@ def test_import_is_light():
     code = f"import sys, verifai_jax\nprint(*[m for m in {heavy.split()} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+def test_the_document_names_files_that_exist():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    named = set(re.findall(r"`([\w/]+\.py)`", text))
+    assert named
+    assert [
+        name
+        for name in sorted(named)
+        if not (PACKAGE / name).exists() and not (ROOT / name).exists()
+    ] == []
+
+
+def test_a_row_comes_about_in_ten_files():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    steps = re.findall(r"^(\d+)\. `([\w/]+\.py)`", text, re.MULTILINE)
+    assert [int(number) for number, _ in steps] == list(range(1, len(steps) + 1))
+    assert 5 <= len(steps) <= 10
+
+
+def test_the_drawing_has_every_room():
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    drawing = text.split("```")[1]
+    for room in set().union(*LAYERS) - {"_version"}:
+        assert f"{room}/" in drawing

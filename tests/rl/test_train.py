@@ -61,6 +61,7 @@ def test_learns_discrete_actions():
     assert trained.steps[-1] >= 8_000
 
 
+@pytest.mark.slow
 def test_learns_continuous_actions_from_observations_of_another_scale():
     ppo = PPO(
         learning_rate=1e-2,

@@ -132,7 +132,7 @@ def sweep(
 
 
 def _understood(asked: dict[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
-    """Keywords of the sweep."""
+    """Return the keywords of the sweep."""
     from verifai_jax.search import named
     from verifai_jax.sweeps.halving import Halving
 
@@ -156,7 +156,7 @@ def _understood(asked: dict[str, Any], options: tuple[str, ...]) -> dict[str, An
 
 
 def _before(store: Path) -> dict[str, Any]:
-    """What the sweep was asked for that a store remembers."""
+    """Read the options of the sweep that a store remembers."""
     from verifai_jax.sweeps.cache import Store, StoreError, store_file
 
     if not store_file(store).exists():
@@ -169,7 +169,7 @@ def _before(store: Path) -> dict[str, Any]:
 
 
 def _told(found: Any) -> str:
-    """The first rows, the ones to choose first, as text."""
+    """Write the first rows, the ones to choose first, as text."""
     from verifai_jax.sweeps.ranking import chosen_first
 
     table = found.table
