@@ -34,8 +34,9 @@ from specs import ball, hopper, mujoco_cartpole
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.differentiation import Derivative
-from verifai_jax.evaluation.engine import Engine, engine_for, judge
+from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.verdicts import trace_verdict
 
 KEY = run_keys(0)[1]
 BATCHES = (1, 64, 1024, 4096)
@@ -149,7 +150,9 @@ def overhead():
         features, keys = jax.device_put((features, keys), split)
 
         def bare(features, keys, problem=problem):
-            return jax.vmap(lambda f, k: judge(problem, problem.system(f, k)))(features, keys)
+            return jax.vmap(lambda f, k: trace_verdict(problem, problem.system(f, k)))(
+                features, keys
+            )
 
         mesh, part = split.mesh, PartitionSpec("b")
         program = jax.jit(

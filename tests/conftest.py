@@ -44,7 +44,7 @@ def memory_given_back(request: pytest.FixtureRequest) -> Iterator[None]:
     for module in (request.module, *specs):
         for value in vars(module).values():
             if isinstance(value, verifai_jax.Problem):
-                value.engines.clear()
+                value.programs.clear()
     jax.clear_caches()
     gc.collect()
 

@@ -10,7 +10,7 @@ from envs import cartpole as cp
 from specs.cartpole import balance_with
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.engine import judge
+from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.rl import Discrete, Policy, evaluate, load_policy
 from verifai_jax.rl.policy import new_layers
 
@@ -248,7 +248,7 @@ def test_one_program_judges_any_policy_of_a_form():
         problem = balance_with(policy)
 
         def one(u):
-            return judge(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
+            return trace_verdict(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
 
         return jax.vmap(one)(u)
 
@@ -263,7 +263,9 @@ def test_one_program_judges_any_policy_of_a_form():
     # As constants, which are written out.
     problem = balance_with(shipped)
     row = int(np.argmin(rho))
-    alone = judge(problem, jax.jit(problem.system)(problem.space.unflatten(u[row]), KEY))[0][0]
+    alone = trace_verdict(problem, jax.jit(problem.system)(problem.space.unflatten(u[row]), KEY))[
+        0
+    ][0]
     np.testing.assert_allclose(alone, rho[row], atol=1e-4)
 
 

@@ -13,7 +13,7 @@ from envs import hopper as h
 from envs import train_hopper, training
 from specs import hopper as specs
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.falsification.run import replay
+from verifai_jax.evaluation.replay import replay
 from verifai_jax.rl import Discrete, Trained, evaluate, load_policy, policy_notes
 
 KEY = jax.random.key(0)

@@ -9,7 +9,7 @@ from gymnasium.envs.classic_control import continuous_mountain_car
 
 from envs import mountain_car as mc
 from specs.mountain_car import climb, climb_continuous, climb_with
-from verifai_jax.evaluation.engine import judge
+from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.rl import Continuous, Discrete, Policy, evaluate
 
 KEY = jax.random.key(0)
@@ -300,7 +300,7 @@ def test_one_program_judges_any_policy_of_a_form(continuous):
 
     def worst(problem, u):
         def one(u):
-            return judge(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
+            return trace_verdict(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
 
         return jax.vmap(one)(u)
 

@@ -14,14 +14,14 @@ from specs import cartpole as paper
 from specs import mujoco_cartpole as specs
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.engine import judge
 from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.verdicts import trace_verdict
 
 ROWS = 256
 
 
 def verdicts(problem, traces):
-    rho, status = jax.jit(jax.vmap(lambda trace: judge(problem, trace)))(
+    rho, status = jax.jit(jax.vmap(lambda trace: trace_verdict(problem, trace)))(
         jax.tree.map(jnp.asarray, traces)
     )
     assert (np.asarray(status) == Status.OK).all()

@@ -10,7 +10,7 @@ pytest.importorskip("mujoco.mjx")
 from envs import reacher as rc
 from specs.reacher import reach, reach_with
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.evaluation.engine import judge
+from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.rl import PPO, Continuous, Discrete, Policy, evaluate, train
 from verifai_jax.rl.policy import new_layers
 
@@ -72,7 +72,7 @@ def test_a_policy_learns_to_reach_and_is_tested_in_one_program():
         problem = reach_with(policy).on_backend("mjx")
 
         def one(u):
-            return judge(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
+            return trace_verdict(problem, problem.system(problem.space.unflatten(u), KEY))[0][0]
 
         return jax.vmap(one)(u)
 
@@ -86,5 +86,5 @@ def test_a_policy_learns_to_reach_and_is_tested_in_one_program():
     problem = reach_with(trained.policy).on_backend("native")
     for row in (int(np.argmin(rho)), int(np.argmax(rho))):
         features = jax.tree.map(np.asarray, problem.space.unflatten(u[row]))
-        native = judge(problem, problem.system(features, KEY))[0][0]
+        native = trace_verdict(problem, problem.system(features, KEY))[0][0]
         assert float(native) == pytest.approx(float(rho[row]), abs=0.02)

@@ -100,7 +100,7 @@ def test_the_faster_one_is_taken_as_measured(monkeypatch, slow, faster):
     [("native", 400, False), ("mjx", 400, True), ("mjx", 100, False), ("native", 2000, True)],
 )
 def test_a_compiler_is_asked_where_it_may_pay(monkeypatch, likely, budget, tried):
-    monkeypatch.setattr(backends, "_measured", lambda engine, on, batch: 40 if on.black_box else 90)
+    monkeypatch.setattr(backends, "_speed", lambda engine, on, batch: 40 if on.black_box else 90)
     choice = resolved(problem(likely=likely), batch=8, budget=budget)
     assert choice.backend == ("mjx" if tried else "native")
 

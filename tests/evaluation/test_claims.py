@@ -8,7 +8,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.falsification.validation import usable
-from verifai_jax.problem.dependence import informative
+from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.search import Portfolio
 
 
@@ -76,8 +76,8 @@ def test_slopes_are_left_out_where_there_are_none():
         return vj.Trace({"gear": gear[None], "a": features["a"][None]}, dt=1.0)
 
     counted = vj.Problem("gears", space, count, "gear < 9")
-    assert not informative(counted)
-    assert informative(vj.Problem("slopes", space, count, "gear < 9 & a < 9.5"))
+    assert not has_gradient(counted)
+    assert has_gradient(vj.Problem("slopes", space, count, "gear < 9 & a < 9.5"))
     search, notes = usable(counted, Portfolio())
     assert search == Portfolio(gradients=False)
     assert notes == ("portfolio without gradients: the robustness is constant almost everywhere",)

@@ -16,7 +16,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Trace
 from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmation import Confirmer
-from verifai_jax.falsification.run import replay
+from verifai_jax.evaluation.replay import replay
 
 
 def oscillator(bound=1.5):

@@ -9,9 +9,10 @@ import verifai_jax as vj
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.differentiation import Derivative
-from verifai_jax.evaluation.engine import Engine, engine_for, judge
+from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.packing import Packing
-from verifai_jax.evaluation.streaming_monitor import carried_monitor
+from verifai_jax.evaluation.streaming_monitor import streaming_monitor
+from verifai_jax.evaluation.verdicts import trace_verdict
 
 KEY = run_keys(0)[1]
 SPACE = {"start": vj.Box(0.5, 1.5), "drag": vj.Box(-0.5, 1.0)}
@@ -32,7 +33,7 @@ def points(n, d, seed=0):
 
 
 @pytest.mark.parametrize("terminate", [None, lambda s, f: s["h"] < 0], ids=["whole", "ends"])
-def test_a_carried_monitor_says_what_the_stored_trace_says(terminate):
+def test_a_streaming_monitor_says_what_the_stored_trace_says(terminate):
     formulas = {
         "above": "always h >= 0.2",
         "window": "always[0.3, 1.1] (v >= -1 | h > 1)",
@@ -40,16 +41,16 @@ def test_a_carried_monitor_says_what_the_stored_trace_says(terminate):
         "until": "(h > 0) until v < -0.8",
     }
     problem = vj.Problem("fall", SPACE, falling(terminate), formulas)
-    carried = carried_monitor(problem)
-    assert carried is not None
+    monitor = streaming_monitor(problem)
+    assert monitor is not None
     features = jax.vmap(problem.space.unflatten)(points(64, 2))
-    rho, status = jax.jit(jax.vmap(lambda f: carried(f, KEY)))(features)
-    wanted = jax.jit(jax.vmap(lambda f: judge(problem, problem.system(f, KEY))))(features)
+    rho, status = jax.jit(jax.vmap(lambda f: monitor(f, KEY)))(features)
+    wanted = jax.jit(jax.vmap(lambda f: trace_verdict(problem, problem.system(f, KEY))))(features)
     np.testing.assert_array_equal(status, wanted[1])
     np.testing.assert_array_equal(rho, wanted[0])
 
 
-def test_a_carried_monitor_reports_what_is_not_finite():
+def test_a_streaming_monitor_reports_what_is_not_finite():
     system = vj.ode(
         lambda t, s, c, f: {"h": jnp.where(f["start"] > 1, jnp.inf, 0.0)},
         lambda f, key: {"h": f["start"]},
@@ -58,7 +59,7 @@ def test_a_carried_monitor_reports_what_is_not_finite():
         duration=1.0,
     )
     problem = vj.Problem("bad", SPACE, system, "always (h > 0 & gap < 9)")
-    assert carried_monitor(problem) is not None
+    assert streaming_monitor(problem) is not None
     table = vj.falsify(problem, "uniform", 64, batch=64).table.all
     bad = (table["start"] > 1) | (table["drag"] < 0)
     assert bad.any()
@@ -74,7 +75,7 @@ def test_a_carried_monitor_reports_what_is_not_finite():
     ],
 )
 def test_what_is_dear_to_carry_is_stored(spec, why):
-    assert carried_monitor(vj.Problem("fall", SPACE, falling(), spec)) is None, why
+    assert streaming_monitor(vj.Problem("fall", SPACE, falling(), spec)) is None, why
 
 
 def test_packing_is_lossless():

@@ -10,7 +10,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.evaluation.journal import JOURNAL, Journal, Judged
+from verifai_jax.evaluation.journal import JOURNAL, Journal
+from verifai_jax.evaluation.verdicts import RowVerdict
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.search import Uniform
@@ -140,7 +141,7 @@ def test_finished_rows_of_a_batch_survive_a_kill(tmp_path, traced):
     second = OneByOne()
     resumed = vj.resume(folder, problem_of(second))
     assert resumed.table.all.equals(whole.table.all)
-    finished = first.simulated[:32]  # Judged in blocks of 32 at most; failed ones at once.
+    finished = first.simulated[:32]  # RowVerdict in blocks of 32 at most; failed ones at once.
     assert len(set(second.simulated) & set(finished)) < len(finished)
     assert len(second.simulated) < 64
     assert not (folder / JOURNAL).exists()
@@ -149,7 +150,7 @@ def test_finished_rows_of_a_batch_survive_a_kill(tmp_path, traced):
 def test_journal_recalls_only_the_same_point(tmp_path):
     points = np.random.default_rng(0).random((3, 2)).astype(np.float32)
     journal = Journal(tmp_path)
-    journal.add(7, points[1], Judged(np.array([0.1, np.nan]), 1, np.array([True, False]), "é"))
+    journal.add(7, points[1], RowVerdict(np.array([0.1, np.nan]), 1, np.array([True, False]), "é"))
     journal.settle(7)  # Nothing of the batch in flight is in the table yet.
     with open(journal.path, "a") as file:
         file.write('{"row": 8, "po')  # Where the process died.

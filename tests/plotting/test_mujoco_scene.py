@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 import verifai_jax as vj
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.falsification.run import replay
+from verifai_jax.evaluation.replay import replay
 from verifai_jax.plotting import animate
 from verifai_jax.plotting import mujoco_scene as scene
 from verifai_jax.plotting.run_pictures import draw_replay

@@ -60,8 +60,8 @@ def usable_search(problem: Problem, search: str | Search) -> Search:
     if isinstance(found, Search) and (found.wants_gradient or found.wants_clauses):
         known = (name for name in searches.names() if not _slopes(name))
         raise ValueError(
-            f"attack {search!r} follows gradients, which are not computed for many policies at once; "
-            f"use one of {', '.join(known)}"
+            f"attack {search!r} follows gradients, which are not computed for many policies at "
+            f"once; use one of {', '.join(known)}"
         )
     return check_search(problem, found)
 

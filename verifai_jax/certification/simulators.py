@@ -24,9 +24,13 @@ from verifai_jax.certification.policy_groups import Family
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.engine import judge, verdict
-from verifai_jax.evaluation.evaluator import Evaluator, violated
-from verifai_jax.evaluation.streaming_monitor import carried_monitor
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.streaming_monitor import streaming_monitor
+from verifai_jax.evaluation.verdicts import (
+    boolean_semantics,
+    trace_verdict,
+    violations,
+)
 from verifai_jax.problem.problem import Problem
 
 MOST_BLOCKS = 64
@@ -104,17 +108,19 @@ class Traced:
     def _call(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
         policies = [self._family.weights[member] for member in members]
         rho, status = self._program("evaluate", policies, points, first, key)
-        proper = status == Status.OK
-        broken = np.any(rho < 0, axis=2) & proper
-        zero = proper & ~broken & np.any(rho == 0, axis=2)
-        if zero.any():
-            # At exactly zero the comparator decides: x >= 0 holds there, x > 0 does not.
-            places = np.flatnonzero(zero.any(axis=1))
+        flat = rho.reshape(-1, rho.shape[2])
+
+        def holds() -> Bool[np.ndarray, "rows formulas"]:
+            places = np.flatnonzero(np.any(rho == 0, axis=(1, 2)))
+            every = np.ones(rho.shape, bool)
             some = [policies[i] for i in places]
-            (holds,) = self._program("verdicts", some, points[places], first[places], key)
-            broken[places] |= zero[places] & ~np.all(holds, axis=2)
+            (every[places],) = self._program("holds", some, points[places], first[places], key)
+            return every.reshape(flat.shape)
+
+        violated = violations(flat, status.ravel(), holds).reshape(status.shape)
+        proper = status == Status.OK
         least = np.where(proper, np.min(rho, axis=2), np.nan).astype(np.float32)
-        return [Outcome(*block) for block in zip(least, broken, proper, strict=True)]
+        return [Outcome(*block) for block in zip(least, violated, proper, strict=True)]
 
 
 def traced(
@@ -204,14 +210,16 @@ class _Program:
 
     def _traced(self, mode: str) -> Any:
         def row(problem: Problem) -> Any:
-            carried = carried_monitor(problem) if mode == "evaluate" else None
+            monitor = streaming_monitor(problem) if mode == "evaluate" else None
 
             def one(u: Array, key: Array) -> Any:
                 features = problem.space.unflatten(u)
-                if carried is not None:
-                    return carried(features, key)
+                if monitor is not None:
+                    return monitor(features, key)
                 trace = problem.system(features, key)
-                return (verdict(problem, trace),) if mode == "verdicts" else judge(problem, trace)
+                if mode == "holds":
+                    return (boolean_semantics(problem, trace),)
+                return trace_verdict(problem, trace)
 
             return one
 
@@ -269,12 +277,10 @@ class Alone:
             if member not in self._evaluators:
                 self._evaluators[member] = Evaluator(self._problems[member], self.lanes)
             engine = self._evaluators[member].engine
-            found = engine.evaluate(u, key, int(number))
-            broken = violated(engine, found, u, key, int(number))
-            proper = found.status == Status.OK
-            told = next((message for message in found.messages or () if message), None)
+            verdicts = engine.evaluate(u, key, int(number))
+            told = next((message for message in verdicts.messages or () if message), None)
             if told is not None:
                 self.messages.setdefault(member, told)
-            least = np.where(proper, np.min(found.rho, axis=1), np.nan).astype(np.float32)
-            outcomes.append(Outcome(least, broken & proper, proper))
+            least = np.where(verdicts.proper, verdicts.least, np.nan).astype(np.float32)
+            outcomes.append(Outcome(least, verdicts.violated, verdicts.proper))
         return outcomes

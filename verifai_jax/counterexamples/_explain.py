@@ -27,7 +27,8 @@ from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.influence import Influence, spans_of
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.counterexamples.selection import Row, problem_of, select_row
-from verifai_jax.falsification.run import Replay, Run, replay
+from verifai_jax.evaluation.replay import Replay, replay
+from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Explanation
 

@@ -36,7 +36,8 @@ from verifai_jax.counterexamples.selection import (
     select_others,
     select_row,
 )
-from verifai_jax.falsification.run import Replay, Run, replay
+from verifai_jax.evaluation.replay import Replay, replay
+from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
 ORDERS = ("count", "distance")

@@ -87,12 +87,12 @@ class Candidates:
         order = self._accepted(points, order)[: max(self.left, 0)]
         if order:
             verdicts = self._evaluate(points[order])
-            rho = np.where(verdicts.proper, verdicts.rho, np.inf).astype(np.float64)
-            for i, value, fails in zip(order, rho, verdicts.failing, strict=True):
+            rho = np.where(verdicts.proper, verdicts.least, np.inf).astype(np.float64)
+            for i, value, fails in zip(order, rho, verdicts.violated, strict=True):
                 self._known[keys[i]] = (float(value), bool(fails))
             self.points = np.concatenate([self.points, points[order]])
             self.rho = np.concatenate([self.rho, rho])
-            self.failing = np.concatenate([self.failing, verdicts.failing])
+            self.failing = np.concatenate([self.failing, verdicts.violated])
         known = [self._known.get(key, (np.inf, False)) for key in keys]
         return np.array([rho for rho, _ in known]), np.array([fails for _, fails in known], bool)
 
@@ -122,7 +122,7 @@ class Candidates:
         assert verdicts.gradient is not None
         free = np.array(self.nominal.cube.levels) == 0
         gradients = np.where(free, verdicts.gradient, 0.0).astype(np.float64)
-        for key, point, rho, gradient in zip(keys, points, verdicts.rho, gradients, strict=True):
+        for key, point, rho, gradient in zip(keys, points, verdicts.least, gradients, strict=True):
             if np.isfinite(rho) and np.all(np.isfinite(gradient)) and np.any(gradient):
                 self._tangents_at[key] = Tangent(point.astype(np.float64), float(rho), gradient)
 

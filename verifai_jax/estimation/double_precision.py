@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -24,6 +25,10 @@ EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
 BEYOND = (2.0**-27, 2.0**-32)
 """Two probabilities at which a distribution with an outermost value has the same value."""
+
+
+FLATTENED: Slot[str, Problem] = Slot("flattened features")
+"""The problem over plain numbers, by precision."""
 
 
 class FlattenedFeatures(FeatureSpace):
@@ -69,10 +74,12 @@ class DoublePrecisionEvaluator:
         space = problem.space
         self._held = max(space.levels, default=0) <= EXACT
         if self._held:
-            if ("held", precision) not in problem.engines:
-                held = FlattenedFeatures(space, precision)
-                problem.engines["held", precision] = _with_space(problem, held)
-            problem = problem.engines["held", precision]
+            original = problem
+            problem = original.programs.get(
+                FLATTENED,
+                precision,
+                lambda: _with_space(original, FlattenedFeatures(space, precision)),
+            )
         self._evaluator = Evaluator(problem, batch, precision=precision, seed=seed)
         self._numbers = jax.jit(jax.vmap(lambda u: _flat(space.unflatten(u))))
         self._batch = batch
@@ -86,12 +93,12 @@ class DoublePrecisionEvaluator:
             padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
             with in_precision("float64"):
                 points = np.asarray(self._numbers(padded))[: len(u)]
-        closed_form = self._evaluator(points)
-        return closed_form.rho, closed_form.failing, closed_form.proper
+        verdicts = self._evaluator(points)
+        return verdicts.least, verdicts.violated, verdicts.proper
 
     def compile(self) -> None:
         """Compile the program of a batch now."""
-        self._evaluator.engine.compile()
+        self._evaluator.compile()
 
     def _clamped(self, space: FeatureSpace) -> Bool[np.ndarray, " d"]:
         if not self._held:

@@ -1,21 +1,23 @@
-"""Which backend simulates a problem whose system has several, such as MJX and native MuJoCo.
+"""The choice of a backend for a problem whose system has several, such as MJX and native MuJoCo.
 
     problem = resolved(problem, gradient=False, batch=1024, budget=20_000)
     problem = resolved(problem, wanted="native")
 
 A gradient needs a backend that JAX can trace. Without one the faster backend is taken, as measured
-on this machine with this problem, unless the run is over before a compiler would be; what was
-chosen, and why, is told in the run.
+on this machine with this problem, unless the run is over before a compiler would be; the
+run notes what was chosen, and why.
 """
 
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from verifai_jax.core.keys import run_keys
-from verifai_jax.evaluation.engine import engine_for
+from verifai_jax.core.programs import Slot
+from verifai_jax.core.text import format_error
+from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.problem.problem import Problem
 
@@ -42,7 +44,7 @@ def resolved(
     precision: str = "float32",
     wanted: str | None = None,
 ) -> Choice:
-    """The problem on the backend that suits the run.
+    """Return the problem on the backend that suits the run.
 
     - `wanted`: a backend by name; chosen here when left out, unless the system names one itself.
 
@@ -76,13 +78,14 @@ def _fastest(
     problem: Problem, on_host: str, traced: str, batch: int, precision: str, budget: int
 ) -> Choice:
     # Measured once for a problem, so that its runs in one process agree on the backend.
-    known = problem.engines.setdefault("speeds", {})
     host, compiled = problem.on_backend(on_host), problem.on_backend(traced)
-    kinds = [(name, batch, precision) for name in (on_host, traced)]
-    if kinds[0] not in known:
-        known[kinds[0]] = _measured(HostEngine(host, precision), host, batch)
-    speed = known[kinds[0]]
-    if kinds[1] not in known:
+    speed = problem.programs.get(
+        SPEEDS,
+        (on_host, batch, precision),
+        lambda: _speed(HostEngine(host, precision), host, batch),
+    )
+    other = problem.programs.peek(SPEEDS, (traced, batch, precision))
+    if other is None:
         likely = problem.system.likely == traced
         if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
             seconds = f"{budget / speed:.1f} s for all simulations"
@@ -91,16 +94,21 @@ def _fastest(
             engine = engine_for(compiled, batch, precision=precision)
             engine.compile()
         except Exception as error:
-            first = (str(error).splitlines() or [type(error).__name__])[0]
-            return Choice(host, on_host, f"{traced} cannot simulate this model: {first}")
-        known[kinds[1]] = _measured(engine, compiled, batch)
-    other = known[kinds[1]]
-    told = f"measured {speed:,.0f} simulations/s on {on_host}, {other:,.0f} on {traced}"
-    return Choice(compiled, traced, told) if other > speed else Choice(host, on_host, told)
+            reason = f"{traced} cannot simulate this model: {format_error(error)}"
+            return Choice(host, on_host, reason)
+        other = problem.programs.get(
+            SPEEDS, (traced, batch, precision), lambda: _speed(engine, compiled, batch)
+        )
+    why = f"measured {speed:,.0f} simulations/s on {on_host}, {other:,.0f} on {traced}"
+    return Choice(compiled, traced, why) if other > speed else Choice(host, on_host, why)
 
 
-def _measured(engine: Any, problem: Problem, batch: int) -> float:
-    """Simulations a second: the best of three batches after one to warm up."""
+SPEEDS: Slot[tuple[str, int, str], float] = Slot("speeds")
+"""Simulations a second of each (backend, batch, precision), as measured."""
+
+
+def _speed(engine: Engine | HostEngine, problem: Problem, batch: int) -> float:
+    """Measure simulations a second: the best of three batches after one to warm up."""
     key = run_keys(0)[1]
     u = np.random.default_rng(0).random((batch, problem.space.dim), np.float32)
     engine.evaluate(u, key, 0)
@@ -110,5 +118,5 @@ def _measured(engine: Any, problem: Problem, batch: int) -> float:
         engine.evaluate(u, key, 0)
         best = min(best, time.perf_counter() - started)
         if best > 2.0:
-            break  # A slow simulator is told from a quick one by one batch.
+            break  # One batch is enough to know a slow simulator.
     return batch / best

@@ -22,7 +22,8 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
-from verifai_jax.evaluation.replays import HostReplays, Replayed, Replays
+from verifai_jax.evaluation.replays import HostReplays, Replays
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
@@ -188,7 +189,7 @@ class Confirmer:
         for block, found in parts:
             verdict[block], band[block] = found.verdict, found.band
             for name in rho:
-                rho[name][block] = found.replayed[name].rho
+                rho[name][block] = found.replayed[name].least
             for place, reason in zip(block.tolist(), found.why, strict=True):
                 why[place] = reason
         if len(rest):
@@ -281,13 +282,13 @@ class _Found(NamedTuple):
     verdict: np.ndarray
     band: Float[np.ndarray, " n"]
     why: list[str]
-    replayed: dict[str, Replayed]
+    replayed: dict[str, Verdicts]
 
 
-def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _Found:
+def _decided(count: int, found: dict[str, Verdicts], run: Any, plan: _Plan) -> _Found:
     base = next((name for name in ("float64", "again") if name in found), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
-    rho = {name: replayed.rho for name, replayed in found.items()}
+    rho = {name: replayed.least for name, replayed in found.items()}
     step = rounding = np.zeros(count)
     if "half_step" in found:
         step = _moved(rho["half_step"], rho["quarter_step"])
@@ -302,8 +303,8 @@ def _decided(count: int, found: dict[str, Replayed], run: Any, plan: _Plan) -> _
         return _Found(np.full(count, "unchecked", object), band, [reason] * count, found)
     deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
     deciding = [name for name in (*deciding, "simulator") if name in found]
-    failing = {name: replayed.failing for name, replayed in found.items()}
-    holding = {name: r.proper & ~r.failing for name, r in found.items()}
+    failing = {name: replayed.violated for name, replayed in found.items()}
+    holding = {name: r.proper & ~r.violated for name, r in found.items()}
     clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
     confirmed = np.all(list(failing.values()), axis=0) & clear
     refuted = np.all([holding[name] for name in deciding], axis=0) & (deciding[0] != "again")
@@ -320,12 +321,13 @@ def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.n
         return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)
 
 
-def _reason(i: int, found: dict[str, Replayed], rho: float, band: float) -> str:
+def _reason(i: int, found: dict[str, Verdicts], rho: float, band: float) -> str:
     lost = [name for name, replayed in found.items() if not replayed.proper[i]]
     if lost:
-        message = next((m for name in lost if (m := found[name].messages[i])), "")
+        messages = [m[i] for name in lost if (m := found[name].messages)]
+        message = next(filter(None, messages), "")
         return f"no verdict {_and(lost)}{f': {message}' if message else ', it is not finite'}"
-    holds = [name for name, replayed in found.items() if not replayed.failing[i]]
+    holds = [name for name, replayed in found.items() if not replayed.violated[i]]
     if len(holds) == len(found):
         return "it holds in every replay"
     if holds:

@@ -1,8 +1,8 @@
-"""How a robustness is differentiated: forward or reverse, by dimension and by model.
+"""Derivatives of the robustness, forward or reverse, by dimension and by model.
 
     derivative = Derivative(dim)
     gradient, auxiliary = derivative(objective, u)      # objective(u) -> (value, auxiliary)
-    slopes, auxiliary = derivative.slopes(objective, u) # of several values [k] at once: [k, d]
+    derivatives, auxiliary = derivative.of_several(objective, u)         # values [k]: [k, d]
 
 Forward mode takes a sweep for each coordinate, several at a time, and works for every model.
 Reverse mode takes one sweep whatever their number, but keeps what the way back needs, and JAX has
@@ -25,7 +25,7 @@ SWEEPS = 8
 
 @dataclass(frozen=True)
 class Derivative:
-    """The gradient of an objective over `dim` coordinates; `reverse` says by which mode.
+    """The gradient of an objective over `dim` coordinates; `reverse` names the mode.
 
     - `forward_up_to`: coordinates up to which forward sweeps are the quicker way.
     """
@@ -36,15 +36,15 @@ class Derivative:
 
     @property
     def reverse(self) -> bool:
-        """Whether one reverse sweep is taken."""
+        """True where one reverse sweep is taken."""
         return self.mode == "reverse" or (self.mode is None and self.dim > self.forward_up_to)
 
     def by(self, mode: str) -> "Derivative":
-        """The same by `"forward"` sweeps or by one `"reverse"` sweep, whatever the dimension."""
+        """Return the same by `"forward"` sweeps or one `"reverse"` sweep in any dimension."""
         return replace(self, mode=mode)
 
-    def told(self) -> str:
-        """What forward mode costs, for people."""
+    def describe(self) -> str:
+        """Say what forward mode costs, for people."""
         return (
             f"gradient by {self.dim} forward sweeps for each simulation, because reverse mode does "
             "not work through a loop of this system"
@@ -53,15 +53,15 @@ class Derivative:
     def __call__(
         self, objective: Callable[..., tuple[Array, Any]], u: Float[Array, " d"]
     ) -> tuple[Float[Array, " d"], Any]:
-        """Gradient and auxiliary output at `u`."""
+        """Return gradient and auxiliary output at `u`."""
         if self.reverse:
             return jax.grad(objective, has_aux=True)(u)
         return _forward(objective, u)
 
-    def slopes(
+    def of_several(
         self, objective: Callable[..., tuple[Float[Array, " k"], Any]], u: Float[Array, " d"]
     ) -> tuple[Float[Array, "k d"], Any]:
-        """The same for an objective of several values: a reverse sweep for each, or as above."""
+        """Differentiate an objective of several values: a reverse sweep for each, or as above."""
         if self.reverse:
             values, sweep, auxiliary = jax.vjp(objective, u, has_aux=True)
             each = jnp.eye(len(values), dtype=values.dtype)
@@ -71,7 +71,7 @@ class Derivative:
 
 
 def reverse_refused(error: Exception) -> bool:
-    """Whether this is JAX's refusal to differentiate a loop of unknown length in reverse."""
+    """Return whether this is JAX's refusal to differentiate a loop of unknown length in reverse."""
     return "Reverse-mode differentiation does not work" in str(error)
 
 

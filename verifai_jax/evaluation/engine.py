@@ -1,92 +1,55 @@
-"""The compiled evaluation of a batch: unit cube in, robustness and status out.
+"""The compiled evaluation of a batch: inputs of simulations in, verdicts out.
 
     engine = engine_for(problem, batch=1024)
     engine.compile()
-    engine.evaluate(u, key, first=0)                                  # robustness, status
+    engine.evaluate(u, key, first=0)                                  # Verdicts
     engine_for(problem, 1024, gradient=True).evaluate(u, key, 0, temperature=0.1)
-    engine_for(problem, 16, gradient=True, clauses=True)              # told clause by clause
+    engine_for(problem, 16, gradient=True, clauses=True)              # clause by clause
 
 A batch is padded to a fixed shape, split over the devices, and worked through in chunks of lanes
 small enough for the cache, so that there is one executable for each (problem, batch, mode).
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
-from verifai_jax.core.keys import simulation_key
+from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
+from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
-from verifai_jax.evaluation.streaming_monitor import carried_monitor, with_status
-from verifai_jax.mtl import hard, robustness, satisfied, smooth
+from verifai_jax.evaluation.streaming_monitor import streaming_monitor
+from verifai_jax.evaluation.verdicts import (
+    Verdicts,
+    boolean_semantics,
+    trace_verdict,
+    violations,
+)
+from verifai_jax.mtl import hard, robustness, smooth
 from verifai_jax.mtl.clauses import ABSENT, Goals, goals_of
 from verifai_jax.problem.problem import Problem
 
-
-class Evaluation(NamedTuple):
-    """What a batch of simulations gave, on the host, one row a simulation.
-
-    `rho` is `[n, formulas]`, hard robustness; NaN where the status is not OK. `gradient` is
-    `[n, d]`, of the least smooth robustness with respect to the unit coordinates. `features` are
-    the simulated values. `messages` say what a black box raised, one a row, empty where nothing.
-    `holds` are its Boolean verdicts where the robustness is exactly zero; None where `verdicts` has
-    to be asked. `clauses` are the scaled values of the clauses of the goal that is nearest to being
-    broken (`mtl.clauses`), `slopes` their derivatives; None unless told clause by clause.
-    """
-
-    rho: Float[np.ndarray, "n formulas"]
-    status: Int[np.ndarray, " n"]
-    features: dict[str, Any]
-    gradient: Float[np.ndarray, "n d"] | None = None
-    messages: list[str] | None = None
-    holds: Bool[np.ndarray, "n formulas"] | None = None
-    clauses: Float[np.ndarray, "n clauses"] | None = None
-    slopes: Float[np.ndarray, "n clauses d"] | None = None
+Mode = Literal["evaluate", "holds"]
+"""Programs of an engine: robustness and derivatives, or the Boolean semantics of the same rows."""
 
 
-class ToldRow(NamedTuple):
-    """What a search is told of one row, traced; see `Evaluation`."""
+class Row(NamedTuple):
+    """The result of one row under `jax.vmap`; see `Verdicts`."""
 
-    rho: Float[Array, ""]
+    rho: Float[Array, " formulas"]
     status: Int[Array, ""]
-    gradient: Float[Array, " d"] | None
-    clauses: Float[Array, " clauses"] | None
-    slopes: Float[Array, "clauses d"] | None
-
-
-def judge(problem: Problem, trace: Trace) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
-    """Hard robustness of each formula, and the status, of one trace.
-
-    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN.
-    """
-    trace = trace.hold()
-    rho = jnp.stack(
-        [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
-    )
-    finite = jnp.array(True)
-    for name in problem.monitored:
-        signal = jnp.asarray(trace.signals[name])
-        if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
-            finite &= jnp.all(jnp.isfinite(signal))
-    status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
-    return with_status(rho, status, finite)
-
-
-def verdict(problem: Problem, trace: Trace) -> Bool[Array, " formulas"]:
-    """Whether each formula holds on one trace: what decides where robustness is exactly zero."""
-    trace = trace.hold()
-    formulas = problem.formulas.values()
-    return jnp.stack([satisfied(formula, trace, end=problem.end) for formula in formulas])
+    features: PyTree
+    derivatives: dict[str, Array]
 
 
 class Engine:
@@ -94,14 +57,19 @@ class Engine:
 
     **Arguments:**
 
-    - `problem`: a checked `Problem` whose system JAX can trace.
+    - `problem`: a checked `Problem`.
     - `batch`: rows of a call at most; fewer are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
-    - `clauses`: whether it tells, and differentiates, clause by clause instead.
     - `devices`: JAX devices to split the batch over; all of this process when left out.
     - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
+    - `clauses`: whether it evaluates, and differentiates, clause by clause instead.
+    - `inputs`: how rows become features and a system; points of the unit cube when left out.
+    - `own_keys`: whether each row is given the random key of its simulation, instead of one key of
+      the run and the number of the first row.
+    - `alone`: whether the engine takes one row at a time, which compiles without `jax.vmap` and so
+      takes less time; with `own_keys` only.
 
-    `notes` says, once compiled, what was decided and would surprise.
+    `notes` says, once compiled, what the engine decided that a user may not expect.
     """
 
     def __init__(
@@ -109,15 +77,17 @@ class Engine:
         problem: Problem,
         batch: int,
         gradient: bool = False,
-        devices: list[Any] | None = None,
+        devices: Sequence[Any] | None = None,
         precision: str = "float32",
         clauses: bool = False,
+        inputs: Inputs | None = None,
+        own_keys: bool = False,
+        alone: bool = False,
     ) -> None:
-        self.problem = problem
-        self.batch = batch
-        self.gradient = gradient
+        self.problem, self.batch, self.gradient = problem, batch, gradient
+        self.inputs = CubePoints(problem) if inputs is None else inputs
         self.goals: Goals | None = goals_of(problem.formulas.values()) if clauses else None
-        self.precision = precision
+        self.precision, self.own_keys, self.alone = precision, own_keys, alone
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
@@ -128,10 +98,10 @@ class Engine:
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
-        limit = problem.system.forward_up_to
-        self._derivative = Derivative(problem.space.dim, limit)
-        self._packing: dict[str, Packing] = {}
-        self._executables: dict[str, Any] = {}
+        self._derivative = Derivative(self.inputs.dim, problem.system.forward_up_to)
+        self._packing: dict[Mode, Packing] = {}
+        self._traced: dict[Mode, jax.stages.Traced] = {}
+        self._executables: dict[Mode, jax.stages.Compiled] = {}
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
@@ -140,71 +110,74 @@ class Engine:
 
     def evaluate(
         self,
-        u: Float[Array, "n d"],
-        key: Key[Array, ""],
-        first: int,
-        temperature: Float[Array, " n"] | Float[Array, ""] | float = 1.0,
-    ) -> Evaluation:
-        """Simulate and judge `n <= batch` points of the unit cube.
+        rows: PyTree,
+        key: Key[Array, ""] | Key[Array, " n"],
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
+        shared: PyTree = (),
+    ) -> Verdicts:
+        """Simulate `n <= batch` rows and decide which violate the property.
 
+        **Arguments:**
+
+        - `rows`: `[n, ...]`, points of the unit cube or whatever the engine's inputs are.
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
+          With `own_keys` the keys `[n]` of the simulations.
+        - `first`: number of the first row.
         - `temperature`: of the smooth robustness that is differentiated, one for all rows or one
           each; unused without gradient. Clause by clause it has no unit.
+        - `shared`: what all rows share, for inputs that have such.
         """
-        rho, status, features, told = self._run("evaluate", u, key, first, temperature)
-        return Evaluation(rho, status, features)._replace(**told)
+        rho, status, features, more = self._run("evaluate", rows, key, first, temperature, shared)
 
-    def verdicts(self, u: Float[Array, "n d"], key: Key[Array, ""], first: int) -> np.ndarray:
-        """Boolean semantics `[n, formulas]`: what decides where the robustness is exactly zero."""
-        return self._run("verdicts", u, key, first, 1.0)
+        def holds() -> Bool[np.ndarray, "n formulas"]:
+            return self.holds(rows, key, first, shared)
 
-    def told_row(
-        self, u: Float[Array, " d"], key: Key[Array, ""], temperature: Float[Array, ""]
-    ) -> ToldRow:
-        """One row under `vmap`: what a search is told of it."""
-        rho, status, _, told = self._evaluate_row(u.astype(self.precision), key, temperature)
-        told = {name: value.astype(jnp.float32) for name, value in told.items()}
-        nothing = dict.fromkeys(("gradient", "clauses", "slopes"))
-        return ToldRow(jnp.min(rho), status, **{**nothing, **told})
+        return Verdicts(rho, status, violations(rho, status, holds), features, **more)
 
-    def _run(self, mode: str, u: Any, key: Any, first: int, temperature: Any) -> Any:
+    def holds(
+        self,
+        rows: PyTree,
+        key: Key[Array, ""] | Key[Array, " n"],
+        first: int = 0,
+        shared: PyTree = (),
+    ) -> Bool[np.ndarray, "n formulas"]:
+        """Simulate the rows again and return the Boolean semantics of each formula."""
+        return self._run("holds", rows, key, first, 1.0, shared)
+
+    def row(
+        self, row: PyTree, key: Key[Array, ""], temperature: Float[Array, ""], shared: PyTree = ()
+    ) -> Row:
+        """Evaluate one row under `jax.vmap`, in a program that a caller compiles."""
+        coordinates = self.inputs.coordinates(row, shared, self.precision)
+
+        def simulated(coordinates: Array) -> tuple[PyTree, Any]:
+            return self.inputs.simulated(coordinates, row, shared)
+
+        if self.goals is not None:
+            return self._clauses(self.goals, simulated, coordinates, key, temperature)
+        if self.gradient:
+            return self._gradient(simulated, coordinates, key, temperature)
+        features, system = simulated(coordinates)
+        monitor = streaming_monitor(self.problem) if self.inputs.streaming else None
+        if monitor is not None:
+            rho, status = monitor(features, key)
+        else:
+            rho, status = trace_verdict(self.problem, system(features, key))
+        return Row(rho.astype(coordinates.dtype), status, features, {})
+
+    def draws(self) -> bool:
+        """Return whether the system uses its random key; needs `own_keys` and `alone`.
+
+        Traces the program, and raises what that raises.
+        """
         with in_precision(self.precision):
-            temperatures = np.asarray(temperature, np.float32)
-            if temperatures.ndim:
-                temperatures = _pad(temperatures, self.padded)
-            else:
-                temperatures = np.full(self.padded, temperatures)
-            arguments = (_pad(u, self.padded), key, np.int32(first), temperatures)
-            packed = self._executable(mode)(*arguments)
-            return self._packing[mode].unpack(packed, len(u))
-
-    def _executable(self, mode: str) -> Any:
-        if mode not in self._executables:
-            enable_compile_cache()
-            started = time.perf_counter()
-            self._executables[mode] = self._compiled(mode)
-            self.compile_seconds += time.perf_counter() - started
-        return self._executables[mode]
-
-    def _compiled(self, mode: str) -> Any:
-        one_row = {"evaluate": self._evaluate_row, "verdicts": self._verdict_row}[mode]
-        arguments = (
-            jax.ShapeDtypeStruct((self.padded, self.problem.space.dim), jnp.float32),
-            jax.eval_shape(lambda: jax.random.key(0)),
-            jax.ShapeDtypeStruct((), jnp.int32),
-            jax.ShapeDtypeStruct((self.padded,), jnp.float32),
-        )
-        packing = self._packing[mode] = Packing()
-
-        def packed_row(u: Array, key: Array, temperature: Array) -> Any:
-            return packing.pack(one_row(u.astype(self.precision), key, temperature))
-
-        program = self._batched(packed_row)
-        # A new function object each time: JAX remembers what it traced by the function.
-        return self.differentiable(lambda: jax.jit(partial(program)).lower(*arguments)).compile()
+            program = self._trace("evaluate").jaxpr.jaxpr
+        used = program.invars[len(jax.tree.leaves(self.inputs.row_form))]
+        return any(used is value for step in program.eqns for value in step.invars)
 
     def differentiable(self, trace: Callable[[], Any]) -> Any:
-        """The result of `trace`, which traces rows of this engine, in a mode that works.
+        """Return the result of `trace`, which traces rows of this engine, in a mode that works.
 
         Where the system refuses reverse mode, it is traced again in forward mode.
         """
@@ -215,95 +188,188 @@ class Engine:
                 raise
         self._derivative = self._derivative.by("forward")
         hint = self.problem.system.reverse_hint
-        self.notes = (f"{self._derivative.told()}{f': {hint}' if hint else ''}",)
+        self.notes = (f"{self._derivative.describe()}{f': {hint}' if hint else ''}",)
         return trace()
 
-    def _batched(self, one_row: Any) -> Any:
-        """Spread `one_row(u, key, temperature)` over chunks of lanes and over the devices."""
+    def _run(
+        self, mode: Mode, rows: Any, key: Any, first: int, temperature: Any, shared: Any
+    ) -> Any:
+        with in_precision(self.precision):
+            count = len(jax.tree.leaves(rows)[0])
+            temperatures = np.asarray(temperature, np.float32)
+            if temperatures.ndim:
+                temperatures = _pad(temperatures, self.padded)
+            else:
+                temperatures = np.full(self.padded, temperatures)
+            rows = jax.tree.map(lambda leaf: _pad(leaf, self.padded), rows)
+            number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
+            if self.alone:
+                one = jax.tree.map(lambda leaf: leaf[0], (rows, number, temperatures))
+                packed = self._executable(mode)(*one, shared)
+                packed = jax.tree.map(lambda leaf: leaf[None], packed)
+            else:
+                packed = self._executable(mode)(rows, number, temperatures, shared)
+            return self._packing[mode].unpack(packed, count)
 
-        def on_device(u: Array, rows: Array, key: Array, temperature: Array) -> Any:
-            def chunk(block: tuple[Array, Array, Array]) -> Any:
-                keys = jax.vmap(partial(simulation_key, key))(block[1])
-                return jax.vmap(one_row)(block[0], keys, block[2])
+    def _executable(self, mode: Mode) -> jax.stages.Compiled:
+        if mode not in self._executables:
+            enable_compile_cache()
+            started = time.perf_counter()
+            self._executables[mode] = self._trace(mode).lower().compile()
+            self.compile_seconds += time.perf_counter() - started
+        return self._executables[mode]
 
+    def _trace(self, mode: Mode) -> jax.stages.Traced:
+        if mode in self._traced:
+            return self._traced[mode]
+        one_row = {"evaluate": self.row, "holds": self._holds}[mode]
+        key = jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
+        first = jax.ShapeDtypeStruct((), jnp.int32)
+        leading = () if self.alone else (self.padded,)
+        arguments = (
+            jax.tree.map(
+                lambda form: jax.ShapeDtypeStruct((*leading, *form.shape), form.dtype),
+                self.inputs.row_form,
+            ),
+            jax.ShapeDtypeStruct(leading, key.dtype) if self.own_keys else (key, first),
+            jax.ShapeDtypeStruct(leading, jnp.float32),
+            self.inputs.shared_form,
+        )
+        packing = self._packing[mode] = Packing()
+
+        def packed_row(row: PyTree, key: Array, temperature: Array, shared: PyTree) -> Any:
+            result = one_row(row, key, temperature, shared)
+            if isinstance(result, Row) and not self.inputs.keeps_features:
+                result = result._replace(features=None)
+            return packing.pack(result)
+
+        program = packed_row if self.alone else self._batched(packed_row)
+        # A new function object each time: JAX remembers what it traced by the function.
+        traced = self.differentiable(lambda: jax.jit(partial(program)).trace(*arguments))
+        self._traced[mode] = traced
+        return traced
+
+    def _batched(self, one_row: Callable[..., Any]) -> Callable[..., Any]:
+        """Spread `one_row` over chunks of lanes and over the devices."""
+
+        def on_device(rows: PyTree, numbers: Array, temperature: Array, key: Any, shared: PyTree):
+            def chunk(block: tuple[PyTree, Array, Array]) -> Any:
+                keys = block[1]
+                if not self.own_keys:
+                    keys = jax.vmap(partial(simulation_key, key))(keys)
+                return jax.vmap(one_row, in_axes=(0, 0, 0, None))(block[0], keys, block[2], shared)
+
+            blocks = (rows, numbers, temperature)
             if self.chunks == 1:
-                return chunk((u, rows, temperature))
-            blocks = (
-                u.reshape(self.chunks, self.lanes, u.shape[-1]),
-                rows.reshape(self.chunks, self.lanes),
-                temperature.reshape(self.chunks, self.lanes),
+                return chunk(blocks)
+            cut = jax.tree.map(
+                lambda leaf: leaf.reshape(self.chunks, self.lanes, *leaf.shape[1:]), blocks
             )
-            results = jax.lax.map(chunk, blocks)
+            results = jax.lax.map(chunk, cut)
             return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), results)
 
-        spread = spread_over_devices(on_device, (True, True, False, True), self.devices)
+        split = (True, True, True, False, False)
+        spread = spread_over_devices(on_device, split, self.devices)
 
-        def program(u: Array, key: Array, first: Array, temperature: Array) -> Any:
-            rows = first + jnp.arange(self.padded, dtype=jnp.int32)
-            return spread(u, rows, key, temperature)
+        def program(rows: PyTree, number: Any, temperature: Array, shared: PyTree) -> Any:
+            if self.own_keys:
+                return spread(rows, number, temperature, (), shared)
+            key, first = number
+            numbers = first + jnp.arange(self.padded, dtype=jnp.int32)
+            return spread(rows, numbers, temperature, key, shared)
 
         return program
 
-    def _evaluate_row(self, u: Array, key: Array, temperature: Array) -> Any:
-        if self.goals is not None:
-            return self._clauses_row(self.goals, u, key, temperature)
-        if not self.gradient:
-            features = self.problem.space.unflatten(u)
-            carried = carried_monitor(self.problem)
-            if carried is not None:
-                rho, status = carried(features, key)
-            else:
-                rho, status = judge(self.problem, self.problem.system(features, key))
-            return rho.astype(u.dtype), status, features, {}
+    def _gradient(
+        self, simulated: Callable[..., Any], coordinates: Array, key: Array, temperature: Array
+    ) -> Row:
+        """Robustness, and the gradient of the least smooth robustness."""
 
-        def objective(u: Array) -> tuple[Array, Any]:
-            features = self.problem.space.unflatten(u)
-            trace = self.problem.system(features, key).hold()
-            semantics = smooth(temperature.astype(u.dtype))
+        def objective(coordinates: Array) -> tuple[Array, Any]:
+            features, system = simulated(coordinates)
+            trace = system(features, key).hold()
+            semantics = smooth(temperature.astype(coordinates.dtype))
             smoothed = [
                 robustness(formula, trace, semantics, end=self.problem.end)
                 for formula in self.problem.formulas.values()
             ]
-            return jnp.min(jnp.stack(smoothed)), (*judge(self.problem, trace), features)
+            judged = trace_verdict(self.problem, trace)
+            return jnp.min(jnp.stack(smoothed)), (*judged, features)
 
-        derivative, (rho, status, features) = self._derivative(objective, u)
-        return rho.astype(u.dtype), status, features, {"gradient": derivative.astype(u.dtype)}
+        gradient, (rho, status, features) = self._derivative(objective, coordinates)
+        dtype = coordinates.dtype
+        return Row(rho.astype(dtype), status, features, {"gradient": gradient.astype(dtype)})
 
-    def _clauses_row(self, goals: Goals, u: Array, key: Array, temperature: Array) -> Any:
+    def _clauses(
+        self,
+        goals: Goals,
+        simulated: Callable[..., Any],
+        coordinates: Array,
+        key: Array,
+        temperature: Array,
+    ) -> Row:
         """Robustness as ever, and the clauses of the goal that is nearest to being broken."""
+        dtype = coordinates.dtype
 
-        def objective(u: Array) -> tuple[Array, Any]:
-            features = self.problem.space.unflatten(u)
-            trace = self.problem.system(features, key).hold()
+        def objective(coordinates: Array) -> tuple[Array, Any]:
+            features, system = simulated(coordinates)
+            trace = system(features, key).hold()
             values = goals.values(trace, hard, self.problem.end)
             nearest = jnp.argmin(jnp.max(values, axis=1))
-            results = (*judge(self.problem, trace), features, values[nearest])
+            judged = trace_verdict(self.problem, trace)
+            results = (*judged, features, values[nearest])
             if not self.gradient:
                 return values[nearest], results
-            semantics = smooth(temperature.astype(u.dtype))
+            semantics = smooth(temperature.astype(dtype))
             return goals.values(trace, semantics, self.problem.end)[nearest], results
 
         if self.gradient:
-            slopes, (rho, status, features, values) = self._derivative.slopes(objective, u)
+            sweep = self._derivative.of_several(objective, coordinates)
+            derivatives, (rho, status, features, values) = sweep
         else:
-            _, (rho, status, features, values) = objective(u)
-            slopes = jnp.zeros((0, 0))
+            _, (rho, status, features, values) = objective(coordinates)
+            derivatives = None
         missing = CLAUSES - len(values)
-        told = {"clauses": jnp.pad(values, (0, missing), constant_values=ABSENT).astype(u.dtype)}
-        if self.gradient:
-            told["slopes"] = jnp.pad(slopes, ((0, missing), (0, 0))).astype(u.dtype)
-        return rho.astype(u.dtype), status, features, told
+        padded = jnp.pad(values, (0, missing), constant_values=ABSENT)
+        more = {"clauses": padded.astype(dtype)}
+        if derivatives is not None:
+            more["clause_gradients"] = jnp.pad(derivatives, ((0, missing), (0, 0))).astype(dtype)
+        return Row(rho.astype(dtype), status, features, more)
 
-    def _verdict_row(self, u: Array, key: Array, temperature: Array) -> Any:
-        return verdict(self.problem, self.problem.system(self.problem.space.unflatten(u), key))
+    def _holds(
+        self, row: PyTree, key: Array, temperature: Array, shared: PyTree
+    ) -> Bool[Array, " formulas"]:
+        coordinates = self.inputs.coordinates(row, shared, self.precision)
+        features, system = self.inputs.simulated(coordinates, row, shared)
+        return boolean_semantics(self.problem, system(features, key))
 
 
-def _pad(u: Any, rows: int) -> Any:
-    if len(u) == rows:
-        return u
+def _pad(rows: Any, count: int) -> Any:
+    if len(rows) == count:
+        return rows
     # In NumPy: JAX would compile a program for each number of missing rows.
-    u = np.asarray(u)
-    return np.concatenate([u, np.broadcast_to(u[-1:], (rows - len(u), *u.shape[1:]))])
+    rows = np.asarray(rows)
+    return np.concatenate([rows, np.broadcast_to(rows[-1:], (count - len(rows), *rows.shape[1:]))])
+
+
+def _pad_keys(keys: Key[Array, " n"], count: int) -> Key[Array, " count"]:
+    if len(keys) == count:
+        return keys
+    data = _pad(np.asarray(jax.random.key_data(keys)), count)
+    return jax.random.wrap_key_data(data, impl=IMPLEMENTATION)
+
+
+class EngineMode(NamedTuple):
+    """What makes an engine of one problem: see `Engine`."""
+
+    batch: int
+    gradient: bool
+    precision: str
+    clauses: bool
+
+
+ENGINES: Slot[EngineMode, Engine] = Slot("engines")
+"""Engines over points of the unit cube."""
 
 
 def engine_for(
@@ -313,10 +379,10 @@ def engine_for(
     precision: str = "float32",
     clauses: bool = False,
 ) -> Engine:
-    """The engine of this (problem, batch, mode), made once and kept as long as the problem."""
-    mode = (batch, gradient, precision, clauses)
-    if mode not in problem.engines:
-        problem.engines[mode] = Engine(
-            problem, batch, gradient, precision=precision, clauses=clauses
-        )
-    return problem.engines[mode]
+    """Return the engine of this (problem, batch, mode), made once and kept with the problem."""
+    mode = EngineMode(batch, gradient, precision, clauses)
+    return problem.programs.get(
+        ENGINES,
+        mode,
+        lambda: Engine(problem, batch, gradient, precision=precision, clauses=clauses),
+    )

@@ -1,176 +1,253 @@
-"""Evaluation of what JAX cannot see into: the same batches as the engine's, simulated on the host.
+"""Evaluation of what JAX cannot trace: the same batches as the engine's, simulated on the host.
+
+    engine = HostEngine(problem)
+    engine.evaluate(u, key, first=0)                    # Verdicts, as of `engine.Engine`
 
 A simulation that raises, hangs or takes its process with it becomes a row with a status and a
 message; the others go on. Traces are judged in blocks of one shape, so that few monitors compile.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.evaluation.engine import Evaluation, judge, verdict
-from verifai_jax.evaluation.journal import Journal, Judged
+from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.verdicts import (
+    RowVerdict,
+    Verdicts,
+    boolean_semantics,
+    trace_verdict,
+    violations,
+)
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import Outcome
+from verifai_jax.systems.base import Outcome, System
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
-BLOCK = 32  # Traces judged together,
-PATIENCE = 0.5  # or as many as there are after so many seconds, so that they are safe on disk.
+BLOCK = 32
+"""Traces judged together, unless patience ends before there are so many."""
+PATIENCE = 0.5
+"""Seconds after which traces are judged in smaller blocks, so that they are safe on disk."""
+
+
+class HostMonitor:
+    """The compiled monitor of a problem for batches of traces that came from the host."""
+
+    def __init__(self, problem: Problem) -> None:
+        self._judge = jax.jit(jax.vmap(lambda trace: trace_verdict(problem, trace)))
+        self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
+
+    def __call__(
+        self, traces: Trace, count: int
+    ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, " n"], Bool[np.ndarray, "n k"]]:
+        """Return robustness, status and Boolean semantics, in one shape for many `count`."""
+        padded = jax.tree.map(_power_of_two, traces)
+        rho, status = (np.asarray(leaf)[:count] for leaf in self._judge(padded))
+        holds = np.ones(rho.shape, bool)
+        if np.any(rho == 0):
+            # Now, while the traces are here: simulating again may be dear.
+            holds = np.asarray(self._holds(padded))[:count]
+        return rho, status, holds
 
 
 class HostEngine:
     """Evaluates batches of a black-box problem; the counterpart of `engine.Engine`.
 
-    - `journal`: where rows are kept as soon as they are judged, until their batch is.
+    **Arguments:**
+
+    - `problem`: a checked `Problem`.
+    - `precision`: `"float32"` or `"float64"`, of features and monitor.
+    - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
+    - `system`: simulated instead of the problem's own, such as one with a finer step.
+    - `monitor`: one that is compiled already for the same formulas.
     """
 
     def __init__(
-        self, problem: Problem, precision: str = "float32", journal: Journal | None = None
+        self,
+        problem: Problem,
+        precision: str = "float32",
+        journal: Journal | None = None,
+        *,
+        system: System | None = None,
+        monitor: HostMonitor | None = None,
     ) -> None:
         self.problem, self.precision, self.journal = problem, precision, journal
+        self.system = problem.system if system is None else system
+        self.monitor = HostMonitor(problem) if monitor is None else monitor
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._prepare = jax.jit(self._prepared)
-        self._judge = jax.jit(jax.vmap(lambda trace: judge(problem, trace)))
-        self._verdict = jax.jit(jax.vmap(lambda trace: verdict(problem, trace)))
 
     def compile(self) -> None:
-        """Nothing to do: monitors compile when the first trace shows its length."""
+        """Do nothing: monitors compile when the first trace shows its length."""
 
     def evaluate(
         self,
-        u: Float[Array, "n d"],
+        rows: Float[np.ndarray, "n d"] | Float[Array, "n d"],
         key: Key[Array, ""],
-        first: int,
-        temperature: Float[Array, ""] | float = 1.0,
-    ) -> Evaluation:
-        """Simulate and judge `n` points of the unit cube; see `engine.Engine`."""
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
+    ) -> Verdicts:
+        """Simulate `n` points of the unit cube and decide which violate the property.
+
+        **Arguments:** as of `engine.Engine.evaluate`; nothing is differentiated.
+        """
         with in_precision(self.precision):
-            return self._evaluate(np.asarray(u), key, first)
+            u = np.asarray(rows)
+            features, keys, seeds = self._prepare(_power_of_two(u), key, np.int32(first))
+            features = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(u)], features)
+            return self._verdicts(features, keys[: len(u)], np.asarray(seeds)[: len(u)], u, first)
 
-    def _evaluate(self, u: np.ndarray, key: Key[Array, ""], first: int) -> Evaluation:
-        n = len(u)
-        features, keys, seeds = self._prepare(_power_of_two(u), key, np.int32(first))
-        features = jax.tree.map(lambda leaf: np.asarray(leaf)[:n], features)
-        rows = _Rows(n, len(self.problem.formulas), self.precision)
-        if self.problem.system.can_simulate_batch:
-            self._together(features, keys[:n], rows)
+    def evaluate_features(self, features: PyTree, keys: Key[Array, " n"]) -> Verdicts:
+        """Simulate `n` rows of features, each with the random key of its own, and decide.
+
+        **Arguments:**
+
+        - `features`: `[n, ...]` each.
+        - `keys`: of the simulations.
+        """
+        with in_precision(self.precision):
+            seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
+            return self._verdicts(features, keys, seeds, None, 0)
+
+    def _verdicts(
+        self,
+        features: PyTree,
+        keys: Key[Array, " n"],
+        seeds: Int[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"] | None,
+        first: int,
+    ) -> Verdicts:
+        rows = _Rows(len(seeds), len(self.problem.formulas), self.precision)
+        if self.system.can_simulate_batch:
+            self._together(features, keys, rows)
         else:
-            self._one_by_one(features, np.asarray(seeds)[:n], u, first, rows)
-        return Evaluation(rows.rho, rows.status, features, None, rows.messages, rows.holds)
+            self._one_by_one(features, seeds, u, first, rows)
+        violated = violations(rows.rho, rows.status, lambda: rows.holds)
+        return Verdicts(rows.rho, rows.status, violated, features, messages=rows.messages)
 
-    def _prepared(self, u: Array, key: Array, first: Array) -> Any:
+    def _prepared(self, u: Array, key: Array, first: Array) -> tuple[PyTree, Array, Array]:
         keys = jax.vmap(lambda i: simulation_key(key, first + i))(jnp.arange(len(u)))
         u = u.astype(self.precision)
         return jax.vmap(self.problem.space.unflatten)(u), keys, jax.vmap(jax.random.bits)(keys)
 
-    def _together(self, features: Any, keys: Key[Array, " n"], rows: "_Rows") -> None:
-        system, n = self.problem.system, len(rows.messages)
+    def _together(self, features: PyTree, keys: Key[Array, " n"], rows: "_Rows") -> None:
+        count = len(rows.messages)
         try:
-            trace = _checked(system.simulate_batch(features, keys), n)
-            rows.rho[:], rows.status[:], rows.holds[:] = self._judged(trace, n)
+            trace = _checked(self.system.simulate_batch(features, keys), count)
+            rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
         except Exception as error:
-            rows.messages[:] = [_told(error)] * n
+            rows.messages[:] = [_message(error)] * count
 
     def _one_by_one(
-        self, features: Any, seeds: np.ndarray, u: np.ndarray, first: int, rows: "_Rows"
+        self,
+        features: PyTree,
+        seeds: Int[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"] | None,
+        first: int,
+        rows: "_Rows",
     ) -> None:
-        def keep(i: int, row: Judged) -> None:
+        journal = None if u is None else self.journal
+        known = {} if journal is None or u is None else journal.recall(first, u)
+
+        def keep(i: int, row: RowVerdict) -> None:
             rows.put(i, row)
-            if self.journal is not None:
-                self.journal.add(first + i, u[i], row)
+            if journal is not None and u is not None:
+                journal.add(first + i, u[i], row)
 
-        known = {} if self.journal is None else self.journal.recall(first, u)
-        for i, judged in known.items():
-            rows.put(i, judged)
-        todo = [i for i in range(len(u)) if i not in known]
+        for i, row in known.items():
+            rows.put(i, row)
+        todo = [i for i in range(len(seeds)) if i not in known]
         each = [plain_leaves(jax.tree.map(lambda leaf, i=i: leaf[i], features)) for i in todo]
-        waiting: dict[Any, list[tuple[int, Trace]]] = {}
-
-        def settle(form: Any) -> None:
-            block = waiting.pop(form)
-            judged = self._judged_block([trace for _, trace in block])
-            for (i, _), row in zip(block, judged, strict=False):
-                keep(i, row)
-
-        since = time.monotonic()
+        waiting = _Waiting(self._block_verdicts, keep)
         for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
-            i = todo[place]
-            trace, problem = _trace(outcome)
+            trace, without = _trace(outcome)
             if trace is None:
-                keep(i, problem)
-                continue
-            form = _form(trace)
-            waiting.setdefault(form, []).append((i, trace))
-            if len(waiting[form]) == BLOCK:
-                settle(form)
-            if time.monotonic() - since > PATIENCE:
-                for form in list(waiting):
-                    settle(form)
-                since = time.monotonic()
-        for form in list(waiting):
-            settle(form)
+                keep(todo[place], without)
+            else:
+                waiting.add(todo[place], trace)
+        waiting.settle_all()
 
     def _outcomes(self, features: list[Any], seeds: list[int]) -> Iterator[tuple[int, Outcome]]:
-        system = self.problem.system
-        if system.can_simulate_each:
+        if self.system.can_simulate_each:
             if features:
-                yield from system.simulate_each(features, seeds)
+                yield from self.system.simulate_each(features, seeds)
             return
         for i, (each, seed) in enumerate(zip(features, seeds, strict=True)):
             try:
-                yield i, Outcome(system(each, seed))
+                yield i, Outcome(self.system(each, seed))
             except Exception as error:
-                yield i, Outcome(None, Status.ERROR, _told(error))
+                yield i, Outcome(None, Status.ERROR, _message(error))
 
-    def _judged_block(self, traces: list[Trace]) -> list[Judged]:
-        filled = traces + [traces[-1]] * (BLOCK - len(traces))
+    def _block_verdicts(self, traces: Sequence[Trace]) -> list[RowVerdict]:
+        filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
         try:
-            rho, status, holds = self._judged(stacked, BLOCK)
+            rho, status, holds = self.monitor(stacked, BLOCK)
         except Exception as error:
             # The monitor refuses traces of this form: their signals, or their clock.
-            return [_without_verdict(Status.ERROR, _told(error))] * len(traces)
-        return [Judged(rho[i], int(status[i]), holds[i], "") for i in range(len(traces))]
+            return [_without_verdict(Status.ERROR, _message(error))] * len(traces)
+        return [RowVerdict(rho[i], int(status[i]), holds[i], "") for i in range(len(traces))]
 
-    def _judged(self, traces: Trace, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Robustness, status and Boolean verdicts of a batch of traces, one shape for many `n`."""
-        padded = jax.tree.map(_power_of_two, traces)
-        rho, status = (np.asarray(leaf)[:n] for leaf in self._judge(padded))
-        holds = np.ones(rho.shape, bool)
-        if np.any(rho == 0):
-            # Now, while the traces are here: simulating again may be dear.
-            holds = np.asarray(self._verdict(padded))[:n]
-        return rho, status, holds
+
+class _Waiting:
+    """Traces that wait for others of their form, to be judged in one block."""
+
+    def __init__(
+        self,
+        judge: Callable[[Sequence[Trace]], list[RowVerdict]],
+        keep: Callable[[int, RowVerdict], None],
+    ) -> None:
+        self._judge, self._keep = judge, keep
+        self._blocks: dict[Any, list[tuple[int, Trace]]] = {}
+        self._since = time.monotonic()
+
+    def add(self, row: int, trace: Trace) -> None:
+        form = _form(trace)
+        self._blocks.setdefault(form, []).append((row, trace))
+        if len(self._blocks[form]) == BLOCK:
+            self._settle(form)
+        if time.monotonic() - self._since > PATIENCE:
+            self.settle_all()
+            self._since = time.monotonic()
+
+    def settle_all(self) -> None:
+        for form in list(self._blocks):
+            self._settle(form)
+
+    def _settle(self, form: Any) -> None:
+        block = self._blocks.pop(form)
+        verdicts = self._judge([trace for _, trace in block])
+        for (row, _), verdict in zip(block, verdicts, strict=True):
+            self._keep(row, verdict)
 
 
 class _Rows:
     """The rows of a batch while they are filled, in any order."""
 
-    def __init__(self, n: int, formulas: int, precision: str) -> None:
-        self.rho = np.full((n, formulas), np.nan, precision)
-        self.status = np.full(n, Status.ERROR, np.int32)
-        self.holds = np.ones((n, formulas), bool)
-        self.messages = [""] * n
+    def __init__(self, count: int, formulas: int, precision: str) -> None:
+        self.rho = np.full((count, formulas), np.nan, precision)
+        self.status = np.full(count, Status.ERROR, np.int32)
+        self.holds = np.ones((count, formulas), bool)
+        self.messages = [""] * count
 
-    def put(self, i: int, row: Judged) -> None:
+    def put(self, i: int, row: RowVerdict) -> None:
         self.rho[i], self.status[i], self.holds[i], self.messages[i] = row
 
 
-def _without_verdict(status: Status, message: str) -> Judged:
-    return Judged(np.array(np.nan), int(status), np.array(True), message)
+def _without_verdict(status: Status, message: str) -> RowVerdict:
+    return RowVerdict(np.array(np.nan), int(status), np.array(True), message)
 
 
-def _trace(outcome: Outcome) -> tuple[Trace | None, Judged]:
-    """The trace to judge; or none, and what its row says instead."""
+def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
+    """Return the trace to judge; or none, and what its row says instead."""
     trace, status, message = outcome
     if not isinstance(trace, Trace) and (trace is not None or status == Status.OK):
         given = type(trace).__name__
@@ -179,21 +256,21 @@ def _trace(outcome: Outcome) -> tuple[Trace | None, Judged]:
     try:
         return None if trace is None else pad_trace(trace), _without_verdict(status, message)
     except Exception as error:
-        return None, _without_verdict(Status.ERROR, _told(error))
+        return None, _without_verdict(Status.ERROR, _message(error))
 
 
-def _told(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def _checked(trace: Any, n: int) -> Trace:
+def _checked(trace: object, count: int) -> Trace:
     if not isinstance(trace, Trace):
         raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
     for name, signal in trace.signals.items():
-        if np.ndim(signal) < 2 or np.shape(signal)[0] != n:
+        if np.ndim(signal) < 2 or np.shape(signal)[0] != count:
             raise ValueError(
-                f"a batch of {n} simulations must give signals [{n}, time]; {name!r} has shape "
-                f"{list(np.shape(signal))}"
+                f"a batch of {count} simulations must give signals [{count}, time]; {name!r} has "
+                f"shape {list(np.shape(signal))}"
             )
     return trace
 
@@ -204,14 +281,14 @@ def _form(trace: Trace) -> Any:
 
 
 def _power_of_two(leaf: Any) -> np.ndarray:
-    """The rows, the last one repeated until their number is a power of two."""
+    """Repeat the last row until the number of rows is a power of two."""
     leaf = np.asarray(leaf)
     missing = (1 << (len(leaf) - 1).bit_length()) - len(leaf)
     return np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]) if missing else leaf
 
 
 def pad_trace(trace: Trace) -> Trace:
-    """The same trace, held to a length that is a power of two.
+    """Hold a trace to a length that is a power of two.
 
     Holding the last sample changes no verdict, and traces of all lengths share a few compiled
     monitors.

@@ -11,19 +11,20 @@ side: for comparing searches, where a run a seed would spend its time between ro
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.verdicts import violations
 from verifai_jax.falsification.lockstep import lockstep
 from verifai_jax.falsification.validation import check_options, check_search, usable, usual_batch
 from verifai_jax.problem.problem import Problem
@@ -35,14 +36,18 @@ SIMULATIONS_A_CALL = 512
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """What `repeat` returns.
+    """The histories of one search from many seeds; what `repeat` returns.
 
-    - `seeds`: `[seeds]`; `rho`: `[seeds, simulations]`, the least formula's robustness, NaN where a
-      simulation has no verdict.
+    - `name`, `search`: of the problem; the repr of the search.
+    - `seeds`: `[seeds]`.
     - `batch`: simulations a round.
-    - `differentiated`: `[seeds, simulations]`, which had slopes taken; None where none or all had.
+    - `rho`: `[seeds, simulations]`, the least formula's robustness, NaN where a simulation has no
+      verdict.
+    - `violated`: `[seeds, simulations]`, which simulations violate the property, as in `falsify`.
     - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
-      one; None for searches that do not plan their rounds.
+      one.
+    - `differentiated`: `[seeds, simulations]`, which were differentiated; None where none or all
+      were.
     """
 
     name: str
@@ -50,21 +55,22 @@ class Trials:
     seeds: Int[np.ndarray, " seeds"]
     batch: int
     rho: Float[np.ndarray, "seeds simulations"]
+    violated: Bool[np.ndarray, "seeds simulations"]
+    failures: Float[np.ndarray, "seeds d"]
     differentiated: Bool[np.ndarray, "seeds simulations"] | None = None
-    failures: Float[np.ndarray, "seeds d"] | None = None
 
-    def cost(self, slopes: float = 2.0) -> Float[np.ndarray, " seeds"]:
-        """Like `first_failure`, with each differentiated simulation counted as so many."""
+    def cost(self, derivative: float = 2.0) -> Float[np.ndarray, " seeds"]:
+        """Return `first_failure` with each differentiated simulation counted as so many."""
         first = self.first_failure
         if self.differentiated is None:
             return first
         before = np.arange(self.rho.shape[1]) < first[:, None]
-        return first + (slopes - 1) * np.sum(self.differentiated & before, axis=1)
+        return first + (derivative - 1) * np.sum(self.differentiated & before, axis=1)
 
     @property
     def first_failure(self) -> Float[np.ndarray, " seeds"]:
         """The number, from 1, of each seed's first failing simulation; infinite without one."""
-        failing = self.rho < 0
+        failing = self.violated
         return np.where(failing.any(axis=1), failing.argmax(axis=1) + 1.0, np.inf)
 
     @property
@@ -114,7 +120,8 @@ def repeat(
     - `stop_early`: end once every seed has found a failure. Seeds of a search that plans its
       rounds (`portfolio`, `gradient`) each end with their own first failure.
 
-    A robustness of exactly zero is no failure here, whatever the comparator says.
+    **Returns:** the robustness and the verdicts of each seed's simulations. A failure is what it is
+    in `falsify` before it is confirmed.
 
     **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`) or a priority,
     which are dealt with between rounds: use `falsify` with one seed after the other.
@@ -145,25 +152,26 @@ def repeat(
     if search.wants_clauses:
         with in_precision(precision):
             found = lockstep(traced, search, every, budget, batch, precision, stop_early)
-        return Trials(problem.name, repr(search), every, batch, *found)
+        return Trials(
+            problem.name,
+            repr(search),
+            every,
+            batch,
+            found.rho,
+            found.violated,
+            found.failures,
+            found.differentiated,
+        )
     rounds = -(-budget // batch)
     each = min(rounds, max(1, SIMULATIONS_A_CALL // batch))
     with in_precision(precision):
-        start, advance, devices = _program(traced, search, batch, each, precision)
-        # As many on each device: the last seed again, for those that are missing.
-        padded = np.append(every, np.repeat(every[-1:], -len(every) % devices))
-        keys = [run_keys(int(seed)) for seed in padded]
-        state = start(jnp.stack([key for key, _ in keys]))
-        simulations = jnp.stack([key for _, key in keys])
-        parts, found = [], np.zeros(len(padded), bool)
-        for first in range(0, rounds, each):
-            state, rho = advance(state, simulations, np.int32(first * batch))
-            parts.append(np.asarray(rho))
-            found |= (parts[-1] < 0).any(axis=1)
-            if stop_early and found.all():
-                break
-    rho = np.concatenate(parts, axis=1)[: len(every), : rounds * batch]
-    return Trials(problem.name, repr(search), every, batch, rho)
+        program = traced.programs.get(
+            WHOLE_ROUNDS,
+            (search, batch, each, precision),
+            lambda: _WholeRounds(traced, search, batch, each, precision),
+        )
+        histories = program.play(every, rounds, stop_early)
+    return Trials(problem.name, repr(search), every, batch, *histories)
 
 
 def _traced(problem: Problem, backend: str | None) -> Problem | None:
@@ -175,52 +183,110 @@ def _traced(problem: Problem, backend: str | None) -> Problem | None:
     return None
 
 
-def _program(problem: Problem, search: Search, batch: int, rounds: int, precision: str) -> Any:
-    """The compiled beginning, and `rounds` rounds, of all seeds; kept as long as the problem."""
-    kind = ("repeat", search, batch, rounds, precision)
-    if kind not in problem.engines:
-        problem.engines[kind] = _compiled(problem, search, batch, rounds, precision)
-    return problem.engines[kind]
+class _WholeRounds:
+    """Compiled rounds of a search, several at a time, from all seeds side by side."""
 
+    def __init__(
+        self, problem: Problem, search: Search, batch: int, rounds: int, precision: str
+    ) -> None:
+        self.problem, self.search, self.batch, self.rounds = problem, search, batch, rounds
+        self.precision = precision
+        self.engine = Engine(problem, batch, search.wants_gradient, precision=precision)
+        cube = problem.space.cube
+        self._start = jax.jit(jax.vmap(lambda key: search.init(key, cube, batch)))
+        self._programs: dict[int, jax.stages.Compiled] = {}
 
-def _compiled(problem: Problem, search: Search, batch: int, rounds: int, precision: str) -> Any:
-    engine = Engine(problem, batch, search.wants_gradient, precision=precision)
-    cube = problem.space.cube
+    def play(
+        self, seeds: Int[np.ndarray, " seeds"], rounds: int, stop_early: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return robustness and violations, `[seeds, n]`, and first failures `[seeds, d]`."""
+        count, devices = len(seeds), len(jax.local_devices())
+        # As many on each device: the last seed again, for those that are missing.
+        padded = np.append(seeds, np.repeat(seeds[-1:], -count % devices))
+        keys = [run_keys(int(seed)) for seed in padded]
+        state = self._start(jnp.stack([key for key, _ in keys]))
+        simulations = jnp.stack([key for _, key in keys])
+        parts, broken = [], []
+        failures = np.full((count, self.problem.space.dim), np.nan, np.float32)
+        failed = np.zeros(count, bool)
+        for first in range(0, rounds, self.rounds):
+            number = first * self.batch
+            state, results = self._advance(state, simulations, np.int32(number))
+            u, rho, status = (np.asarray(result)[:count] for result in results)
+            # The last call may have rounds beyond the budget.
+            u, rho, status = (part[:, : (rounds - first) * self.batch] for part in (u, rho, status))
+            violated = self._violated(u, rho, status, simulations, number)
+            new = violated.any(axis=1) & ~failed
+            failures[new] = u[new, violated[new].argmax(axis=1)]
+            failed |= new
+            parts.append(rho)
+            broken.append(violated)
+            if stop_early and failed.all():
+                break
+        return np.concatenate(parts, axis=1), np.concatenate(broken, axis=1), failures
 
-    def one_seed(state: Any, key: Any, first: Any) -> Any:
-        def step(state: Any, i: Any) -> Any:
+    def _violated(
+        self,
+        u: Float[np.ndarray, "seeds n d"],
+        rho: Float[np.ndarray, "seeds n"],
+        status: Int[np.ndarray, "seeds n"],
+        keys: Key[Array, " padded"],
+        first: int,
+    ) -> Bool[np.ndarray, "seeds n"]:
+        flat = status.ravel()
+
+        def holds() -> Bool[np.ndarray, "rows 1"]:
+            undecided = np.flatnonzero((rho.ravel() == 0) & (flat == Status.OK))
+            every = np.ones((rho.size, 1), bool)
+            for place in undecided.tolist():
+                seed, row = divmod(place, rho.shape[1])
+                found = self.engine.holds(u[seed, row][None], keys[seed], first + row)
+                every[place] = found.all()
+            return every
+
+        return violations(rho.reshape(-1, 1), flat, holds).reshape(rho.shape)
+
+    def _advance(
+        self, state: PyTree, keys: Key[Array, " padded"], first: np.int32
+    ) -> tuple[PyTree, tuple[Array, Array, Array]]:
+        if len(keys) not in self._programs:
+            enable_compile_cache()
+            program = spread_over_devices(self._on_device, (True, True, False))
+            traced = self.engine.differentiable(
+                lambda: jax.jit(partial(program)).lower(state, keys, first)
+            )
+            self._programs[len(keys)] = traced.compile()
+        return self._programs[len(keys)](state, keys, first)
+
+    def _on_device(self, state: PyTree, keys: Array, first: Array) -> PyTree:
+        # Blocks of seeds whose simulations fit the cache together.
+        blocks = max(1, self.engine.together // self.batch)
+        return jax.lax.map(
+            lambda seed: self._one_seed(seed[0], seed[1], first), (state, keys), batch_size=blocks
+        )
+
+    def _one_seed(self, state: PyTree, key: Array, first: Array) -> PyTree:
+        search, cube, batch = self.search, self.problem.space.cube, self.batch
+
+        def step(state: PyTree, i: Array) -> PyTree:
             u, state = search.ask(state, cube, batch)
             rows = first + i * batch + jnp.arange(batch, dtype=jnp.int32)
             keys = jax.vmap(partial(simulation_key, key))(rows)
-            temperature: Any = search.temperature(state) if search.wants_gradient else 1.0
-            simulate = jax.vmap(engine.told_row, in_axes=(0, 0, None))
+            temperature = search.temperature(state) if search.wants_gradient else 1.0
+            simulate = jax.vmap(self.engine.row, in_axes=(0, 0, None))
             row = simulate(u, keys, jnp.float32(temperature))
-            told = Observations(
-                u, row.rho.astype(jnp.float32), row.status == Status.OK, row.gradient
-            )
-            return search.tell(state, cube, told) if search.learns else state, row.rho
+            least = jnp.min(row.rho, axis=-1)
+            gradient = row.derivatives.get("gradient")
+            gradient = None if gradient is None else gradient.astype(jnp.float32)
+            valid = row.status == Status.OK
+            observations = Observations(u, least.astype(jnp.float32), valid, gradient)
+            if search.learns:
+                state = search.tell(state, cube, observations)
+            return state, (u, least, row.status)
 
-        state, rho = jax.lax.scan(step, state, jnp.arange(rounds, dtype=jnp.int32))
-        return state, rho.ravel()
+        state, results = jax.lax.scan(step, state, jnp.arange(self.rounds, dtype=jnp.int32))
+        return state, jax.tree.map(lambda each: each.reshape(-1, *each.shape[2:]), results)
 
-    def on_device(state: Any, keys: Any, first: Any) -> Any:
-        # Blocks of seeds whose simulations fit the cache together.
-        blocks = max(1, engine.together // batch)
-        return jax.lax.map(
-            lambda seed: one_seed(seed[0], seed[1], first), (state, keys), batch_size=blocks
-        )
 
-    on_devices = spread_over_devices(on_device, (True, True, False))
-    start = jax.jit(jax.vmap(lambda key: search.init(key, cube, batch)))
-    programs: dict[int, Any] = {}
-
-    def advance(state: Any, keys: Any, first: Any) -> Any:
-        if len(keys) not in programs:
-            enable_compile_cache()
-            traced = engine.differentiable(
-                lambda: jax.jit(partial(on_devices)).lower(state, keys, first)
-            )
-            programs[len(keys)] = traced.compile()
-        return programs[len(keys)](state, keys, first)
-
-    return start, advance, len(jax.local_devices())
+WHOLE_ROUNDS: Slot[tuple[Search, int, int, str], _WholeRounds] = Slot("whole rounds")
+"""Compiled rounds by (search, batch, rounds, precision)."""

@@ -1,158 +1,164 @@
-"""Many seeds of a search that plans its rounds, side by side: for `trials.repeat`.
+"""Many seeds of a search that plans its rounds, side by side: for `repeat`.
 
-Such a search asks for slopes in some rounds only, each seed in its own. A program of whole rounds
-would have to differentiate every simulation; here the points of all seeds that want the same go
-together, and the loop is on the host.
+Such a search asks for derivatives in some rounds only, each seed in its own. A program of whole
+rounds would have to differentiate every simulation; here the points of all seeds that want the same
+go together, and the loop is on the host.
 """
 
 from functools import partial
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.trace import Status
+from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
-VALUES_AT_ONCE, SLOPES_AT_ONCE = 256, 64
+VALUES_AT_ONCE = 256
+"""Simulations of one call without derivatives."""
+DERIVATIVES_AT_ONCE = 64
+"""Simulations of one call with derivatives."""
+
+
+class SeedHistories(NamedTuple):
+    """The simulations of each seed, padded behind its last one.
+
+    - `rho`: the least robustness; NaN where there is no simulation or no verdict.
+    - `violated`: whether the simulation violates the property.
+    - `differentiated`: whether derivatives were taken.
+    - `failures`: the first failing point of each seed in the unit cube; NaN without one.
+    """
+
+    rho: Float[np.ndarray, "seeds simulations"]
+    violated: Bool[np.ndarray, "seeds simulations"]
+    differentiated: Bool[np.ndarray, "seeds simulations"]
+    failures: Float[np.ndarray, "seeds d"]
 
 
 def lockstep(
     problem: Problem,
     search: Search,
-    seeds: Any,
+    seeds: Int[np.ndarray, " seeds"],
     budget: int,
     batch: int,
     precision: str,
     stop_early: bool,
-) -> tuple[
-    Float[np.ndarray, "seeds simulations"],
-    Bool[np.ndarray, "seeds simulations"],
-    Float[np.ndarray, "seeds d"],
-]:
-    """Robustness of each seed's simulations, which were differentiated, and the first failures.
+) -> SeedHistories:
+    """Run the search from every seed and return the histories.
 
-    NaN where there was no simulation, or no failure.
     A seed that has found a failure makes no further simulation if `stop_early`.
     """
     cube, n = problem.space.cube, len(seeds)
     keys = [run_keys(int(seed)) for seed in seeds]
-    simulation_keys = jnp.stack([key for _, key in keys])
-    start, ask, tell = _search_program(problem, search, batch)
+    run_key = jnp.stack([key for _, key in keys])
+    start, ask, tell = _search_programs(problem, search, batch)
     state = start(jnp.stack([key for key, _ in keys]))
-    evaluate = {
-        slopes: _simulations(problem, slopes, min(n * batch, most), precision)
-        for slopes, most in ((False, VALUES_AT_ONCE), (True, SLOPES_AT_ONCE))
+    engines = {
+        kind: _engine(problem, kind, min(n * batch, most), precision)
+        for kind, most in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
     }
-    found: list[list[float]] = [[] for _ in range(n)]
-    flags: list[list[bool]] = [[] for _ in range(n)]
+    number_keys = jax.jit(jax.vmap(simulation_key))
+    rho: list[list[float]] = [[] for _ in range(n)]
+    violated: list[list[bool]] = [[] for _ in range(n)]
+    differentiated: list[list[bool]] = [[] for _ in range(n)]
+    failures = np.full((n, cube.dim), np.nan, np.float32)
     failed = np.zeros(n, bool)
-    points = np.full((n, cube.dim), np.nan, np.float32)
     while True:
         u, plan, state = ask(state)
-        u, rows, slopes, temperature = map(
+        u, rows, wanted, temperature = map(
             np.asarray, (u, plan.rows, plan.differentiate, plan.temperature)
         )
-        left = np.array([budget - len(each) for each in found])
+        left = np.array([budget - len(each) for each in rho])
         left[failed] *= not stop_early
         rows = np.minimum(rows, left)
         if not rows.any():
             break
-        told = Observations(
-            u=u,  # pyright: ignore[reportArgumentType]
-            rho=np.full((n, batch), np.nan, np.float32),  # pyright: ignore[reportArgumentType]
-            valid=np.zeros((n, batch), bool),  # pyright: ignore[reportArgumentType]
-            clauses=np.zeros((n, batch, CLAUSES), np.float32),  # pyright: ignore[reportArgumentType]
-            clause_gradients=np.zeros((n, batch, CLAUSES, cube.dim), np.float32),  # pyright: ignore[reportArgumentType]
-        )
-        asked = np.arange(batch) < rows[:, None]
-        for kind in (False, True):
-            who, row = np.nonzero(asked & (slopes == kind)[:, None])
-            if not len(who):
+        values = np.full((n, batch), np.nan, np.float32)
+        valid, broken = np.zeros((n, batch), bool), np.zeros((n, batch), bool)
+        clauses = np.zeros((n, batch, CLAUSES), np.float32)
+        clause_gradients = np.zeros((n, batch, CLAUSES, cube.dim), np.float32)
+        proposed = np.arange(batch) < rows[:, None]
+        for kind, engine in engines.items():
+            seed, row = np.nonzero(proposed & (wanted == kind)[:, None])
+            if not len(seed):
                 continue
-            numbers = np.array([len(found[seed]) for seed in who]) + row
-            result = evaluate[kind](
-                u[who, row], simulation_keys, who, numbers, temperature[who, row]
-            )
-            told.rho[who, row] = result["rho"]  # pyright: ignore[reportIndexIssue]
-            told.valid[who, row] = result["status"] == Status.OK  # pyright: ignore[reportIndexIssue]
-            told.clauses[who, row] = result["clauses"]  # pyright: ignore[reportOptionalSubscript]
+            numbers = np.array([len(rho[each]) for each in seed]) + row
+            parts = []
+            for first in range(0, len(seed), engine.batch):
+                block = slice(first, first + engine.batch)
+                # Always as many, so that one program makes the keys.
+                place = np.minimum(np.arange(first, first + engine.padded), len(seed) - 1)
+                own = number_keys(run_key[seed[place]], numbers[place].astype(np.int32))
+                some = seed[block], row[block]
+                parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
+            verdicts = Verdicts.concatenate(parts)
+            values[seed, row], valid[seed, row] = verdicts.least, verdicts.proper
+            broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses
             if kind:
-                told.clause_gradients[who, row] = result["slopes"]  # pyright: ignore[reportOptionalSubscript]
+                clause_gradients[seed, row] = verdicts.clause_gradients
         for seed in range(n):
-            found[seed].extend(told.rho[seed, : rows[seed]].tolist())
-            flags[seed].extend([bool(slopes[seed])] * int(rows[seed]))
-            below = np.flatnonzero(np.asarray(told.rho[seed, : rows[seed]]) < 0)
-            if len(below) and not failed[seed]:
-                failed[seed], points[seed] = True, u[seed, below[0]]
-        state = tell(state, told)
-    longest = max(map(len, found))
-    rho = np.full((n, longest), np.nan, np.float32)
-    differentiated = np.zeros((n, longest), bool)
-    for seed in range(n):
-        rho[seed, : len(found[seed])] = found[seed]
-        differentiated[seed, : len(flags[seed])] = flags[seed]
-    return rho, differentiated, points
+            count = int(rows[seed])
+            rho[seed].extend(values[seed, :count].tolist())
+            violated[seed].extend(broken[seed, :count].tolist())
+            differentiated[seed].extend([bool(wanted[seed])] * count)
+            first_broken = np.flatnonzero(broken[seed, :count])
+            if len(first_broken) and not failed[seed]:
+                failed[seed], failures[seed] = True, u[seed, first_broken[0]]
+        observations = Observations(
+            u=jnp.asarray(u),
+            rho=jnp.asarray(values),
+            valid=jnp.asarray(valid),
+            clauses=jnp.asarray(clauses),
+            clause_gradients=jnp.asarray(clause_gradients),
+        )
+        state = tell(state, observations)
+    longest = max(map(len, rho))
+    return SeedHistories(
+        _filled(rho, longest, np.nan).astype(np.float32),
+        _filled(violated, longest, False).astype(bool),
+        _filled(differentiated, longest, False).astype(bool),
+        failures,
+    )
 
 
-def _search_program(problem: Problem, search: Search, batch: int) -> Any:
-    kind = ("lockstep", search, batch)
-    if kind not in problem.engines:
-        cube = problem.space.cube
+def _filled(rows: list[list[float]] | list[list[bool]], length: int, fill: float) -> np.ndarray:
+    return np.array([[*row, *[fill] * (length - len(row))] for row in rows])
 
-        def ask(state: Any) -> Any:
-            u, state = search.ask(state, cube, batch)
-            return u, search.plan(state, cube, batch), state
 
-        problem.engines[kind] = (
+SEARCHES: Slot[tuple[Search, int], tuple[jax.stages.Wrapped, ...]] = Slot("searches of seeds")
+"""Compiled `init`, `ask` with `plan`, and `tell` of all seeds, by (search, batch)."""
+DERIVING: Slot[tuple[bool, int, str], Engine] = Slot("engines of seeds")
+"""Engines whose rows have keys of their own, by (with derivatives, batch, precision)."""
+
+
+def _search_programs(
+    problem: Problem, search: Search, batch: int
+) -> tuple[jax.stages.Wrapped, ...]:
+    cube = problem.space.cube
+
+    def ask(state):
+        u, state = search.ask(state, cube, batch)
+        return u, search.plan(state, cube, batch), state
+
+    def make() -> tuple[jax.stages.Wrapped, ...]:
+        return (
             jax.jit(jax.vmap(lambda key: search.init(key, cube, batch))),
             jax.jit(jax.vmap(ask)),
-            jax.jit(jax.vmap(lambda state, told: search.tell(state, cube, told))),
+            jax.jit(jax.vmap(lambda state, observations: search.tell(state, cube, observations))),
         )
-    return problem.engines[kind]
+
+    return problem.programs.get(SEARCHES, (search, batch), make)
 
 
-def _simulations(problem: Problem, slopes: bool, most: int, precision: str) -> Any:
-    """A function that simulates any number of points, each with the key of its seed and number."""
-    kind = ("lockstep simulations", slopes, most, precision)
-    if kind in problem.engines:
-        return problem.engines[kind]
-    engine = Engine(problem, most, slopes, precision=precision, clauses=True)
-    devices = jax.local_devices()[: max(1, min(len(jax.local_devices()), most))]
-    size = -(-most // len(devices)) * len(devices)
-
-    def one(u: Any, key: Any, number: Any, temperature: Any) -> Any:
-        row = engine.told_row(u, simulation_key(key, number), temperature)._asdict()
-        return {name: value for name, value in row.items() if value is not None}
-
-    program = spread_over_devices(jax.vmap(one), (True,) * 4, devices)
-    compiled: list[Any] = []
-
-    def simulate(u: Any, keys: Any, who: Any, numbers: Any, temperature: Any) -> Any:
-        parts = []
-        for first in range(0, len(u), size):
-            rows = np.minimum(np.arange(first, first + size), len(u) - 1)
-            arguments = (
-                u[rows],
-                keys[who[rows]],
-                numbers[rows].astype(np.int32),
-                temperature[rows],
-            )
-            if not compiled:
-                enable_compile_cache()
-                lowered = engine.differentiable(
-                    lambda a=arguments: jax.jit(partial(program)).lower(*a)
-                )
-                compiled.append(lowered.compile())
-            parts.append(jax.tree.map(np.asarray, compiled[0](*arguments)))
-        return {name: np.concatenate([part[name] for part in parts])[: len(u)] for name in parts[0]}
-
-    problem.engines[kind] = simulate
-    return simulate
+def _engine(problem: Problem, derivatives: bool, batch: int, precision: str) -> Engine:
+    make = partial(
+        Engine, problem, batch, derivatives, precision=precision, clauses=True, own_keys=True
+    )
+    return problem.programs.get(DERIVING, (derivatives, batch, precision), make)

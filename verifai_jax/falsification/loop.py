@@ -9,16 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
+from jaxtyping import Bool, Float
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.confirmation import Confirmer
-from verifai_jax.evaluation.engine import Evaluation, engine_for
-from verifai_jax.evaluation.evaluator import violated
-from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_snapshot
 from verifai_jax.falsification.table import NOT_CLAIMED, ErrorTable
 from verifai_jax.problem.problem import Problem
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
-MOST_SLOPES = 16
-"""Rows with slopes in one call of the engine."""
+MOST_DIFFERENTIATED = 16
+"""Rows whose clauses are differentiated in one call of the engine."""
 MOST_WARM = 2048
 """Rows of an earlier table at most that a search starts with; the worst of a longer one."""
 
@@ -57,20 +56,29 @@ class Rounds:
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
         self.precision, self.folder = precision, folder
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
-        self.engine = (
-            HostEngine(problem, precision, self._journal)
-            if problem.black_box
-            else engine_for(
-                problem, batch, search.wants_gradient, precision, clauses=search.wants_clauses
-            )
+        self.evaluate = Evaluator(
+            problem,
+            batch,
+            gradient=search.wants_gradient,
+            clauses=search.wants_clauses,
+            precision=precision,
+            seed=seed,
+            journal=self._journal,
         )
-        # Slopes are wanted of few points at a time, and now and then: compiled when they are.
-        self._slopes_engine = (
-            engine_for(problem, min(batch, MOST_SLOPES), True, precision, clauses=True)
+        # Derivatives of clauses are wanted of few points, now and then: compiled when they are.
+        self._differentiate = (
+            Evaluator(
+                problem,
+                min(batch, MOST_DIFFERENTIATED),
+                gradient=True,
+                clauses=True,
+                precision=precision,
+                seed=seed,
+            )
             if search.wants_clauses
             else None
         )
-        self.search_key, self.simulation_key = run_keys(seed)
+        self.search_key = run_keys(seed)[0]
         self.found = self.judged = 0
         self.best = float("nan")
         self.compile_seconds = 0.0
@@ -82,7 +90,7 @@ class Rounds:
 
     def compile(self) -> None:
         """Compile the engine and the search."""
-        self.engine.compile()
+        self.evaluate.compile()
         self._proposals = Proposals(
             self.search,
             self.problem.space.cube,
@@ -94,7 +102,7 @@ class Rounds:
 
     @property
     def confirms(self) -> bool:
-        """Whether only what closer replays confirm is claimed."""
+        """True where only what closer replays confirm is claimed."""
         return self._confirmer is not None
 
     @property
@@ -106,13 +114,13 @@ class Rounds:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the engines decided by themselves and would surprise."""
-        slopes = () if self._slopes_engine is None else self._slopes_engine.notes
-        return (*self.engine.notes, *slopes)
+        """Decisions of the engines that a user may not expect."""
+        more = () if self._differentiate is None else self._differentiate.notes
+        return (*self.evaluate.notes, *more)
 
     @property
     def exhausted(self) -> bool:
-        """Whether a finite search has come to its end."""
+        """True where a finite search has come to its end."""
         return self._proposals.exhausted
 
     @property
@@ -130,82 +138,80 @@ class Rounds:
             self._proposals.tell_refused()
             self._keep()
             return
-        evaluation = self._evaluated(points, first)
-        violated = self._violated(evaluation, points, first)
-        rho = np.min(evaluation.rho, axis=1)
-        proper = evaluation.status == Status.OK
-        columns = self._columns(evaluation, rho, violated)
-        told = rho
+        verdicts = self._verdicts(points, first)
+        columns = self._columns(verdicts)
+        objective = verdicts.least
         if self._objective is not None:
-            told = self._objective(evaluation.rho, evaluation.rho < 0)
-        claimed = violated
+            objective = self._objective(verdicts.rho, verdicts.rho < 0)
+        claimed = verdicts.violated
         if self._confirmer is not None:
-            verdict, held = self._confirmed(self._confirmer, columns, first)
+            verdict, greatest = self._confirmed(self._confirmer, columns, first)
             columns["verdict"] = verdict
-            claimed = violated & ~np.isin(verdict, NOT_CLAIMED)
+            claimed = verdicts.violated & ~np.isin(verdict, NOT_CLAIMED)
             # A search that took them for failures would stay with them.
-            told = np.where(violated & ~claimed, held, told)
-            evaluation = _raised(evaluation, violated & ~claimed)
-        gradient = evaluation.gradient
-        self._proposals.tell(
-            told.astype(np.float32),  # Searches compute in float32, whatever the simulations do.
-            proper,
-            None if gradient is None else gradient.astype(np.float32),
-            None if evaluation.clauses is None else evaluation.clauses.astype(np.float32),
-            None if evaluation.slopes is None else evaluation.slopes.astype(np.float32),
-        )
+            refuted = verdicts.violated & ~claimed
+            objective = np.where(refuted, greatest, objective)
+            verdicts = _raised(verdicts, refuted)
+        self._tell(objective, verdicts)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
-        self.judged += int(np.sum(proper))
-        self.best = float(np.fmin(self.best, np.fmin.reduce(rho)))
+        self.judged += int(np.sum(verdicts.proper))
+        self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
+
+    def _tell(self, objective: Float[np.ndarray, " n"], verdicts: Verdicts) -> None:
+        """Tell the search what came of its points, in float32 whatever the simulations do."""
+
+        def single(values: np.ndarray | None) -> np.ndarray | None:
+            return None if values is None else values.astype(np.float32)
+
+        self._proposals.tell(
+            objective.astype(np.float32),
+            verdicts.proper,
+            single(verdicts.gradient),
+            single(verdicts.clauses),
+            single(verdicts.clause_gradients),
+        )
 
     def _confirmed(
         self, confirmer: Confirmer, columns: dict[str, Any], first: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The verdict of each row, empty where nothing is violated, and what speaks against it.
+        """Return the verdict of each row, and the greatest robustness of its replays.
 
-        That is the greatest robustness of the replays, and no less than next to nothing.
+        The verdict is empty where nothing is violated; the robustness is at least 1e-6.
         """
         rows = np.flatnonzero(columns["violated"])
         verdict = np.full(len(columns["rho"]), "", object)
-        held = np.full(len(verdict), np.nan)
+        greatest = np.full(len(verdict), np.nan)
         if not len(rows):
-            return verdict, held
+            return verdict, greatest
         if not confirmer.finer:
             # To simulate it again may take as long as the run, and would say little.
             verdict[rows] = "unchecked"
-            return verdict, held
+            return verdict, greatest
         own = {name: column[rows] for name, column in columns.items()}
         checked = confirmer(own, first + rows)
         verdict[rows] = checked.verdict
         if checked.rho:
-            greatest = np.nanmax(np.stack([*checked.rho.values(), own["rho"]]), axis=0)
-            held[rows] = np.maximum(greatest, 1e-6)
-        return verdict, held
+            most = np.nanmax(np.stack([*checked.rho.values(), own["rho"]]), axis=0)
+            greatest[rows] = np.maximum(most, 1e-6)
+        return verdict, greatest
 
-    def _evaluated(self, points: Any, first: int) -> Evaluation:
+    def _verdicts(self, points: Float[Any, "n d"], first: int) -> Verdicts:
         temperature = self._proposals.temperature
-        if self._slopes_engine is None or not self._proposals.differentiate:
-            if self._slopes_engine is not None:
-                temperature = 1.0  # Nothing is differentiated.
-            return self.engine.evaluate(points, self.simulation_key, first, temperature)
-        engine = self._slopes_engine
-        compiled = engine.compile_seconds
-        parts = [
-            engine.evaluate(
-                points[start : start + engine.batch],
-                self.simulation_key,
-                first + start,
-                temperature[start : start + engine.batch],
-            )
-            for start in range(0, len(points), engine.batch)
-        ]
-        self.compile_seconds += engine.compile_seconds - compiled
-        if len(parts) == 1:
-            return parts[0]
-        # Messages and Boolean verdicts are those of black boxes, which have no slopes.
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        compiled = self.evaluate.compile_seconds
+        if self._differentiate is None:
+            verdicts = self.evaluate(points, temperature, first)
+        elif not self._proposals.differentiate:
+            verdicts = self.evaluate(points, first=first)
+        else:
+            compiled = self._differentiate.compile_seconds
+            verdicts = self._differentiate(points, temperature, first)
+            self.compile_seconds += self._differentiate.compile_seconds - compiled
+            return verdicts
+        # A robustness of exactly zero compiles a program of its own.
+        self.compile_seconds += self.evaluate.compile_seconds - compiled
+        return verdicts
 
     def warm(self, table: "pd.DataFrame") -> None:
         """Let the search learn from the rows of an earlier table."""
@@ -270,34 +276,33 @@ class Rounds:
             seen = self._confirmer
             self.snapshot["confirmer"] = np.array([seen.examined, seen.band], np.float64)
 
-    def _violated(self, evaluation: Evaluation, points: Any, first: int) -> np.ndarray:
-        compiled = getattr(self.engine, "compile_seconds", 0.0)
-        found = violated(self.engine, evaluation, points, self.simulation_key, first)
-        self.compile_seconds += getattr(self.engine, "compile_seconds", 0.0) - compiled
-        return found
-
-    def _columns(self, evaluation: Evaluation, rho: Any, violated: Any) -> dict[str, Any]:
-        columns: dict[str, Any] = {**self.problem.space.rows(evaluation.features), "rho": rho}
+    def _columns(self, verdicts: Verdicts) -> dict[str, np.ndarray]:
+        """Return the columns of the table, as the rows are before they are confirmed."""
+        space, count = self.problem.space, len(verdicts.status)
+        assert verdicts.features is not None
+        columns: dict[str, np.ndarray] = {**space.rows(verdicts.features), "rho": verdicts.least}
         if len(self.problem.formulas) > 1:
             for i, name in enumerate(self.problem.formulas):
-                columns[f"rho.{name}"] = evaluation.rho[:, i]
-        columns |= {"violated": violated, "status": STATUS_NAMES[evaluation.status]}
-        if evaluation.gradient is not None:
-            columns["gradient_finite"] = np.all(np.isfinite(evaluation.gradient), axis=1)
-        if self._slopes_engine is not None:
-            slopes, count = evaluation.slopes, len(rho)
-            columns["differentiated"] = np.full(count, slopes is not None)
+                columns[f"rho.{name}"] = verdicts.rho[:, i]
+        columns |= {"violated": verdicts.violated, "status": STATUS_NAMES[verdicts.status]}
+        if verdicts.gradient is not None:
+            columns["gradient_finite"] = np.all(np.isfinite(verdicts.gradient), axis=1)
+        if self._differentiate is not None:
+            clause_gradients = verdicts.clause_gradients
+            columns["differentiated"] = np.full(count, clause_gradients is not None)
             columns["gradient_finite"] = (
-                np.ones(count, bool) if slopes is None else np.all(np.isfinite(slopes), axis=(1, 2))
+                np.ones(count, bool)
+                if clause_gradients is None
+                else np.all(np.isfinite(clause_gradients), axis=(1, 2))
             )
-        if evaluation.messages is not None:
-            columns["message"] = np.array(evaluation.messages, dtype=object)
+        if verdicts.messages is not None:
+            columns["message"] = np.array(verdicts.messages, dtype=object)
         return columns
 
 
-def _raised(evaluation: Evaluation, rows: np.ndarray) -> Evaluation:
-    """The same with clauses that are not broken in these rows."""
-    if evaluation.clauses is None or not rows.any():
-        return evaluation
-    lift = np.where(rows, 1e-6 - np.max(evaluation.clauses, axis=1), 0.0)
-    return evaluation._replace(clauses=evaluation.clauses + lift[:, None])
+def _raised(verdicts: Verdicts, rows: Bool[np.ndarray, " n"]) -> Verdicts:
+    """Raise the clauses of these rows until they are not broken."""
+    if verdicts.clauses is None or not rows.any():
+        return verdicts
+    lift = np.where(rows, 1e-6 - np.max(verdicts.clauses, axis=1), 0.0)
+    return verdicts._replace(clauses=verdicts.clauses + lift[:, None])

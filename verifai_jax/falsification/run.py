@@ -12,20 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
 
-from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
-from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_features, format_percent
-from verifai_jax.core.trace import Status, Trace
-from verifai_jax.evaluation.engine import judge, verdict
+from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import read_snapshot, write_snapshot
 from verifai_jax.falsification.table import ErrorTable
-from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -36,49 +30,6 @@ if TYPE_CHECKING:
 
 RECORD = "run.json"
 FORMAT = 1
-
-
-@dataclass(frozen=True)
-class Replay:
-    """One simulation, looked at again.
-
-    `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
-    random key of the simulation.
-    """
-
-    problem: Problem
-    row: int | None
-    features: dict[str, Any]
-    trace: Trace
-    rho: dict[str, float]
-    status: Status
-    key: Key[Array, ""] | None = None
-
-    @property
-    def violated(self) -> bool:
-        """Whether the simulation ended properly and breaks a formula."""
-        if self.status != Status.OK or min(self.rho.values()) != 0:
-            return self.status == Status.OK and min(self.rho.values()) < 0
-        return not bool(jnp.all(verdict(self.problem, self.trace)))
-
-    @property
-    def worst(self) -> str:
-        """Name of the formula with the least robustness."""
-        return min(self.rho, key=lambda name: float(np.nan_to_num(self.rho[name], nan=np.inf)))
-
-    def explain(self) -> Explanation:
-        """Which predicate decides the worst formula, when, and through which sub-formulas.
-
-        **Raises:** `ValueError` for a simulation without a verdict.
-        """
-        if self.status != Status.OK:
-            raise ValueError(f"no verdict to explain: the simulation is {self.status.name.lower()}")
-        formula = self.problem.formulas[self.worst]
-        return explain(formula, self.trace, end=self.problem.end)
-
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the signals with the violated bound and instant marked; returns the figure."""
-        return late("verifai_jax.plotting.replay", "plot_replay")(self, path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +137,7 @@ class Run:
 
     def analyze(self, **options: Any) -> Any:
         """What the table says: rules, importance, clusters, coverage; see `analysis.analyze`."""
-        return late("verifai_jax.analysis.overview", "analyze")(self, **options)
+        return late("verifai_jax.analysis", "analyze")(self, **options)
 
     def replay(
         self, row: "int | pd.Series | Mapping[str, Any]", precision: str | None = None
@@ -234,42 +185,6 @@ class Run:
 
     def __repr__(self) -> str:
         return self.summary()
-
-
-def replay(
-    problem: Problem,
-    row: Any,
-    key: Key[Array, ""],
-    number: int | None = None,
-    precision: str = "float32",
-) -> Replay:
-    """Simulate the features of `row` with the random key that simulation `number` had.
-
-    **Raises:** `ValueError` for a precision other than float32 and float64.
-    """
-    key = simulation_key(key, 0 if number is None else number)
-    with in_precision(precision):
-        features = problem.space.from_row(row)
-        if problem.black_box:
-            trace = problem.system(features, key)
-        else:
-            precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
-            trace = jax.jit(problem.system)(precise, key)
-        rho, status = jax.jit(judge, static_argnums=0)(problem, trace)
-        return Replay(
-            problem=problem,
-            row=number,
-            features=features,
-            trace=trace.trim(),
-            rho={name: float(value) for name, value in zip(problem.formulas, rho, strict=True)},
-            status=Status(int(status)),
-            key=key,
-        )
-
-
-def _cast(leaf: Any, precision: str) -> Any:
-    leaf = jnp.asarray(leaf)
-    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
 
 
 def write_record(run: Run, folder: Path) -> None:

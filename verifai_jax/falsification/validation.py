@@ -12,7 +12,7 @@ from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
-from verifai_jax.problem.dependence import informative
+from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.stopping import StoppingRule
@@ -124,7 +124,7 @@ def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
         why = "a priority has no gradient"
     elif not len(problem.space.cube.continuous):
         why = "all features are discrete"
-    elif not informative(problem):
+    elif not has_gradient(problem):
         why = "the robustness is constant almost everywhere"
     else:
         return search, ()

@@ -9,7 +9,7 @@ from verifai_jax.plotting.mujoco_scene import can_draw, film, record
 from verifai_jax.plotting.style import new_figure
 
 if TYPE_CHECKING:
-    from verifai_jax.falsification.run import Replay
+    from verifai_jax.evaluation.replay import Replay
 
 FRAMES_PER_SECOND = 25
 MOST_FRAMES = 150

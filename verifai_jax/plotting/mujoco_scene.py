@@ -12,7 +12,7 @@ import copy
 import importlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,12 +23,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from verifai_jax.core.errors import require, unknown_name
+from verifai_jax.core.programs import Slot
 from verifai_jax.core.waveform import bound
 from verifai_jax.plotting.replay import decisive_instant
 from verifai_jax.systems.mujoco.system import MuJoCo
 
 if TYPE_CHECKING:
-    from verifai_jax.falsification.run import Replay
+    from verifai_jax.evaluation.replay import Replay
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -80,10 +81,7 @@ def record(replay: "Replay") -> Motion:
         raise ValueError(f"the system of problem {replay.problem.name!r} is no MuJoCo model")
     features, loop = bound(replay.features, system.duration), system.loop
     # Kept with the problem, as they are compiled once.
-    engines = replay.problem.engines
-    if "recorder" not in engines:
-        engines["recorder"] = _recorder(system)
-    simulate, placed = engines["recorder"]
+    simulate, placed = replay.problem.programs.get(RECORDERS, None, lambda: _recorder(system))
     clock = np.asarray(replay.trace.clock(), np.float64)
     samples = len(clock)
     precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
@@ -114,6 +112,10 @@ def record(replay: "Replay") -> Motion:
         f"{replay.problem.name}{row}: {verdict}",
         None if decided is None else decided[1],
     )
+
+
+RECORDERS: Slot[None, tuple[Callable[..., Any], Callable[..., Any]]] = Slot("recorders")
+"""Compiled functions that simulate one replay of a problem with its positions."""
 
 
 def _recorder(system: Any) -> tuple[Any, Any]:

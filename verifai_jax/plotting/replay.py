@@ -7,7 +7,7 @@ import numpy as np
 
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Trace
-from verifai_jax.falsification.run import Replay
+from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Formula, explain, robustness_signal
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal

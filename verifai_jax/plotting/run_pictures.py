@@ -11,7 +11,8 @@ from verifai_jax.plotting.robustness_history import plot_budget
 from verifai_jax.plotting.scatter import plot_features
 
 if TYPE_CHECKING:
-    from verifai_jax.falsification.run import Replay, Run
+    from verifai_jax.evaluation.replay import Replay
+    from verifai_jax.falsification.run import Run
 
 
 def draw_run(run: "Run", folder: str | Path) -> list[Path]:

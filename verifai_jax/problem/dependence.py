@@ -1,4 +1,4 @@
-"""Whether a problem's robustness has a slope at all, told without simulating.
+"""The dependence of a problem's robustness on its features, found without simulating.
 
 A signal that is a whole number (a gear, a count) or a truth value is constant between its jumps:
 its derivative is zero wherever there is one. Where formulas speak of nothing else, slopes would
@@ -11,14 +11,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
 
+DEPENDENCE: Slot[None, bool] = Slot("dependence")
+"""Whether the robustness of a problem depends differentiably on a feature."""
 
-def informative(problem: Problem) -> bool:
-    """Whether a monitored signal depends differentiably on a feature; traced once, and kept."""
-    if "informative" not in problem.engines:
-        problem.engines["informative"] = _depends(problem)
-    return problem.engines["informative"]
+
+def has_gradient(problem: Problem) -> bool:
+    """Return whether a monitored signal depends differentiably on a feature; traced once."""
+    return problem.programs.get(DEPENDENCE, None, lambda: _depends(problem))
 
 
 def _depends(problem: Problem) -> bool:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
+from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
@@ -47,7 +48,7 @@ class Problem:
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
 
     `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
-    `engines` what has been compiled for this problem.
+    `programs` what has been compiled for this problem.
 
     **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, nominal
     features outside the space, or a priority that names no formula or goes round in a circle.
@@ -64,7 +65,7 @@ class Problem:
     priority: Sequence[str] | Sequence[tuple[str, str]] | None = None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False, default=None)
-    engines: dict[Any, Any] = field(init=False, repr=False, default_factory=dict)
+    programs: ProgramCache = field(init=False, repr=False, default_factory=ProgramCache)
 
     if TYPE_CHECKING:
         # For type checkers: a dictionary and a function are stored as a space and a system.
@@ -139,10 +140,9 @@ class Problem:
         system = self.system
         if not system.backends or system.backend == backend:
             return self
-        made = self.engines.setdefault("backends", {})
-        if backend not in made:
-            made[backend] = replace(self, system=system.with_backend(backend))
-        return made[backend]
+        return self.programs.get(
+            BACKENDS, backend, lambda: replace(self, system=system.with_backend(backend))
+        )
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
         """The same problem with these features varied alone, all others at their nominal values.
@@ -191,6 +191,10 @@ class Problem:
             lines.append(f"  {name}: {formula}")
         lines.append(f"  features: {', '.join(self.space.columns)}")
         return "\n".join(lines)
+
+
+BACKENDS: Slot[str, Problem] = Slot("backends")
+"""The same problem on each backend of its system."""
 
 
 def _rulebook(priority: Any, formulas: Mapping[str, Formula]) -> Rulebook:

@@ -18,16 +18,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.engine import judge, verdict
+from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.inputs import WithParameters
+from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.features import FeatureSpace
-from verifai_jax.mtl import robustness, smooth
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import as_system
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 ROWS = 64
 """Rows of a table made at a time, so that one shape compiles."""
+MOST_DIFFERENTIATED = 64
+"""Simulations differentiated at a time by arrays of parameters."""
 
 
 class Pairs(NamedTuple):
@@ -136,16 +138,16 @@ class FeatureParameters:
         happens = accepted(self.problem.space, rows)
         evaluate = self._values if temperature is None else self._slopes
         assert evaluate is not None
-        found = evaluate(rows[happens], 1.0 if temperature is None else temperature)
-        self.without_verdict += int(np.sum(~found.proper))
+        verdicts = evaluate(rows[happens], 1.0 if temperature is None else temperature)
+        self.without_verdict += int(np.sum(~verdicts.proper))
         rho = np.full(k * n, np.inf)
-        rho[happens] = np.where(found.proper, found.rho, np.nan)
+        rho[happens] = np.where(verdicts.proper, verdicts.least, np.nan)
         failing, proper = np.zeros(k * n, bool), np.ones(k * n, bool)
-        failing[happens], proper[happens] = found.failing, found.proper
+        failing[happens], proper[happens] = verdicts.violated, verdicts.proper
         slopes: Any = (None, None)
-        if temperature is not None and found.gradient is not None:
+        if temperature is not None and verdicts.gradient is not None:
             whole = np.zeros((k * n, d))
-            whole[happens] = _finite(found.gradient, found.proper)
+            whole[happens] = _finite(verdicts.gradient, verdicts.proper)
             whole = whole.reshape(k, n, d)
             slopes = whole[..., self.mine], whole[..., self.theirs]
         return Pairs(*(x.reshape(k, n) for x in (rho, failing, proper)), *slopes)
@@ -244,11 +246,13 @@ class ArrayParameters:
                 "the parameters features of the space, and name them"
             )
         theta = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
+
+        def judged(theta: Array, features: PyTree, key: Array) -> PyTree:
+            system = self.system_of(self._restore(theta))
+            return trace_verdict(self.problem, system(features, key))
+
         try:
-            jax.eval_shape(
-                lambda t, f, k: judge(self.problem, self.system_of(self._restore(t))(f, k)),
-                theta, features, key,
-            )  # fmt: skip
+            jax.eval_shape(judged, theta, features, key)
         except Exception as error:
             raise ValueError(
                 "system_of(parameters) must make a system that JAX can trace in the parameters "
@@ -279,22 +283,19 @@ class ArrayParameters:
         if temperature is not None:
             slopes = np.zeros((len(rows), self.dim)), np.zeros((len(rows), space.dim))
         places = np.flatnonzero(happens)
-        # One slope of each row is kept, which is as long as the parameters.
-        lanes = self.batch if temperature is None else min(self.batch, 64)
-        program = self._values if temperature is None else self._slopes
-        for start in range(0, len(places), lanes):
-            these = places[start : start + lanes]
-            u = rows[np.pad(these, (0, lanes - len(these)), mode="edge")]
-            first = np.int32(self.simulations)
-            found, gradient = program(theta, u, self._key, first, np.float32(temperature or 1.0))
-            least, status, breaks = (np.asarray(x)[: len(these)] for x in found)
-            ended = status == Status.OK
-            rho[these] = np.where(ended, least, np.nan)
-            failing[these], proper[these] = breaks & ended, ended
-            for whole, part in zip(slopes, gradient, strict=False):
-                whole[these] = _finite(np.asarray(part)[: len(these)], ended)
+        engine = self._values if temperature is None else self._gradients
+        for start in range(0, len(places), engine.batch):
+            these = places[start : start + engine.batch]
+            verdicts = engine.evaluate(
+                rows[these], self._key, self.simulations, temperature or 1.0, shared=theta
+            )
+            rho[these] = np.where(verdicts.proper, verdicts.least, np.nan)
+            failing[these], proper[these] = verdicts.violated, verdicts.proper
+            if verdicts.gradient is not None:
+                usable = _finite(verdicts.gradient, verdicts.proper)
+                slopes[0][these], slopes[1][these] = usable[:, : self.dim], usable[:, self.dim :]
             self.simulations += len(these)
-            self.without_verdict += int(np.sum(~ended))
+            self.without_verdict += int(np.sum(~verdicts.proper))
         return Pairs(rho, failing, proper, *slopes)
 
     def values(self, theta: Float[np.ndarray, " p"]) -> Any:
@@ -306,42 +307,19 @@ class ArrayParameters:
         return replace(self.problem, system=self.system_of(self.values(theta)))
 
     @cached_property
-    def _values(self) -> Any:
-        return self._program(lambda theta, u, key, temperature: (self._row(theta, u, key)[1], ()))
+    def _values(self) -> Engine:
+        return self._engine(self.batch, gradient=False)
 
     @cached_property
-    def _slopes(self) -> Any:
-        def row(theta: Any, u: Any, key: Any, temperature: Any) -> Any:
-            def objective(theta: Any, u: Any) -> Any:
-                trace, told = self._row(theta, u, key)
-                semantics = smooth(temperature.astype(u.dtype))
-                smoothed = [
-                    robustness(formula, trace, semantics, end=self.problem.end)
-                    for formula in self.problem.formulas.values()
-                ]
-                return jnp.min(jnp.stack(smoothed)), told
+    def _gradients(self) -> Engine:
+        # The gradient of each row is kept, which is as long as the parameters.
+        return self._engine(min(self.batch, MOST_DIFFERENTIATED), gradient=True)
 
-            gradient, told = jax.grad(objective, argnums=(0, 1), has_aux=True)(theta, u)
-            return told, gradient
-
-        return self._program(row)
-
-    def _row(self, theta: Any, u: Any, key: Any) -> Any:
-        system = self.system_of(self._restore(theta))
-        trace = system(self.problem.space.unflatten(u), key).hold()
-        rho, status = judge(self.problem, trace)
-        # At exactly zero the comparator decides.
-        holds = verdict(self.problem, trace)
-        return trace, (jnp.min(rho), status, jnp.any((rho < 0) | ((rho == 0) & ~holds)))
-
-    def _program(self, row: Callable[..., Any]) -> Any:
-        def program(theta: Any, u: Any, key: Any, first: Any, temperature: Any) -> Any:
-            numbers = first + jnp.arange(len(u), dtype=jnp.int32)
-            keys = jax.vmap(lambda number: simulation_key(key, number))(numbers)
-            cast = theta.astype(self.precision), u.astype(self.precision)
-            return jax.vmap(row, in_axes=(None, 0, 0, None))(*cast, keys, temperature)
-
-        return jax.jit(program)
+    def _engine(self, batch: int, gradient: bool) -> Engine:
+        inputs = WithParameters(
+            self.problem, self.dim, lambda theta: self.system_of(self._restore(theta))
+        )
+        return Engine(self.problem, batch, gradient, precision=self.precision, inputs=inputs)
 
 
 Parametric = FeatureParameters | ArrayParameters

@@ -16,12 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
-from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.engine import engine_for
-from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -81,10 +79,7 @@ class Simulator:
         problem = resolved(problem, gradient=gradient, batch=batch).problem
         problem.check()
         self.batch = batch
-        self.engine = (
-            HostEngine(problem) if problem.black_box else engine_for(problem, batch, gradient)
-        )
-        self.key = run_keys(seed)[1]
+        self._evaluate = Evaluator(problem, batch, gradient=gradient, seed=seed)
         self.column = None if of is None else list(problem.formulas).index(of)
         self.done = self.dropped = 0
         self.gradients: list[Any] = []
@@ -93,15 +88,10 @@ class Simulator:
         self, u: Float[np.ndarray, "n d"], first: int, temperature: float = 1.0
     ) -> Float[np.ndarray, " n"]:
         """Robustness `[n]`, NaN without a verdict; row `i` has the random key `first + i`."""
-        parts = []
-        for begin in range(0, len(u), self.batch):
-            chunk: Any = np.asarray(u[begin : begin + self.batch], np.float32)
-            done = self.engine.evaluate(chunk, self.key, first + begin, temperature)
-            parts.append(
-                np.min(done.rho, axis=1) if self.column is None else done.rho[:, self.column]
-            )
-            self.gradients.append(done.gradient)
-        rho = np.concatenate(parts).astype(np.float64)
+        verdicts = self._evaluate(u, temperature, first)
+        self.gradients.append(verdicts.gradient)
+        rho = verdicts.least if self.column is None else verdicts.rho[:, self.column]
+        rho = rho.astype(np.float64)
         rho[~np.isfinite(rho)] = np.nan
         self.done += len(rho)
         self.dropped += int(np.sum(np.isnan(rho)))

@@ -1,0 +1,115 @@
+"""The inputs of a simulation, as an engine takes them: how they become features and a system.
+
+    CubePoints(problem)                                 # points of the unit cube
+    TableRows(refiner, formats)                         # features of a table, at a finer step
+    WithParameters(problem, restore, system_of, start)  # points, and parameters that all share
+
+An engine compiles one program for each kind of inputs; everything else about it is the same.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from verifai_jax.problem.problem import Problem
+
+
+class Inputs(abc.ABC):
+    """What one row is given, and what all rows share; both are pytrees that JAX traces."""
+
+    row_form: PyTree
+    """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""
+    shared_form: PyTree = ()
+    """The same of what all rows share."""
+    dim: int = 0
+    """Coordinates by which the robustness may be differentiated."""
+    keeps_features: bool = False
+    """Whether the simulated features are part of the results."""
+    streaming: bool = False
+    """Whether the monitor may travel with the rollout, where the system allows it."""
+
+    @abc.abstractmethod
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        """Return what the robustness is differentiated by, in this precision."""
+
+    @abc.abstractmethod
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        """Return the features and the system to simulate."""
+
+
+class CubePoints(Inputs):
+    """Points of the unit cube of a problem's feature space."""
+
+    keeps_features = True
+    streaming = True
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.dim = problem.space.dim
+        self.row_form = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return row.astype(precision)
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        return self.problem.space.unflatten(coordinates), self.problem.system
+
+
+class TableRows(Inputs):
+    """Features as a table holds them, simulated by a system that depends on a shared number.
+
+    **Arguments:**
+
+    - `form`: the features of one row, as `jax.ShapeDtypeStruct`s in the engine's precision.
+    - `system_at`: the system for the shared number, a `factor` of refinement.
+    """
+
+    def __init__(self, form: PyTree, system_at: Callable[[Any], Callable[..., Any]]) -> None:
+        self.row_form, self.system_at = form, system_at
+        self.shared_form = jax.ShapeDtypeStruct((), jnp.int32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return jnp.zeros(0, precision)
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        return row, self.system_at(shared)
+
+
+class WithParameters(Inputs):
+    """Points of the unit cube, and a vector of parameters of the system that all rows share.
+
+    The coordinates are the parameters first and the point behind them.
+
+    **Arguments:**
+
+    - `problem`: its space and formulas.
+    - `size`: how many parameters.
+    - `system_of`: the system of a vector of parameters.
+    """
+
+    def __init__(
+        self, problem: Problem, size: int, system_of: Callable[[Array], Callable[..., Any]]
+    ) -> None:
+        self.problem, self.size, self.system_of = problem, size, system_of
+        self.dim = size + problem.space.dim
+        self.row_form = jax.ShapeDtypeStruct((problem.space.dim,), jnp.float32)
+        self.shared_form = jax.ShapeDtypeStruct((size,), jnp.float32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return jnp.concatenate([shared.astype(precision), row.astype(precision)])
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        theta, u = coordinates[: self.size], coordinates[self.size :]
+        return self.problem.space.unflatten(u), self.system_of(theta)

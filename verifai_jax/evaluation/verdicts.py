@@ -1,0 +1,150 @@
+"""The result of every simulation, and the law that says which of them violate the property.
+
+    verdicts = engine.evaluate(u, key, first=0)
+    verdicts.rho, verdicts.status                       # [n, formulas], [n]
+    verdicts.violated, verdicts.least                   # [n], [n]
+
+A simulation violates the property if it ended properly and breaks a formula: with a negative
+robustness, or with one of exactly zero where the Boolean semantics say so (`x >= 0` holds at zero,
+`x > 0` does not). This file is the only one that decides it.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.mtl import robustness, satisfied
+from verifai_jax.problem.problem import Problem
+
+
+class Verdicts(NamedTuple):
+    """Verdicts of `n` simulations, on the host, one row each.
+
+    - `rho`: `[n, formulas]`, hard robustness; NaN where the status is not OK.
+    - `status`: `[n]`, codes of `Status`.
+    - `violated`: `[n]`, whether the simulation ended properly and breaks a formula.
+    - `features`: the simulated values, `[n, ...]` each; None where the caller has them already.
+    - `gradient`: `[n, d]`, of the least smooth robustness by the coordinates; None unless wanted.
+    - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
+      broken (`mtl.clauses`); None unless wanted.
+    - `clause_gradients`: `[n, clauses, d]`, of the clauses by the coordinates; None unless wanted.
+    - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
+      JAX traces.
+    """
+
+    rho: Float[np.ndarray, "n formulas"]
+    status: Int[np.ndarray, " n"]
+    violated: Bool[np.ndarray, " n"]
+    features: dict[str, PyTree] | None = None
+    gradient: Float[np.ndarray, "n d"] | None = None
+    clauses: Float[np.ndarray, "n clauses"] | None = None
+    clause_gradients: Float[np.ndarray, "n clauses d"] | None = None
+    messages: list[str] | None = None
+
+    @property
+    def proper(self) -> Bool[np.ndarray, " n"]:
+        """Rows whose simulation ended properly and so has a verdict."""
+        return self.status == Status.OK
+
+    @property
+    def least(self) -> Float[np.ndarray, " n"]:
+        """The least robustness over the formulas; NaN without a verdict."""
+        return np.min(self.rho, axis=1)
+
+    @classmethod
+    def nothing(cls, formulas: int, dim: int) -> "Verdicts":
+        """Return the verdicts of no simulation."""
+        rho, no = np.zeros((0, formulas), np.float32), np.zeros(0, bool)
+        gradient = np.zeros((0, dim), np.float32)
+        return cls(rho, np.zeros(0, np.int32), no, gradient=gradient, messages=[])
+
+    @classmethod
+    def concatenate(cls, parts: "Sequence[Verdicts]") -> "Verdicts":
+        """Join the rows of several batches that were evaluated alike."""
+        if len(parts) == 1:
+            return parts[0]
+        rows = [part._replace(messages=None) for part in parts]
+        whole: Verdicts = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
+        if all(part.messages is None for part in parts):
+            return whole
+        messages = [m for part in parts for m in part.messages or [""] * len(part.status)]
+        return whole._replace(messages=messages)
+
+
+class RowVerdict(NamedTuple):
+    """The verdict of one simulation of a host system, before those of its batch are complete.
+
+    - `rho`: `[formulas]`, or one number that stands for all; NaN without a verdict.
+    - `status`: a code of `Status`.
+    - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
+    - `message`: what the system raised; empty where nothing.
+    """
+
+    rho: Float[np.ndarray, " formulas"] | Float[np.ndarray, ""]
+    status: int
+    holds: Bool[np.ndarray, " formulas"] | Bool[np.ndarray, ""]
+    message: str
+
+
+def violations(
+    rho: Float[np.ndarray, "n formulas"],
+    status: Int[np.ndarray, " n"],
+    holds: Callable[[], Bool[np.ndarray, "n formulas"]],
+) -> Bool[np.ndarray, " n"]:
+    """Decide which simulations violate the property.
+
+    **Arguments:**
+
+    - `rho`: hard robustness; NaN where there is no verdict.
+    - `status`: codes of `Status`.
+    - `holds`: gives the Boolean semantics of each formula; called only where a robustness of
+      exactly zero needs it, because it may have to simulate again.
+
+    **Returns:** for each simulation whether it ended properly and breaks a formula.
+    """
+    proper = status == Status.OK
+    broken = proper & np.any(rho < 0, axis=1)
+    undecided = proper & ~broken & np.any(rho == 0, axis=1)
+    if undecided.any():
+        broken |= undecided & ~np.all(holds(), axis=1)
+    return broken
+
+
+def trace_verdict(
+    problem: Problem, trace: Trace
+) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
+    """Return the hard robustness of each formula on one trace, and the status; traced by JAX.
+
+    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN.
+    """
+    trace = trace.hold()
+    rho = jnp.stack(
+        [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
+    )
+    finite = jnp.array(True)
+    for name in problem.monitored:
+        signal = jnp.asarray(trace.signals[name])
+        if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
+            finite &= jnp.all(jnp.isfinite(signal))
+    status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
+    return with_status(rho, status, finite)
+
+
+def boolean_semantics(problem: Problem, trace: Trace) -> Bool[Array, " formulas"]:
+    """Return whether each formula holds on one trace; traced by JAX."""
+    trace = trace.hold()
+    formulas = problem.formulas.values()
+    return jnp.stack([satisfied(formula, trace, end=problem.end) for formula in formulas])
+
+
+def with_status(
+    rho: Float[Array, " formulas"], status: Int[Array, ""], finite: Bool[Array, ""]
+) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
+    """Return robustness and status given whether all signals are finite; NaN unless it is OK."""
+    status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
+    return jnp.where(status == Status.OK, rho, jnp.nan), status
