@@ -61,7 +61,7 @@ class TestFeatures:
         np.testing.assert_allclose(box.to_unit([1.5, 2.5]), [0.25, 0.25])
         np.testing.assert_allclose(box.from_unit(jnp.array([0.25, 0.25])), [1.5, 2.5])
         assert vj.Box.from_intervals((3, 1)) == vj.Box(1, 3)
-        assert vj.DiscreteBox.from_interval(0.2, 3.9) == vj.DiscreteBox(1, 3)
+        assert vj.DiscreteBox.from_intervals((0.2, 3.9)) == vj.DiscreteBox(1, 3)
         with pytest.raises(ValueError, match="low must be below high"):
             vj.Box(3, 1)
         with pytest.raises(ValueError, match="an interval is a pair of numbers"):

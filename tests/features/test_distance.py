@@ -7,7 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Normal, Signal
+from verifai_jax.features import (
+    Array,
+    Box,
+    Categorical,
+    Constant,
+    DiscreteBox,
+    FeatureSpace,
+    Normal,
+    Signal,
+    Struct,
+)
 
 SPACE = FeatureSpace(
     {
@@ -43,6 +53,47 @@ def test_known_values(changes, wanted):
     assert float(SPACE.distance(one, other)) == pytest.approx(wanted, abs=1e-6)
 
 
+def test_values_as_a_person_writes_them():
+    cars = {"n": Array(Struct({"lane": Categorical("left", "right"), "v": Box(0, 10)}), 2)}
+    space = FeatureSpace(
+        {**SPACE.domains, **cars, "g": Constant(9.8), "at": DiscreteBox([0, 0], [2, 4])}
+    )
+    written = {
+        **BASE,
+        "n": [{"lane": "left", "v": 2}, {"lane": "right", "v": 5.0}],
+        "at": [1, 4],
+    }
+    changes = {
+        "x": np.float64(7),
+        "alg": "c",
+        "n": {"lane": ["left", "left"], "v": [2, 5]},
+        "at": (2, 3),
+    }
+    one, other = written, {**written, **changes}
+    expected = float(space.distance(space.coerce(one), space.coerce(other)))
+    assert expected == pytest.approx(np.sqrt(0.5**2 + 1 + 1 + 0.5**2 + 0.25**2))
+    assert float(space.distance(one, other)) == expected
+    assert float(space.distance(space.coerce(one), other)) == expected
+    assert float(space.distance(one, one)) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"alg": "d"}, "alg must be one of 'a', 'b', 'c'; got 'd'"),
+        ({"x": "far"}, "x must be a number; got 'far'"),
+        ({"gear": 2.5}, "gear must be an integer from 1 to 5; got 2.5"),
+        ({"cars": [0.1, 2]}, r"cars\[1\] must lie in \[0, 1\]; got 2"),
+        ({"speed": 1}, "unknown feature 'speed'"),
+    ],
+)
+def test_values_outside_the_space_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        SPACE.distance(BASE, {**BASE, **changes})
+    with pytest.raises(ValueError, match="gear is missing"):
+        SPACE.distance({name: BASE[name] for name in BASE if name != "gear"}, BASE)
+
+
 points = st.lists(st.floats(0, 1, width=32), min_size=SPACE.dim, max_size=SPACE.dim)
 
 
@@ -72,7 +123,7 @@ def test_is_zero_only_between_the_same(u, i):
     assert (float(SPACE.distance(a, b)) == 0) == same
 
 
-def test_slopes_are_finite_between_the_same():
+def test_derivatives_are_finite_between_the_same():
     u = jnp.full(SPACE.dim, 0.3)
     slope = jax.grad(lambda v: SPACE.distance(SPACE.unflatten(u), SPACE.unflatten(v)))
     assert np.all(np.isfinite(slope(u)))

@@ -17,6 +17,9 @@ DOMAINS = [
     DiscreteBox(1, 4),
     DiscreteBox(-3, -3),
     DiscreteBox(0, 2**20 - 1),
+    DiscreteBox([0, 0], [3, 5]),
+    DiscreteBox([-(2**31), 7], [-(2**31) + 9, 7]),
+    Array(DiscreteBox([1, 2, 3], [3, 2, 5]), length=2),
     Categorical("ppo", "sac"),
     Categorical(0.1, 0.25, 7),
     Categorical(3, 1, 2),
@@ -73,6 +76,21 @@ class TestKnownValues:
         values = jax.vmap(die.from_unit)(u[:, None])
         assert values.tolist() == [1, 1, 2, 4, 6, 6]
         assert values.dtype == jnp.int32
+
+    def test_vectors_of_integers(self):
+        domain = DiscreteBox([0, -2], [3, 5])
+        assert domain.levels == (4, 8)
+        assert domain.columns("at") == ("at[0]", "at[1]")
+        value = domain.from_unit(jnp.array([0.5, 1.0]))
+        assert (value.tolist(), value.dtype) == ([2, 5], jnp.int32)
+        np.testing.assert_allclose(domain.to_unit(value), [2.5 / 4, 7.5 / 8])
+        np.testing.assert_array_equal(domain.coerce((1, -1)), [1, -1])
+        rows = domain.to_columns(np.array([[2, 5], [0, -2]], np.int32), "at")
+        assert {name: rows[name].tolist() for name in rows} == {"at[0]": [2, 0], "at[1]": [5, -2]}
+        stored = domain.from_columns({"at[0]": 2, "at[1]": 5.0}, "at")
+        assert (stored.tolist(), stored.dtype) == ([2, 5], jnp.int32)
+        assert DiscreteBox.from_intervals((0, 3), (5, -2.5)) == domain
+        assert DiscreteBox(np.array([0, -2]), np.array([3, 5])) == domain
         assert float(die.to_unit(jnp.int32(1))[0]) == pytest.approx(1 / 12)
 
     def test_choices(self):
@@ -193,6 +211,13 @@ class TestRefused:
             (lambda: DiscreteBox(4, 1), r"not be above high.*got \(low=4, high=1\)"),
             (lambda: DiscreteBox(0.2, 3), r"must be integers; got \(low=0.2, high=3\)"),
             (lambda: DiscreteBox(0, float("nan")), "must be integers"),
+            (lambda: DiscreteBox(0, [1, 2]), "both ends of a DiscreteBox are numbers, or both are"),
+            (lambda: DiscreteBox([0], [1, 2]), r"one length; got \(low=\[0\], high=\[1, 2\]\)"),
+            (lambda: DiscreteBox([], []), "a vector DiscreteBox needs at least one entry"),
+            (lambda: DiscreteBox([0, 4], [1, 2]), r"not be above high.*got \(low=\[0, 4\]"),
+            (lambda: DiscreteBox([0, 0.5], [1, 2]), r"must be integers; got \(low=\[0, 0.5\]"),
+            (lambda: DiscreteBox([0, 0], [1, 2**20]), "at most 1048576 values"),
+            (lambda: DiscreteBox.from_intervals((0, 1, 2)), "an interval is a pair of numbers"),
             (lambda: DiscreteBox(0, 2**31), "fit into 32 bits"),
             (lambda: DiscreteBox(0, 2**20), "at most 1048576 values"),
             (lambda: Categorical(), "at least one choice; got none"),

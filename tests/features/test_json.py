@@ -41,6 +41,7 @@ choices = st.lists(
 leaves = st.one_of(
     real,
     st.builds(lambda low, width: DiscreteBox(low, low + width), numbers, widths),
+    st.builds(lambda low, width: DiscreteBox([low, 0], [low + width, 4]), numbers, widths),
     choices.map(lambda names: Categorical(*names)),
     st.lists(widths, min_size=2, max_size=4).map(
         lambda w: Categorical(*range(len(w)), weights=[x / sum(w) for x in w])

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import Halton, Uniform
+from verifai_jax.search import Halton, Uniform, from_json, to_json
 from verifai_jax.search.halton import halton_points, primes
 
 
@@ -47,6 +47,41 @@ class TestHalton:
     def test_equals_scipy(self):
         reference = stats.qmc.Halton(30, scramble=False).random(1001)[1:]
         np.testing.assert_allclose(points(Halton(False), 30, 1000), reference, atol=2e-7)
+
+    def test_points_and_bases_can_be_skipped(self):
+        # Conformance case halton-02: sample_index counts from 0 and its first point has index 1.
+        whole = points(Halton(scramble=False), 5, 40)
+        np.testing.assert_array_equal(points(Halton(skip_points=7), 5, 33), whole[7:])
+        np.testing.assert_array_equal(points(Halton(skip_bases=2), 3, 40), whole[:, 2:])
+        skipping = Halton(skip_points=2**31, skip_bases=4)
+        expected = [[exact_inverse(2**31 + i, base) for base in (11, 13)] for i in range(1, 9)]
+        np.testing.assert_allclose(points(skipping, 2, 8), expected, atol=2e-7)
+
+    def test_large_bases_are_scrambled_by_default(self):
+        plain = points(Halton(False, skip_bases=4), 5, 20)
+        assert not np.allclose(points(Halton(skip_bases=4), 5, 20), plain)
+        np.testing.assert_array_equal(
+            points(Halton(skip_bases=4), 4, 20), points(Halton(False, skip_bases=4), 4, 20)
+        )
+
+    def test_skipping_is_part_of_the_record_of_a_search(self):
+        search = Halton(skip_points=3, skip_bases=1)
+        assert from_json(to_json(search)) == search
+        # As it was recorded before there was anything to skip.
+        assert from_json({"name": "halton", "options": {"scramble": None}}) == Halton()
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            ({"skip_points": -1}, "skip_points must be an integer of at least 0; got -1"),
+            ({"skip_bases": 1.5}, r"skip_bases must be an integer of at least 0; got 1\.5"),
+            ({"skip_points": 2**31 + 1}, "skip_points must be at most 2147483648; got 2147483649"),
+            ({"skip_bases": 10**6}, "skip_bases must be at most 10000; got 1000000"),
+        ],
+    )
+    def test_what_cannot_be_skipped(self, options, message):
+        with pytest.raises(ValueError, match=message):
+            Halton(**options)
 
     def test_large_indices(self):
         index = [2**24 + 1, 123_456_789, 2**31 - 2, 2**31 - 1, 2**32 - 1]

@@ -1,28 +1,46 @@
-"""How much of a space its constraint accepts, and what is wrong with one that accepts nothing."""
+"""Measurement of the share of a space that its constraint accepts."""
 
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.text import format_percent
 
 SAMPLES = 65_536
+"""Samples of the prior at most."""
+
 BLOCK = 4096
+"""Samples of the prior at a time."""
+
 ENOUGH = 1000
 """Accepted samples after which the rate is known well enough."""
 
 
-def acceptance_rate(space: Any, seed: Any = 0) -> float:
-    """The share of the prior's samples that `space.where` accepts.
+def acceptance_rate(
+    where: Callable[[Float[Array, " d"]], Array],
+    accepts: Callable[[Float[np.ndarray, "n d"]], Bool[Array, " n"]],
+    names: Sequence[str],
+    dim: int,
+    seed: int | Key[Array, ""] = 0,
+) -> float:
+    """Estimate the share of the prior's samples that a constraint accepts.
+
+    **Arguments:**
+
+    - `where`: the constraint as a function of one point of the unit cube.
+    - `accepts`: the same for many points, compiled.
+    - `names`: of the features, for messages.
+    - `dim`: number of unit coordinates.
+    - `seed`: of the samples.
 
     **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
     accepts none of the samples.
     """
-    point = jax.ShapeDtypeStruct((space.dim,), jnp.float32)
     try:
-        answer = jax.eval_shape(lambda u: space.where(space.unflatten(u)), point)
+        answer = jax.eval_shape(where, jax.ShapeDtypeStruct((dim,), jnp.float32))
     except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
         raise ValueError(
             "where is traced by JAX, so it cannot use `and`, `or`, `not`, `if` or NumPy on "
@@ -30,7 +48,7 @@ def acceptance_rate(space: Any, seed: Any = 0) -> float:
         ) from error
     except Exception as error:
         raise ValueError(
-            f"where raised {type(error).__name__} for the features {list(space.domains)}: {error}"
+            f"where raised {type(error).__name__} for the features {list(names)}: {error}"
         ) from error
     if getattr(answer, "shape", None) != () or answer.dtype != jnp.bool_:
         shown = type(answer).__name__
@@ -38,11 +56,9 @@ def acceptance_rate(space: Any, seed: Any = 0) -> float:
             shown = f"shape {list(answer.shape)} of {answer.dtype}"
         raise ValueError(f"where must return one truth value; got {shown}")
     accepted = tried = 0
-    if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
-        seed = [int(word) for word in np.ravel(jax.random.key_data(seed))]
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(_entropy(seed))
     while tried < SAMPLES and accepted < ENOUGH:
-        accepted += int(np.sum(space.accepts_points(random.random((BLOCK, space.dim), np.float32))))
+        accepted += int(np.sum(accepts(random.random((BLOCK, dim), np.float32))))
         tried += BLOCK
     if not accepted:
         most = -np.log(0.05) / tried
@@ -52,3 +68,10 @@ def acceptance_rate(space: Any, seed: Any = 0) -> float:
             "narrower, or check the condition"
         )
     return accepted / tried
+
+
+def _entropy(seed: int | Key[Array, ""]) -> int | list[int]:
+    """Return the seed of NumPy's generator; that of a key are its words."""
+    if isinstance(seed, jax.Array) and jnp.issubdtype(seed.dtype, jax.dtypes.prng_key):
+        return [int(word) for word in np.ravel(jax.random.key_data(seed))]
+    return seed  # pyright: ignore[reportReturnType]

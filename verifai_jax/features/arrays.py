@@ -1,15 +1,15 @@
-"""Several features of one kind: a fixed number of them, or one that varies (`Array`)."""
+"""Several features of one kind, in a fixed or a varying number (`Array`)."""
 
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.features.domain import Domain, as_numbers, cell, centre, dotted, indexed
@@ -22,14 +22,23 @@ class Array(Domain):
     A value is stacked along a leading axis: an array `[length]` of a `Box`, a dictionary of such
     arrays of a `Struct`. With `length=(1, 3)` the number varies too, see `VariableArray`.
 
-    **Raises:** `ValueError` for a length that is not a positive integer; `TypeError` for something
-    that is no domain.
+    **Arguments:**
+
+    - `domain`: of each value.
+    - `length`: their number, or a pair with the least and the greatest number.
+
+    **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
+    `0 <= least <= most` with `most >= 1`; `TypeError` for something that is no domain.
     """
 
     domain: Domain
     length: int
 
-    def __new__(cls, domain: Domain, length: Any) -> Any:
+    @overload
+    def __new__(cls, domain: Domain, length: int) -> "Array": ...
+    @overload
+    def __new__(cls, domain: Domain, length: tuple[int, int] | list[int]) -> "VariableArray": ...
+    def __new__(cls, domain: Domain, length: object) -> "Array | VariableArray":
         if isinstance(length, tuple | list):
             return VariableArray(domain, *_ends(domain, length))
         return super().__new__(cls)
@@ -66,20 +75,20 @@ class Array(Domain):
             label for item in indexed(name, self.length) for label in self.domain.coordinates(item)
         )
 
-    def from_unit(self, u: Float[jax.Array, " size"]) -> Any:
+    def from_unit(self, u: Float[jax.Array, " size"]) -> PyTree:
         return jax.vmap(self.domain.from_unit)(u.reshape(self.length, self.domain.size))
 
-    def to_unit(self, value: Any) -> Float[jax.Array, " size"]:
+    def to_unit(self, value: PyTree) -> Float[jax.Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit, axis_size=self.length)(value))
 
-    def coerce(self, value: Any) -> Any:
+    def coerce(self, value: PyTree) -> PyTree:
         if _is_stacked(value):
             return self.domain.coerce(value)
         # As a person wrote it, which one item may do in another form than the next.
         items = [_element(value, i, self.length, "the array") for i in range(self.length)]
         return _stacked([self.domain.coerce(item) for item in items])
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         for i in range(self.length):
             self.domain.check(_element(value, i, self.length, name), f"{name}[{i}]")
 
@@ -88,14 +97,14 @@ class Array(Domain):
             column for item in indexed(name, self.length) for column in self.domain.columns(item)
         )
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+    def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
         columns: dict[str, np.ndarray] = {}
         for i, item in enumerate(indexed(name, self.length)):
             element = jax.tree.map(operator.itemgetter((slice(None), i)), values)
             columns |= self.domain.to_columns(element, item)
         return columns
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
         return _stacked(
             [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
         )
@@ -103,7 +112,7 @@ class Array(Domain):
     def refined(self, factor: int) -> "Array":
         return Array(self.domain.refined(factor), self.length)
 
-    def refine(self, value: Any, factor: int) -> Any:
+    def refine(self, value: PyTree, factor: int) -> PyTree:
         return jax.vmap(lambda item: self.domain.refine(item, factor), axis_size=self.length)(value)
 
     def __repr__(self) -> str:
@@ -113,30 +122,32 @@ class Array(Domain):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Items:
-    """The value of an array of variable length: all places, of which the first `length` count.
+    """The value of an array of variable length: all places, of which the first `length` are valid.
 
-    `values` is stacked along a leading axis as in an `Array` of the greatest length, so that every
-    simulation has the same shapes. `features["cars"]["x"]` are the `x` of all places; multiply by
-    `mask`, or use `jnp.where`. Places behind the length hold the middle of the item's domain.
+    - `values`: stacked along a leading axis as in an `Array` of the greatest length, so that every
+      simulation has the same shapes. Places behind the length hold the middle of the item's domain.
+    - `length`: the number of items that there are.
+
+    `features["cars"]["x"]` are the `x` of all places; multiply by `mask`, or use `jnp.where`.
     """
 
-    values: Any
+    values: PyTree
     length: Int[jax.Array, "*n"]
 
     @property
     def mask(self) -> Bool[jax.Array, "*n places"]:
-        """Which places count."""
+        """True at the places that hold an item."""
         places = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
         return jnp.arange(places) < jnp.asarray(self.length)[..., None]
 
-    def __getitem__(self, name: Any) -> Any:
+    def __getitem__(self, name: str) -> PyTree:
         return self.values[name]
 
-    def cleared(self, absent: Any) -> "Items":
-        """The same items, with `absent` at the places that do not count."""
+    def cleared(self, absent: PyTree) -> "Items":
+        """Return the same items, with `absent` at the places behind the length."""
         mask, axes = self.mask, jnp.ndim(self.length) + 1
 
-        def clear(leaf: Any, rest: Any) -> Any:
+        def clear(leaf: jax.Array, rest: jax.Array) -> jax.Array:
             counts = jnp.expand_dims(mask, tuple(range(axes, jnp.ndim(leaf))))
             return jnp.where(counts, leaf, jnp.asarray(rest, leaf.dtype))
 
@@ -149,7 +160,7 @@ class VariableArray(Domain):
 
     A value is an `Items`; a person may write a list of as many items as there are. The first
     coordinate is the length, each equally likely (none if `least == most`). In a table the column
-    `cars.length` says how many; the entries of absent items are empty (NaN or None).
+    `cars.length` holds the length; the entries of absent items are empty (NaN or None).
     """
 
     domain: Domain
@@ -203,17 +214,17 @@ class VariableArray(Domain):
             return units
         return jnp.concatenate([centre(value.length - self.least, self.levels[0]), units])
 
-    def coerce(self, value: Any) -> Items:
+    def coerce(self, value: PyTree) -> "Items":
         if isinstance(value, Items):
             items = Items(self.domain.coerce(value.values), jnp.asarray(value.length, jnp.int32))
             # Whatever stands behind the length must not make two of the same value.
             return items.cleared(self._absent)
-        items = [self.domain.coerce(item) for item in _listed(value, "the array")]
+        items = [self.domain.coerce(item) for item in _items(value, "the array")]
         length = jnp.asarray(len(items), jnp.int32)
         items += [self._absent] * (self.most - len(items))
         return Items(_stacked(items), length)
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         if isinstance(value, Items):
             length = int(value.length)
             items = [
@@ -221,7 +232,7 @@ class VariableArray(Domain):
                 for i in range(min(length, self.most))
             ]
         else:
-            items = _listed(value, name)
+            items = _items(value, name)
             length = len(items)
         if not self.least <= length <= self.most:
             raise ValueError(f"{name} must have {self.least} to {self.most} items; got {length}")
@@ -242,7 +253,7 @@ class VariableArray(Domain):
                 columns[column] = entries if i < self.least else _emptied(entries, length <= i)
         return columns
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Items:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Items:
         length = self.least
         if self._varies:
             number = as_numbers(row[f"{name}.length"], f"{name}.length").item()
@@ -266,8 +277,8 @@ class VariableArray(Domain):
         return Items(finer(value.values), value.length)
 
     @property
-    def _absent(self) -> Any:
-        """What a place behind the length holds."""
+    def _absent(self) -> PyTree:
+        """The value of a place behind the length."""
         return self.domain.from_unit(jnp.full(self.domain.size, 0.5))
 
     @property
@@ -278,22 +289,22 @@ class VariableArray(Domain):
         return f"Array({self.domain!r}, length=({self.least}, {self.most}))"
 
 
-def _is_stacked(value: Any) -> bool:
-    """Whether this is a value as `from_unit` gives it, and not one that a person wrote."""
+def _is_stacked(value: PyTree) -> bool:
+    """Return whether this is a value as `from_unit` gives it, and not one that a person wrote."""
     leaves = jax.tree.leaves(value, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
     return all(isinstance(leaf, jax.Array) for leaf in leaves)
 
 
-def _stacked(items: list[Any]) -> Any:
+def _stacked(items: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *items)
 
 
-def _check_domain(domain: Any) -> None:
+def _check_domain(domain: object) -> None:
     if not isinstance(domain, Domain):
         raise TypeError(f"an Array needs a domain, such as Box(0, 1); got {domain!r}")
 
 
-def _ends(domain: Any, length: Any) -> tuple[int, int]:
+def _ends(domain: object, length: tuple | list) -> tuple[int, int]:
     _check_domain(domain)
     whole = all(isinstance(n, int | np.integer) and not isinstance(n, bool) for n in length)
     if len(length) != 2 or not whole:
@@ -319,7 +330,7 @@ def _repeated(domain: Domain, count: int) -> tuple[int, ...]:
 
 
 def _emptied(entries: np.ndarray, absent: np.ndarray) -> np.ndarray:
-    """Entries of which some are absent, of one dtype whether or not there are such."""
+    """Return entries with empty ones where absent, in one dtype whether or not there are such."""
     if entries.dtype.kind in "iub":
         entries = entries.astype(np.float64)
     emptied = entries.copy()
@@ -327,8 +338,8 @@ def _emptied(entries: np.ndarray, absent: np.ndarray) -> np.ndarray:
     return emptied
 
 
-def _listed(value: Any, name: str) -> list[Any]:
-    """The items that a person wrote: one by one, or stacked as in an `Array`."""
+def _items(value: PyTree, name: str) -> list[PyTree]:
+    """Return the items that a person wrote: one by one, or stacked as in an `Array`."""
     if isinstance(value, Mapping):
         leaves = list(value.values())
         count = len(leaves[0]) if leaves and isinstance(leaves[0], Sequence | np.ndarray) else -1
@@ -338,8 +349,8 @@ def _listed(value: Any, name: str) -> list[Any]:
     return list(value)
 
 
-def _element(value: Any, i: int, length: int, name: str) -> Any:
-    """Element `i` of a stacked value."""
+def _element(value: PyTree, i: int, length: int, name: str) -> PyTree:
+    """Return element `i` of a stacked value."""
     if isinstance(value, Mapping):
         return {
             field: _element(leaf, i, length, dotted(name, field)) for field, leaf in value.items()

@@ -1,13 +1,14 @@
-"""Intervals: of real numbers (`Box`), of vectors (`Box`), of integers (`DiscreteBox`)."""
+"""Intervals of real numbers (`Box`) and of integers (`DiscreteBox`), and vectors of them."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     LEAST_REAL,
@@ -17,8 +18,6 @@ from verifai_jax.features.domain import (
     as_number,
     as_numbers,
     as_real,
-    cell,
-    centre,
     indexed,
     short,
 )
@@ -28,34 +27,24 @@ from verifai_jax.features.domain import (
 class Box(Domain):
     """Real numbers from `low` to `high`, uniform; vectors if the ends are sequences.
 
-    **Arguments:** `low < high`, two finite numbers or two sequences of one length.
+    `Box(-1, 1)`, `Box([0, 0], [10, 5])`. A value is a real number, or an array with shape
+    `[entries]`.
+
+    **Arguments:**
+
+    - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.
 
     **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
     farther apart or nearer than float32 can hold, or of different lengths.
     """
 
-    low: Any
-    high: Any
+    low: float | Sequence[float] | np.ndarray
+    high: float | Sequence[float] | np.ndarray
 
     def __post_init__(self) -> None:
         shown = f"got (low={self.low!r}, high={self.high!r})"
-        vector = [
-            isinstance(end, Sequence | np.ndarray) and not isinstance(end, str)
-            for end in (self.low, self.high)
-        ]
-        if vector[0] != vector[1]:
-            raise ValueError(f"both ends of a Box are numbers, or both are sequences; {shown}")
-        if not vector[0]:
-            object.__setattr__(self, "low", as_number(self.low, "low of a Box"))
-            object.__setattr__(self, "high", as_number(self.high, "high of a Box"))
-        else:
-            for end in ("low", "high"):
-                entries = [as_number(x, f"{end} of a Box") for x in getattr(self, end)]
-                object.__setattr__(self, end, tuple(entries))
-            if len(self.low) != len(self.high):
-                raise ValueError(f"low and high of a Box must have one length; {shown}")
-            if not self.low:
-                raise ValueError(f"a vector Box needs at least one entry; {shown}")
+        for name, end in zip(("low", "high"), _ends("Box", self.low, self.high), strict=True):
+            object.__setattr__(self, name, end)
         for low, high in zip(np.ravel(self.low), np.ravel(self.high), strict=True):
             low, high = low.item(), high.item()
             if not (math.isfinite(low) and math.isfinite(high)):
@@ -71,10 +60,11 @@ class Box(Domain):
 
     @classmethod
     def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
-        """VerifAI's notation, an interval for each entry, whose ends may come in any order."""
-        if not intervals or not all(np.shape(interval) == (2,) for interval in intervals):
-            raise ValueError(f"an interval is a pair of numbers; got {intervals!r}")
-        ends = [sorted(interval) for interval in intervals]
+        """Translate VerifAI's notation: an interval for each entry, its ends in any order.
+
+        **Raises:** `ValueError` for an interval that is no pair of numbers, and as the `Box`.
+        """
+        ends = _in_order(intervals)
         if len(ends) == 1:
             return cls(*ends[0])
         low, high = zip(*ends, strict=True)
@@ -84,32 +74,29 @@ class Box(Domain):
     def levels(self) -> tuple[int, ...]:
         return (0,) * np.size(self.low)
 
-    def from_unit(self, u: Float[Array, " size"]) -> Float[Array, "*size"]:
-        low, high, _, width = self._ends(u.dtype)
+    def from_unit(self, u: Float[Array, " size"]) -> Float[Array, "*entries"]:
+        low, high, _, width = self._limits(u.dtype)
         u = u.reshape(low.shape)
         # From the nearer end: exact at both ends and never outside, whatever the rounding.
         return jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
 
-    def to_unit(self, value: Any) -> Float[Array, " size"]:
+    def to_unit(self, value: ArrayLike | Array) -> Float[Array, " size"]:
         value = as_real(value)
-        low, high, middle, width = self._ends(value.dtype)
+        low, high, middle, width = self._limits(value.dtype)
         u = jnp.where(value < middle, (value - low) / width, 1 - (high - value) / width)
         return jnp.ravel(u)
 
-    def coerce(self, value: Any) -> Float[Array, "*size"]:
+    def coerce(self, value: ArrayLike | Array) -> Float[Array, "*shape"]:
         return as_real(value)
 
-    def check(self, value: Any, name: str) -> None:
-        value = as_numbers(value, name)
-        if value.shape != np.shape(self.low):
-            raise ValueError(
-                f"{name} must have shape {list(np.shape(self.low))}; got {list(value.shape)}"
-            )
+    def check(self, value: object, name: str) -> None:
+        numbers = as_numbers(value, name)
+        _check_shape(numbers, self.low, name)
         # A bound that float32 has rounded is still inside.
         slack = np.finfo(np.float32).eps * np.maximum(np.abs(self.low), np.abs(self.high))
-        inside = (value >= self.low - slack) & (value <= self.high + slack)
+        inside = (numbers >= self.low - slack) & (numbers <= self.high + slack)
         for column, ok, x, low, high in zip(
-            self.columns(name), *map(np.ravel, (inside, value, self.low, self.high)), strict=True
+            self.columns(name), *map(np.ravel, (inside, numbers, self.low, self.high)), strict=True
         ):
             if not ok:
                 raise ValueError(
@@ -118,20 +105,20 @@ class Box(Domain):
                 )
 
     def columns(self, name: str) -> tuple[str, ...]:
-        return (name,) if np.ndim(self.low) == 0 else indexed(name, self.size)
+        return _columns(self.low, name)
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
-        values = np.asarray(values)
-        if np.ndim(self.low) == 0:
-            return {name: values}
-        return {column: values[:, i] for i, column in enumerate(self.columns(name))}
+    def to_columns(
+        self, values: Float[Array, "n *entries"] | Float[np.ndarray, "n *entries"], name: str
+    ) -> dict[str, np.ndarray]:
+        return _to_columns(values, self.columns(name))
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Float[Array, "*size"]:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Float[Array, "*entries"]:
         entries = [as_numbers(row[column], column).item() for column in self.columns(name)]
         return as_real(entries[0] if np.ndim(self.low) == 0 else entries)
 
-    def _ends(self, dtype: Any) -> tuple[Any, Any, Any, Any]:
-        low, high = np.float64(self.low), np.float64(self.high)
+    def _limits(self, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return low, high, middle and width in this precision."""
+        low, high = np.float64(self.low), np.float64(self.high)  # pyright: ignore[reportArgumentType]
         ends = (low, high, low + (high - low) / 2, high - low)
         return tuple(np.asarray(end, dtype) for end in ends)  # pyright: ignore[reportReturnType]
 
@@ -141,77 +128,150 @@ class Box(Domain):
 
 @dataclass(frozen=True, repr=False)
 class DiscreteBox(Domain):
-    """Integers from `low` to `high`, both included, equally likely; an `int32` value.
+    """Integers from `low` to `high`, equally likely; vectors if the ends are sequences.
 
-    **Raises:** `ValueError` for ends that are no integers, reversed, or more than 2^20 values.
+    `DiscreteBox(1, 6)`, `DiscreteBox([0, 0], [3, 5])`. Both ends are included. A value is an
+    `int32`, or an array of them with shape `[entries]`.
+
+    **Arguments:**
+
+    - `low`, `high`: the ends, two integers or two sequences of one length; `low <= high`.
+
+    **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond
+    32 bits, or with more than 2^20 values between them.
     """
 
-    low: int
-    high: int
+    low: int | Sequence[int] | np.ndarray
+    high: int | Sequence[int] | np.ndarray
 
     def __post_init__(self) -> None:
         shown = f"got (low={self.low!r}, high={self.high!r})"
-        for end in ("low", "high"):
-            value = getattr(self, end)
-            number = as_number(value, f"{end} of a DiscreteBox")
+        ends = _ends("DiscreteBox", self.low, self.high)
+        for number in np.ravel(ends).tolist():
             if not math.isfinite(number) or number != int(number):
                 raise ValueError(f"the ends of a DiscreteBox must be integers; {shown}")
             if not -(2**31) <= number < 2**31:
                 raise ValueError(f"the ends of a DiscreteBox must fit into 32 bits; {shown}")
-            object.__setattr__(self, end, int(number))
-        if self.low > self.high:
+        for name, end in zip(("low", "high"), ends, strict=True):
+            whole = tuple(map(int, end)) if isinstance(end, tuple) else int(end)
+            object.__setattr__(self, name, whole)
+        if np.any(np.asarray(self.low) > np.asarray(self.high)):
             raise ValueError(f"low must not be above high in a DiscreteBox; {shown}")
-        if self.count > MOST_LEVELS:
+        if max(self.levels) > MOST_LEVELS:
             raise ValueError(
                 f"a DiscreteBox has at most {MOST_LEVELS} values, which a float32 coordinate can "
                 f"tell apart (use a Box and round); {shown}"
             )
 
     @classmethod
-    def from_interval(cls, one: float, other: float) -> "DiscreteBox":
-        """The integers between two numbers, which may come in any order, as in VerifAI."""
-        low, high = sorted((one, other))
-        return cls(math.ceil(low), math.floor(high))
+    def from_intervals(cls, *intervals: Sequence[float]) -> "DiscreteBox":
+        """Translate VerifAI's notation: an interval for each entry, its ends in any order.
 
-    @property
-    def count(self) -> int:
-        """Number of values."""
-        return self.high - self.low + 1
+        The ends are rounded inwards.
+
+        **Raises:** `ValueError` for an interval that is no pair of numbers, and as the
+        `DiscreteBox`.
+        """
+        ends = [(math.ceil(low), math.floor(high)) for low, high in _in_order(intervals)]
+        if len(ends) == 1:
+            return cls(*ends[0])
+        low, high = zip(*ends, strict=True)
+        return cls(low, high)
 
     @property
     def levels(self) -> tuple[int, ...]:
-        return (self.count,)
+        low, high = np.asarray(self.low, np.int64), np.asarray(self.high, np.int64)
+        return tuple(np.ravel(high - low + 1).tolist())
 
-    def from_unit(self, u: Float[Array, "1"]) -> Any:
-        return self.low + cell(u[0], self.count)
+    def from_unit(self, u: Float[Array, " size"]) -> Int[Array, "*entries"]:
+        low, count = self._limits()
+        places = (u.reshape(low.shape) * count).astype(jnp.int32)
+        return jnp.clip(places, 0, count - 1) + low
 
-    def to_unit(self, value: Any) -> Float[Array, "1"]:
-        return centre(jnp.asarray(value) - self.low, self.count)
+    def to_unit(self, value: ArrayLike | Array) -> Float[Array, " size"]:
+        low, count = self._limits()
+        return jnp.ravel((as_real(jnp.asarray(value) - low) + 0.5) / count)
 
-    def coerce(self, value: Any) -> Any:
+    def coerce(self, value: ArrayLike | Array) -> Int[Array, "*shape"]:
         return jnp.asarray(value, jnp.int32)
 
-    def check(self, value: Any, name: str) -> None:
-        number = as_numbers(value, name)
-        if number.shape != ():
-            raise ValueError(f"{name} must be one integer; got shape {list(number.shape)}")
-        if not (self.low <= number <= self.high and number == np.floor(number)):
-            raise ValueError(
-                f"{name} must be an integer from {self.low} to {self.high}; "
-                f"got {short(number.item())}"
-            )
+    def check(self, value: object, name: str) -> None:
+        numbers = as_numbers(value, name)
+        if np.ndim(self.low) == 0 and numbers.shape != ():
+            raise ValueError(f"{name} must be one integer; got shape {list(numbers.shape)}")
+        _check_shape(numbers, self.low, name)
+        for column, x, low, high in zip(
+            self.columns(name), *map(np.ravel, (numbers, self.low, self.high)), strict=True
+        ):
+            if not (low <= x <= high and x == np.floor(x)):
+                raise ValueError(
+                    f"{column} must be an integer from {low} to {high}; got {short(x.item())}"
+                )
 
     def columns(self, name: str) -> tuple[str, ...]:
-        return (name,)
+        return _columns(self.low, name)
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
-        return {name: np.asarray(values)}
+    def to_columns(
+        self, values: Int[Array, "n *entries"] | Int[np.ndarray, "n *entries"], name: str
+    ) -> dict[str, np.ndarray]:
+        return _to_columns(values, self.columns(name))
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
-        number = as_numbers(row[name], name).item()
-        if not math.isfinite(number) or number != int(number):
-            raise ValueError(f"{name} must be an integer; got {number!r}")
-        return jnp.asarray(int(number), jnp.int32)
+    def from_columns(self, row: Mapping[str, object], name: str) -> Int[Array, "*entries"]:
+        entries = []
+        for column in self.columns(name):
+            number = as_numbers(row[column], column).item()
+            if not math.isfinite(number) or number != int(number):
+                raise ValueError(f"{column} must be an integer; got {number!r}")
+            entries.append(int(number))
+        return jnp.asarray(entries[0] if np.ndim(self.low) == 0 else entries, jnp.int32)
+
+    def _limits(self) -> tuple[Int[np.ndarray, "*entries"], Int[np.ndarray, "*entries"]]:
+        """Return the lower ends and the numbers of values."""
+        low = np.asarray(self.low, np.int32)
+        return low, np.asarray(self.levels, np.int32).reshape(low.shape)
 
     def __repr__(self) -> str:
-        return f"DiscreteBox({self.low}, {self.high})"
+        return f"DiscreteBox({short(self.low)}, {short(self.high)})"
+
+
+def _ends(
+    kind: str, low: object, high: object
+) -> tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return both ends of a box as numbers, or as tuples of one length."""
+    shown = f"got (low={low!r}, high={high!r})"
+    vector = [
+        isinstance(end, Sequence | np.ndarray) and not isinstance(end, str) for end in (low, high)
+    ]
+    if vector[0] != vector[1]:
+        raise ValueError(f"both ends of a {kind} are numbers, or both are sequences; {shown}")
+    if not vector[0]:
+        return as_number(low, f"low of a {kind}"), as_number(high, f"high of a {kind}")
+    lows = tuple(as_number(entry, f"low of a {kind}") for entry in low)  # pyright: ignore[reportGeneralTypeIssues]
+    highs = tuple(as_number(entry, f"high of a {kind}") for entry in high)  # pyright: ignore[reportGeneralTypeIssues]
+    if len(lows) != len(highs):
+        raise ValueError(f"low and high of a {kind} must have one length; {shown}")
+    if not lows:
+        raise ValueError(f"a vector {kind} needs at least one entry; {shown}")
+    return lows, highs
+
+
+def _in_order(intervals: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
+    if not intervals or not all(np.shape(interval) == (2,) for interval in intervals):
+        raise ValueError(f"an interval is a pair of numbers; got {intervals!r}")
+    return [(min(interval), max(interval)) for interval in intervals]
+
+
+def _check_shape(numbers: np.ndarray, end: ArrayLike, name: str) -> None:
+    if numbers.shape != np.shape(end):
+        raise ValueError(f"{name} must have shape {list(np.shape(end))}; got {list(numbers.shape)}")
+
+
+def _columns(end: ArrayLike, name: str) -> tuple[str, ...]:
+    return (name,) if np.ndim(end) == 0 else indexed(name, np.size(end))
+
+
+def _to_columns(values: np.ndarray | jax.Array, columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    array = np.asarray(values)
+    if array.ndim == 1:
+        return dict.fromkeys(columns, array)
+    return {column: array[:, i] for i, column in enumerate(columns)}

@@ -1,15 +1,15 @@
-"""Values without an order: one of several choices (`Categorical`), or a single one (`Constant`)."""
+"""Values without an order: one of several choices (`Categorical`), or a `Constant`."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree, Shaped
+from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     MOST_LEVELS,
@@ -22,7 +22,7 @@ from verifai_jax.features.domain import (
     as_tuple,
     cell,
     centre,
-    listed,
+    format_choices,
     short,
 )
 
@@ -31,18 +31,22 @@ from verifai_jax.features.domain import (
 class Categorical(Domain):
     """One of several choices without an order: `Categorical("ppo", "sac", weights=[0.9, 0.1])`.
 
-    Equally likely without `weights`, which are their probabilities. Where all choices are numbers
-    the value is the number; otherwise JAX cannot hold it and the value is its place in `choices`,
-    an `int32`. The table always shows the choice itself.
+    Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
+    value is its place in `choices`, an `int32`. The table always shows the choice itself.
+
+    **Arguments:**
+
+    - `choices`: numbers, texts or other objects, one by one.
+    - `weights`: their probabilities; equally likely when left out.
 
     **Raises:** `ValueError` for no choices, the same choice twice, or weights that are not one
     positive number a choice with the sum one.
     """
 
-    choices: tuple[Any, ...]
+    choices: tuple[object, ...]
     probabilities: tuple[float, ...] | None = None
 
-    def __init__(self, *choices: Any, weights: Sequence[float] | None = None) -> None:
+    def __init__(self, *choices: object, weights: Sequence[float] | None = None) -> None:
         object.__setattr__(self, "choices", tuple(as_scalar(choice) for choice in choices))
         if not self.choices:
             raise ValueError("a Categorical needs at least one choice; got none")
@@ -52,9 +56,9 @@ class Categorical(Domain):
             )
         if len(self.choices) > MOST_LEVELS:
             raise ValueError(f"a Categorical has at most {MOST_LEVELS} choices")
-        seen: set[Any] = set()
+        known: set[object] = set()
         for choice in self.choices:
-            keys: set[Any] = {str(choice)}  # All that the table shows of most objects.
+            keys: set[object] = {str(choice)}  # All that the table shows of most objects.
             if isinstance(choice, int | float):
                 most = 2**31 - 1 if isinstance(choice, int) else MOST_REAL
                 if not abs(choice) <= most:
@@ -63,13 +67,16 @@ class Categorical(Domain):
                         f"got {choice!r}"
                     )
                 keys.add(float(np.float32(choice)))  # All that a system sees of a number.
-            if keys & seen:
-                raise ValueError(f"the choice {choice!r} is given twice in {listed(self.choices)}")
-            seen |= keys
+            if keys & known:
+                raise ValueError(
+                    f"the choice {choice!r} is given twice in {format_choices(self.choices)}"
+                )
+            known |= keys
         if weights is not None:
-            object.__setattr__(self, "probabilities", self._checked(weights))
+            object.__setattr__(self, "probabilities", self._probabilities(weights))
 
-    def _checked(self, weights: Sequence[float]) -> tuple[float, ...]:
+    def _probabilities(self, weights: Sequence[float]) -> tuple[float, ...]:
+        """Check the weights and return them as probabilities."""
         numbers = tuple(as_number(weight, "a weight of a Categorical") for weight in weights)
         if len(numbers) != len(self.choices):
             raise ValueError(
@@ -98,7 +105,7 @@ class Categorical(Domain):
         return self._dtype.kind != "O"
 
     @cached_property
-    def _dtype(self) -> Any:
+    def _dtype(self) -> np.dtype:
         kinds = {type(choice) for choice in self.choices}
         if kinds == {bool}:
             return np.dtype(bool)
@@ -127,11 +134,11 @@ class Categorical(Domain):
 
     @cached_property
     def _edges(self) -> np.ndarray:
-        """Where the cells begin and end, of unequal ones."""
+        """Ends of the cells, where these are unequal."""
         assert self.probabilities is not None
         return np.concatenate([[0], np.cumsum(self.probabilities)]).astype(np.float32)
 
-    def from_unit(self, u: Float[Array, "1"]) -> Any:
+    def from_unit(self, u: Float[Array, "1"]) -> Shaped[Array, ""]:
         if self.probabilities is None:
             index = cell(u[0], len(self.choices))
         else:
@@ -141,7 +148,7 @@ class Categorical(Domain):
         dtype = u.dtype if self._dtype == np.float64 else self._dtype
         return jnp.asarray(self._shown, dtype)[index]
 
-    def to_unit(self, value: Any) -> Float[Array, "1"]:
+    def to_unit(self, value: ArrayLike | Array) -> Float[Array, "1"]:
         index = jnp.asarray(value)
         if self.numeric:
             index = jnp.argmin(jnp.abs(as_real(index) - self._shown.astype(np.float32)))
@@ -150,7 +157,7 @@ class Categorical(Domain):
         middles = (self._edges[1:] + self._edges[:-1]) / 2
         return jnp.reshape(jnp.asarray(middles)[index], (1,)).astype(jnp.result_type(float))
 
-    def coerce(self, value: Any) -> Any:
+    def coerce(self, value: PyTree) -> Shaped[Array, "*shape"]:
         if self.numeric:
             return as_real(value) if self._dtype == np.float64 else jnp.asarray(value, self._dtype)
         if isinstance(value, jax.Array):
@@ -159,8 +166,8 @@ class Categorical(Domain):
         places = [self._place(choice) for choice in values.ravel()]
         return jnp.asarray(np.array(places, np.int32).reshape(values.shape))
 
-    def check(self, value: Any, name: str) -> None:
-        known = f"one of {listed(self.choices)}"
+    def check(self, value: object, name: str) -> None:
+        known = f"one of {format_choices(self.choices)}"
         if np.ndim(np.asarray(value, dtype=object)) != 0:
             raise ValueError(f"{name} must be {known}; got {value!r}")
         value = as_scalar(value)
@@ -174,7 +181,9 @@ class Categorical(Domain):
     def columns(self, name: str) -> tuple[str, ...]:
         return (name,)
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+    def to_columns(
+        self, values: Shaped[Array, " n"] | Shaped[np.ndarray, " n"], name: str
+    ) -> dict[str, np.ndarray]:
         index = np.asarray(values)
         if self.numeric:
             # The nearest one: a system sees 0.1 as float32, the table shows 0.1.
@@ -184,7 +193,7 @@ class Categorical(Domain):
             index = order[np.searchsorted(middles, index.astype(np.float64))]
         return {name: self._shown[index]}
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Shaped[Array, ""]:
         shown = as_scalar(row[name])
         if not self.numeric:
             places = {text: i for i, text in enumerate(self._shown)}
@@ -194,15 +203,17 @@ class Categorical(Domain):
             place = self._nearest(shown) if isinstance(shown, bool | int | float) else None
             if place is not None:
                 return self.coerce(self.choices[place])
-        raise ValueError(f"{name} must be one of {listed(self.choices)}; got {shown!r}")
+        raise ValueError(f"{name} must be one of {format_choices(self.choices)}; got {shown!r}")
 
-    def _place(self, value: Any) -> int | None:
-        """Where a choice stands; integers are places already, as systems see them."""
+    def _place(self, value: object) -> int | None:
+        """Return the place of a choice; integers are places already, as systems see them."""
         if type(value) in (int, np.int32, np.int64):
-            return int(value) if 0 <= value < len(self.choices) else None
+            place = int(value)  # pyright: ignore[reportArgumentType]
+            return place if 0 <= place < len(self.choices) else None
         return self.choices.index(value) if value in self.choices else None
 
     def _nearest(self, value: float) -> int | None:
+        """Return the place of the choice that is this number in float32."""
         numbers = self._shown.astype(np.float64)
         place = int(np.argmin(np.abs(numbers - value)))
         return place if np.float32(numbers[place]) == np.float32(value) else None
@@ -211,7 +222,7 @@ class Categorical(Domain):
         weights = ""
         if self.probabilities is not None:
             weights = f", weights={short(self.probabilities)}"
-        return f"Categorical({listed(self.choices)}{weights})"
+        return f"Categorical({format_choices(self.choices)}{weights})"
 
 
 @dataclass(frozen=True, repr=False)
@@ -221,10 +232,14 @@ class Constant(Domain):
     It takes no unit coordinate and no column of the table. A system sees a text as the place 0, as
     in a `Categorical` with one choice.
 
+    **Arguments:**
+
+    - `value`: the only one, such as `9.8`, `[0, 1]`, `"dry"`.
+
     **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
     """
 
-    value: Any
+    value: float | bool | str | PyTree
 
     def __post_init__(self) -> None:
         value = self.value
@@ -245,21 +260,23 @@ class Constant(Domain):
     def levels(self) -> tuple[int, ...]:
         return ()
 
-    def from_unit(self, u: Float[Array, "0"]) -> Any:
+    def from_unit(self, u: Float[Array, "0"]) -> Shaped[Array, "*shape"]:
         return self._value(u.dtype)
 
-    def to_unit(self, value: Any) -> Float[Array, "0"]:
+    def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))
 
-    def coerce(self, value: Any) -> Any:
+    def coerce(self, value: PyTree) -> Shaped[Array, "*shape"]:
         if isinstance(self.value, str):
             return jnp.zeros(np.shape(value), jnp.int32)
         return jnp.broadcast_to(self._value(jnp.result_type(float)), np.shape(value))
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         shown = self.value
         if isinstance(shown, str):
-            same = value == shown if isinstance(value, str) else np.array_equal(value, 0)
+            same = (
+                value == shown if isinstance(value, str) else np.array_equal(np.asarray(value), 0)
+            )
         else:
             given = as_numbers(value, name)
             same = given.shape == np.shape(shown) and np.array_equal(
@@ -271,13 +288,13 @@ class Constant(Domain):
     def columns(self, name: str) -> tuple[str, ...]:
         return ()
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+    def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
         return {}
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Shaped[Array, "*shape"]:
         return self._value(jnp.result_type(float))
 
-    def _value(self, real: Any) -> Any:
+    def _value(self, real: np.dtype) -> Shaped[Array, "*shape"]:
         if isinstance(self.value, str):
             return jnp.asarray(0, jnp.int32)
         kind = np.asarray(self.value).dtype.kind

@@ -1,15 +1,14 @@
-"""Domains made of domains: several under names (`Struct`)."""
+"""Several domains under names (`Struct`)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.features.box import Box
@@ -21,6 +20,10 @@ class Struct(Domain):
     """Domains under names, in the order written: `Struct({"x": Box(0, 50), "v": Box(0, 20)})`.
 
     A value is a dictionary with these names.
+
+    **Arguments:**
+
+    - `fields`: name -> `Domain`, in the order in which coordinates and columns come.
 
     **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a
     field that is no domain.
@@ -56,19 +59,19 @@ class Struct(Domain):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        found, start = [], 0
+        places, start = [], 0
         for _, domain in self.fields:
-            found += [start + i for i in domain.lengths]
+            places += [start + i for i in domain.lengths]
             start += domain.size
-        return tuple(found)
+        return tuple(places)
 
     @cached_property
     def signals(self) -> tuple[tuple[int, ...], ...]:
-        found, start = [], 0
+        places, start = [], 0
         for _, domain in self.fields:
-            found += [tuple(start + i for i in signal) for signal in domain.signals]
+            places += [tuple(start + i for i in signal) for signal in domain.signals]
             start += domain.size
-        return tuple(found)
+        return tuple(places)
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         return tuple(
@@ -86,7 +89,7 @@ class Struct(Domain):
         """Names of the fields, in the order written."""
         return tuple(name for name, _ in self.fields)
 
-    def from_unit(self, u: Float[jax.Array, " size"]) -> dict[str, Any]:
+    def from_unit(self, u: Float[jax.Array, " size"]) -> dict[str, PyTree]:
         value, start = {}, 0
         for names, domain in self._runs:
             part = domain.from_unit(u[start : start + domain.size])
@@ -94,7 +97,7 @@ class Struct(Domain):
             start += domain.size
         return value
 
-    def to_unit(self, value: Mapping[str, Any]) -> Float[jax.Array, " size"]:
+    def to_unit(self, value: Mapping[str, PyTree]) -> Float[jax.Array, " size"]:
         parts = [
             domain.to_unit(
                 value[names[0]] if len(names) == 1 else jnp.stack([value[name] for name in names])
@@ -103,10 +106,10 @@ class Struct(Domain):
         ]
         return jnp.concatenate(parts)
 
-    def coerce(self, value: Mapping[str, Any]) -> dict[str, Any]:
+    def coerce(self, value: Mapping[str, PyTree]) -> dict[str, PyTree]:
         return {name: domain.coerce(value[name]) for name, domain in self.fields}
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         if not isinstance(value, Mapping):
             raise ValueError(f"{name or 'features'} must be a dictionary; got {value!r}")
         check_names("feature", [dotted(name, field) for field in value], self._dotted_names(name))
@@ -122,13 +125,13 @@ class Struct(Domain):
             for column in domain.columns(dotted(name, field))
         )
 
-    def to_columns(self, values: Mapping[str, Any], name: str) -> dict[str, np.ndarray]:
+    def to_columns(self, values: Mapping[str, PyTree], name: str) -> dict[str, np.ndarray]:
         columns: dict[str, np.ndarray] = {}
         for field, domain in self.fields:
             columns |= domain.to_columns(values[field], dotted(name, field))
         return columns
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> dict[str, Any]:
+    def from_columns(self, row: Mapping[str, object], name: str) -> dict[str, PyTree]:
         return {
             field: domain.from_columns(row, dotted(name, field)) for field, domain in self.fields
         }
@@ -136,12 +139,12 @@ class Struct(Domain):
     def refined(self, factor: int) -> "Struct":
         return Struct({name: domain.refined(factor) for name, domain in self.fields})
 
-    def refine(self, value: Mapping[str, Any], factor: int) -> dict[str, Any]:
+    def refine(self, value: Mapping[str, PyTree], factor: int) -> dict[str, PyTree]:
         return {name: domain.refine(value[name], factor) for name, domain in self.fields}
 
     @cached_property
     def _runs(self) -> tuple[tuple[tuple[str, ...], Domain], ...]:
-        """The fields, neighbouring scalar boxes merged into a vector: 200 cost one operation."""
+        """Fields, with neighbouring scalar boxes merged into a vector: 200 cost one operation."""
         runs: list[tuple[tuple[str, ...], Domain]] = []
         for scalar, group in groupby(self.fields, lambda field: _is_scalar_box(field[1])):
             names, domains = zip(*group, strict=True)

@@ -1,23 +1,23 @@
-"""Real numbers with a distribution: `Normal`, `TruncatedNormal`, `LogUniform`, one of your own.
+"""Distributions of real numbers: `Normal`, `TruncatedNormal`, `LogUniform`, one of your own.
 
     FeatureSpace({"wind": Normal(0, 2), "mass": LogUniform(0.01, 10)})
 
 A unit coordinate is the probability to its left, so that uniform coordinates sample the
 distribution (inverse transform sampling). Both tails are computed from the smaller probability;
-0 and 1 give finite values, and slopes there are finite and not zero.
+0 and 1 give finite values, and derivatives there are finite and not zero.
 """
 
 import abc
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     LEAST_REAL,
@@ -45,11 +45,11 @@ class Continuous(Domain):
 
     @abc.abstractmethod
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        """The value with this probability to its left; finite at 0 and 1."""
+        """Return the value with this probability to its left; finite at 0 and 1."""
 
     @abc.abstractmethod
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        """The probability to the left of this value."""
+        """Return the probability to the left of this value."""
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -58,13 +58,13 @@ class Continuous(Domain):
     def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
         return self.quantile(u[0]).astype(u.dtype)
 
-    def to_unit(self, value: Any) -> Float[Array, "1"]:
+    def to_unit(self, value: ArrayLike | Array) -> Float[Array, "1"]:
         return jnp.clip(self.probability(as_real(value)), 0, 1)[None]
 
-    def coerce(self, value: Any) -> Float[Array, ""]:
+    def coerce(self, value: ArrayLike | Array) -> Float[Array, "*shape"]:
         return as_real(value)
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         number = as_numbers(value, name)
         if number.shape != ():
             raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
@@ -87,10 +87,12 @@ class Continuous(Domain):
     def columns(self, name: str) -> tuple[str, ...]:
         return (name,)
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+    def to_columns(
+        self, values: Float[Array, " n"] | Float[np.ndarray, " n"], name: str
+    ) -> dict[str, np.ndarray]:
         return {name: np.asarray(values)}
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Float[Array, ""]:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Float[Array, ""]:
         return as_real(as_numbers(row[name], name).item())
 
 
@@ -101,6 +103,11 @@ class Normal(Continuous):
     A float32 coordinate reaches 5.5 standard deviations to either side, beyond which lies a
     probability of 3e-8; the coordinates 0 and 1 stand for these outermost values.
 
+    **Arguments:**
+
+    - `mean`: of the distribution.
+    - `std`: its standard deviation, positive.
+
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
@@ -109,7 +116,7 @@ class Normal(Continuous):
     std: float
 
     def __post_init__(self) -> None:
-        _numbers(self, "mean", "std")
+        _check_numbers(self, "mean", "std")
         _check_scale(self, self.mean, self.std)
 
     @property
@@ -132,7 +139,10 @@ class Normal(Continuous):
 class TruncatedNormal(Continuous):
     """A normal distribution given that the value lies in `[low, high]`.
 
+    **Arguments:**
+
     - `mean`, `std`: of the distribution before it is cut off.
+    - `low`, `high`: the ends; `low < high`.
 
     The coordinates 0 and 1 are `low` and `high` exactly. Where an end is more than 5 standard
     deviations away, values near it are too improbable for a float32 coordinate.
@@ -148,7 +158,7 @@ class TruncatedNormal(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _numbers(self, "mean", "std", "low", "high")
+        _check_numbers(self, "mean", "std", "low", "high")
         _check_scale(self, self.mean, self.std)
         _check_ends(self, self.low, self.high)
         if self.high - self.low < 0.05 * self.std:
@@ -169,7 +179,7 @@ class TruncatedNormal(Continuous):
 
     @property
     def _mirrored(self) -> bool:
-        """Whether all lies in the upper tail, so that the mirror image is computed."""
+        """True if the interval lies in the upper tail, so that its mirror image is computed."""
         return self.low > self.mean
 
     @property
@@ -221,6 +231,10 @@ class TruncatedNormal(Continuous):
 class LogUniform(Continuous):
     """Positive numbers whose logarithm is uniform: learning rates, masses, stiffnesses.
 
+    **Arguments:**
+
+    - `low`, `high`: the ends; `0 < low < high`.
+
     **Raises:** `ValueError` for ends that are not finite, not positive, reversed or equal.
     """
 
@@ -228,7 +242,7 @@ class LogUniform(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _numbers(self, "low", "high")
+        _check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < LEAST_REAL:
@@ -266,16 +280,21 @@ class Distribution(Continuous):
 
         Distribution(lambda u: 3 * jnp.sqrt(u), lambda x: (x / 3) ** 2, name="triangle")
 
-    **Arguments:** `inverse_cdf`: probability -> value, increasing; `cdf`: value -> probability;
-    `name`: for people and JSON. Where `inverse_cdf` or its slope is infinite at 0 or 1, the
-    outermost float32 coordinates are used there instead.
+    Where `inverse_cdf` or its derivative is infinite at 0 or 1, the outermost float32 coordinates
+    are used there instead.
+
+    **Arguments:**
+
+    - `inverse_cdf`: probability -> value, increasing.
+    - `cdf`: value -> probability.
+    - `name`: for people and JSON.
 
     **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
     finite inside, or are not each other's inverse.
     """
 
-    inverse_cdf: Callable[[Any], Any]
-    cdf: Callable[[Any], Any]
+    inverse_cdf: Callable[[Array], Array]
+    cdf: Callable[[Array], Array]
     name: str = "custom"
     _range: tuple[float, float] = field(default=(0.0, 1.0), init=False, compare=False)
 
@@ -287,10 +306,10 @@ class Distribution(Continuous):
         if not isinstance(self.name, str) or not self.name.strip():
             raise ValueError(f"name of a Distribution must be a text; got {self.name!r}")
         with jax.ensure_compile_time_eval():
-            object.__setattr__(self, "_range", self._checked())
+            object.__setattr__(self, "_range", self._measured_range())
 
-    def _checked(self) -> tuple[float, float]:
-        """The probabilities that 0 and 1 stand for; refuses functions that do not fit together."""
+    def _measured_range(self) -> tuple[float, float]:
+        """Check both functions and return the probabilities that the coordinates 0 and 1 mean."""
         u = np.linspace(0, 1, 129, dtype=np.float32)[1:-1]
         values = self._sampled("inverse_cdf", self.inverse_cdf, u)
         for i in range(len(u)):
@@ -314,7 +333,7 @@ class Distribution(Continuous):
         return 0.0 if finite[0] else OUTERMOST, 1.0 if finite[1] else 1 - 2.0**-24
 
     def _sampled(
-        self, role: str, function: Callable[[Any], Any], points: Float[np.ndarray, " n"]
+        self, role: str, function: Callable[[Array], Array], points: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
         try:
             array = np.asarray(jax.vmap(function)(jnp.asarray(points)))
@@ -344,7 +363,7 @@ class Distribution(Continuous):
         return f"Distribution(name={self.name!r})"
 
 
-def _numbers(domain: Any, *names: str) -> None:
+def _check_numbers(domain: Domain, *names: str) -> None:
     kind = type(domain).__name__
     for name in names:
         given = as_number(getattr(domain, name), f"{name} of a {kind}")
@@ -376,8 +395,10 @@ def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
     return _but(x, x < least, least)
 
 
-def _but(x: Float[Array, ""], condition: Any, value: Any) -> Float[Array, ""]:
-    """`x`, but where the condition holds exactly `value`, with the slope of `x` even there.
+def _but(
+    x: Float[Array, ""], condition: Bool[Array, ""], value: float | np.ndarray
+) -> Float[Array, ""]:
+    """Replace `x` by `value` where the condition holds, and keep the derivative of `x` there.
 
     A search that stands at an end of the coordinate can so leave it.
     """

@@ -1,10 +1,10 @@
-"""How one feature varies: a domain maps unit coordinates to values and back.
+"""Domains of single features: maps from unit coordinates to values and back.
 
     Box(-0.05, 0.05), Box([0, 0], [10, 5])              # box.py: a real number, a vector of two
-    DiscreteBox(1, 4)                                   # box.py: an integer
+    DiscreteBox(1, 4), DiscreteBox([0, 0], [3, 5])      # box.py: an integer, a vector of two
     Categorical("ppo", "sac"), Constant(9.8)            # choice.py
-    Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py
-    Array(Box(0, 50), length=(1, 3))                                        # variable.py
+    Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py, arrays.py
+    Array(Box(0, 50), length=(1, 3))                                        # arrays.py
     Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
     Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
 
@@ -14,18 +14,24 @@ The unit cube is the probability space: uniform coordinates give the prior on th
 import abc
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, PyTree
+from numpy.typing import ArrayLike
 
-# Cells narrower than this could not be told apart in a float32 coordinate.
 MOST_LEVELS = 2**20
-# Below, XLA takes numbers for zero.
+"""Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
+
 LEAST_REAL = float(np.finfo(np.float32).tiny)
+"""Smallest normal float32 number: XLA treats smaller ones as zero."""
+
 MOST_REAL = float(np.finfo(np.float32).max)
+"""Largest float32 number."""
+
+Value = TypeVar("Value")
 
 
 class Domain(abc.ABC):
@@ -39,41 +45,49 @@ class Domain(abc.ABC):
     @property
     @abc.abstractmethod
     def levels(self) -> tuple[int, ...]:
-        """For each unit coordinate: 0 if continuous, or the number of its equally wide cells."""
+        """Number of cells of each unit coordinate; 0 if it is continuous."""
 
     @abc.abstractmethod
-    def from_unit(self, u: Float[Array, " size"]) -> Any:
-        """The value at coordinates `u` in `[0, 1]`, both ends included; reals have `u`'s dtype."""
+    def from_unit(self, u: Float[Array, " size"]) -> PyTree:
+        """Return the value at coordinates `u` in `[0, 1]`, both ends included.
+
+        Real numbers have the dtype of `u`.
+        """
 
     @abc.abstractmethod
-    def to_unit(self, value: Any) -> Float[Array, " size"]:
-        """The coordinates of a value as `from_unit` gives it; cell centres where discrete."""
+    def to_unit(self, value: PyTree) -> Float[Array, " size"]:
+        """Return the coordinates of a value, as `from_unit` gives it; cell centres if discrete."""
 
     @abc.abstractmethod
-    def coerce(self, value: Any) -> Any:
-        """What a person may write (a number, a list, a choice), as `from_unit` would give it.
+    def coerce(self, value: PyTree) -> PyTree:
+        """Convert what a person may write (a number, a list, a choice) to what `from_unit` gives.
 
         Leading axes are kept. Nothing is checked; see `check`.
         """
 
     @abc.abstractmethod
-    def check(self, value: Any, name: str) -> None:
-        """Raise `ValueError` unless this concrete value lies in the domain.
+    def check(self, value: object, name: str) -> None:
+        """Check that a concrete value lies in the domain.
 
+        **Arguments:**
+
+        - `value`: as `from_unit` gives it, or as a person writes it.
         - `name`: of the feature, for the message.
+
+        **Raises:** `ValueError` for a value outside the domain, or of another kind.
         """
 
     @abc.abstractmethod
     def columns(self, name: str) -> tuple[str, ...]:
-        """Names of the table columns that hold the feature called `name`."""
+        """Return the names of the table columns that hold the feature called `name`."""
 
     @abc.abstractmethod
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
-        """A batch of values (leaves `[n, ...]`) as table columns `[n]`."""
+    def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
+        """Return a batch of values (leaves `[n, ...]`) as table columns `[n]`."""
 
     @abc.abstractmethod
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
-        """The value that a table row holds, exactly.
+    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
+        """Return the value that a table row holds, exactly.
 
         **Raises:** `ValueError` for an entry that is no value of this kind.
         """
@@ -85,17 +99,17 @@ class Domain(abc.ABC):
 
     @property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """For each unit coordinate the probabilities of its cells, their widths; None if equal."""
+        """Probabilities of the cells of each unit coordinate, their widths; None if equal."""
         return (None,) * self.size
 
     @property
     def ordered(self) -> tuple[bool, ...]:
-        """For each unit coordinate whether its values have an order; choices have none."""
+        """Whether the values of each unit coordinate have an order; choices have none."""
         return (True,) * self.size
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Which unit coordinates are lengths of arrays, on which others depend."""
+        """Indices of the unit coordinates that are lengths of arrays, on which others depend."""
         return ()
 
     @property
@@ -104,47 +118,50 @@ class Domain(abc.ABC):
         return ()
 
     def coordinates(self, name: str) -> tuple[str, ...]:
-        """What each unit coordinate of the feature called `name` is called."""
+        """Return the names of the unit coordinates of the feature called `name`."""
         return self.columns(name)
 
     def refined(self, factor: int) -> "Domain":
-        """The same domain with finer signals, where it has any; see `Signal.refined`."""
+        """Return the same domain with finer signals, where it has any; see `Signal.refined`."""
         return self
 
-    def refine(self, value: Any, factor: int) -> Any:
-        """A value of this domain as one of `refined(factor)`."""
+    def refine(self, value: PyTree, factor: int) -> PyTree:
+        """Convert a value of this domain to one of `refined(factor)`."""
         return value
 
 
-def cell(u: Float[Array, "*shape"], count: int) -> Any:
-    """Which of `count` equally wide cells holds `u`, as `int32`; 1.0 is in the last one."""
+def cell(u: Float[Array, "*shape"], count: int) -> Int[Array, "*shape"]:
+    """Return the index of the cell that holds `u`, of `count` equally wide ones.
+
+    1.0 is in the last one.
+    """
     return jnp.clip((u * count).astype(jnp.int32), 0, count - 1)
 
 
-def centre(index: Any, count: int) -> Float[Array, "1"]:
-    """The middle of a cell."""
+def centre(index: ArrayLike | Array, count: int) -> Float[Array, "1"]:
+    """Return the middle of a cell."""
     return jnp.reshape((as_real(index) + 0.5) / count, (1,))
 
 
-def as_real(value: Any) -> Float[Array, "*shape"]:
-    """An array of floating-point numbers; integers and lists get JAX's default precision."""
+def as_real(value: ArrayLike | Array) -> Float[Array, "*shape"]:
+    """Convert to an array of real numbers; integers and lists get JAX's default precision."""
     array = jnp.asarray(value)
     real = jnp.issubdtype(array.dtype, jnp.floating) and not array.weak_type
     return array if real else array.astype(jnp.result_type(float))
 
 
-def as_number(value: Any, what: str) -> float:
-    """One number; `what` names it in the error."""
+def as_number(value: object, what: str) -> float:
+    """Convert to one number; `what` names it in the error."""
     if not isinstance(value, bool | np.bool_ | str | bytes):
         try:
-            return float(value)
+            return float(value)  # pyright: ignore[reportArgumentType]
         except (TypeError, ValueError, OverflowError):
             pass
     raise ValueError(f"{what} must be a number; got {value!r}")
 
 
-def as_numbers(value: Any, name: str) -> np.ndarray:
-    """A concrete number or an array of them, in float64; `name` names it in the error."""
+def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
+    """Convert a concrete number or an array of them to float64; `name` names it in the error."""
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
@@ -156,35 +173,35 @@ def as_numbers(value: Any, name: str) -> np.ndarray:
     return numbers.astype(np.float64)
 
 
-def as_scalar(value: Any) -> Any:
-    """Plain Python instead of NumPy and JAX scalars."""
+def as_scalar(value: Value) -> Value:
+    """Convert NumPy and JAX scalars to plain Python; other values stay as they are."""
     if isinstance(value, np.generic | jax.Array | np.ndarray) and np.ndim(value) == 0:
         return value.item()
     return value
 
 
-def as_tuple(value: Any) -> Any:
-    """Nested tuples instead of nested lists."""
+def as_tuple(value: PyTree) -> PyTree:
+    """Convert nested lists to nested tuples."""
     return tuple(map(as_tuple, value)) if isinstance(value, list) else value
 
 
 def indexed(name: str, count: int) -> tuple[str, ...]:
-    """`name[0]`, `name[1]`, ..."""
+    """Return the names `name[0]`, `name[1]`, ..."""
     return tuple(f"{name}[{i}]" for i in range(count))
 
 
 def dotted(name: str, field: str) -> str:
-    """What a field of the feature called `name` is called."""
+    """Return the full name of a field of the feature called `name`."""
     return f"{name}.{field}" if name else field
 
 
-def listed(choices: Sequence[Any]) -> str:
-    """Choices for a message."""
+def format_choices(choices: Sequence[object]) -> str:
+    """Format choices for a message."""
     return ", ".join(map(repr, choices))
 
 
-def short(value: Any) -> str:
-    """A number, or a tuple of them, as a person would write it."""
+def short(value: object) -> str:
+    """Format a number, or a tuple of them, as a person would write it."""
     if isinstance(value, tuple):
         return "[" + ", ".join(map(short, value)) + "]"
     if isinstance(value, float) and value == int(value if math.isfinite(value) else 0):

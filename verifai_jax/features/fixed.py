@@ -1,13 +1,12 @@
-"""A feature held at one value: what a view of a space makes of those that it does not vary."""
+"""Features held at one value (`Fixed`): those that a view of a space does not vary."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.features.domain import Domain, as_scalar
 
@@ -16,23 +15,26 @@ from verifai_jax.features.domain import Domain, as_scalar
 class Fixed(Domain):
     """A domain at one of its values: it keeps its table columns and has no coordinates.
 
-    **Arguments:** `domain`, and `value` in it, as a person writes it; `name` of the feature, for
-    messages.
+    **Arguments:**
+
+    - `domain`: of the feature.
+    - `value`: in the domain, as a person writes it.
+    - `name`: of the feature, for messages.
 
     **Raises:** `ValueError` for a value outside the domain.
     """
 
     domain: Domain
-    row: tuple[tuple[str, Any], ...]  # The value as a row of a table, which can be compared.
+    row: tuple[tuple[str, object], ...]  # The value as a row of a table, which can be compared.
 
-    def __init__(self, domain: Domain, value: Any, name: str = "value") -> None:
+    def __init__(self, domain: Domain, value: PyTree, name: str = "value") -> None:
         domain.check(value, name)
         object.__setattr__(self, "domain", domain)
         object.__setattr__(self, "row", _row(domain, value))
 
     @property
-    def value(self) -> Any:
-        """What a system sees."""
+    def value(self) -> PyTree:
+        """The value, as a system sees it."""
         return self.domain.from_columns(dict(self.row), "")
 
     @property
@@ -42,50 +44,50 @@ class Fixed(Domain):
     def coordinates(self, name: str) -> tuple[str, ...]:
         return ()
 
-    def from_unit(self, u: Float[Array, "0"]) -> Any:
-        def cast(leaf: Any) -> Any:
+    def from_unit(self, u: Float[Array, "0"]) -> PyTree:
+        def cast(leaf: Array) -> Array:
             real = jnp.issubdtype(leaf.dtype, jnp.floating)
             return leaf.astype(u.dtype) if real else leaf
 
         return jax.tree.map(cast, self.value)
 
-    def to_unit(self, value: Any) -> Float[Array, "0"]:
+    def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))
 
-    def coerce(self, value: Any) -> Any:
+    def coerce(self, value: PyTree) -> PyTree:
         return self.domain.coerce(value)
 
-    def check(self, value: Any, name: str) -> None:
+    def check(self, value: object, name: str) -> None:
         self.domain.check(value, name)
         if _row(self.domain, value) != self.row:
-            raise ValueError(f"{name} is fixed, {self._shown()}; got {value!r}")
+            raise ValueError(f"{name} is fixed, {self._format()}; got {value!r}")
 
     def columns(self, name: str) -> tuple[str, ...]:
         return self.domain.columns(name)
 
-    def to_columns(self, values: Any, name: str) -> dict[str, np.ndarray]:
+    def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
         return self.domain.to_columns(values, name)
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Any:
+    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
         return self.domain.from_columns(row, name)
 
     def refined(self, factor: int) -> "Fixed":
         return Fixed(self.domain.refined(factor), self.domain.refine(self.value, factor))
 
-    def refine(self, value: Any, factor: int) -> Any:
+    def refine(self, value: PyTree, factor: int) -> PyTree:
         return self.domain.refine(value, factor)
 
-    def _shown(self) -> str:
+    def _format(self) -> str:
         values = [value for _, value in self.row if value is not None]
         shown = [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values[:6]]
         return f"{', '.join(shown)}{', ...' * (len(values) > 6)}"
 
     def __repr__(self) -> str:
-        return f"{self._shown()}, fixed in {self.domain!r}"
+        return f"{self._format()}, fixed in {self.domain!r}"
 
 
-def _row(domain: Domain, value: Any) -> tuple[tuple[str, Any], ...]:
-    """A value as the table shows it; None where an item is absent, which NaN would not equal."""
+def _row(domain: Domain, value: PyTree) -> tuple[tuple[str, object], ...]:
+    """Return a value as the table shows it, with None for absent items: NaN is not equal to NaN."""
     with jax.ensure_compile_time_eval():
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], domain.coerce(value))
         columns = domain.to_columns(batch, "")

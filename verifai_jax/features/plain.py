@@ -1,4 +1,4 @@
-"""Domains as plain data, for JSON: `to_plain(domain)` and back.
+"""Plain data of domains, for JSON: `to_plain(domain)` and back.
 
 Data holds a `kind`, one of the names below, and the arguments of that domain. Code, that is the
 functions of a `Distribution`, is not data: it has to be given again by name.
@@ -6,6 +6,8 @@ functions of a `Distribution`, is not data: it has to be given again by name.
 
 from collections.abc import Mapping
 from typing import Any
+
+from jaxtyping import PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
@@ -31,7 +33,7 @@ KINDS: dict[str, Any] = {kind.__name__: kind for kind in FIELDS}
 
 
 def to_plain(domain: Domain) -> dict[str, Any]:
-    """A domain as dictionaries, lists, texts and numbers.
+    """Describe a domain by dictionaries, lists, texts and numbers.
 
     **Raises:** `ValueError` for a domain of the user's own, or choices that are no plain data.
     """
@@ -65,21 +67,23 @@ def to_plain(domain: Domain) -> dict[str, Any]:
 def from_plain(
     data: Mapping[str, Any], distributions: Mapping[str, Distribution] | None = None
 ) -> Domain:
-    """The domain that `to_plain` described.
+    """Build the domain that `to_plain` described.
 
+    **Arguments:**
+
+    - `data`: as `to_plain` gives it.
     - `distributions`: those with functions, by name.
 
     **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts,
     or what the domain itself refuses.
     """
-    given = distributions or {}
     try:
-        return _built(data, given)
+        return _build(data, distributions or {})
     except (KeyError, TypeError) as error:
         raise ValueError(f"this describes no domain ({error}): {data!r}") from error
 
 
-def _built(data: Mapping[str, Any], given: Mapping[str, Distribution]) -> Domain:
+def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -> Domain:
     kind = data["kind"]
     match kind:
         case "Struct":
@@ -87,32 +91,34 @@ def _built(data: Mapping[str, Any], given: Mapping[str, Distribution]) -> Domain
             for name in names:
                 if names.count(name) > 1:
                     raise ValueError(f"the name {name!r} comes twice; got {names}")
-            return Struct({name: from_plain(field, given) for name, field in data["fields"]})
+            return Struct(
+                {name: from_plain(field, distributions) for name, field in data["fields"]}
+            )
         case "Array":
             length: Any = data["length"]
             length = tuple(length) if isinstance(length, list) else length
-            return Array(from_plain(data["domain"], given), length)
+            return Array(from_plain(data["domain"], distributions), length)
         case "Categorical":
             return Categorical(*data["choices"], weights=data["weights"])
         case "Fixed":
-            domain = from_plain(data["domain"], given)
+            domain = from_plain(data["domain"], distributions)
             return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
         case "Distribution":
-            if data["name"] not in given:
+            if data["name"] not in distributions:
                 raise ValueError(
                     f"the functions of Distribution {data['name']!r} are code, which JSON does "
                     "not hold; give it: from_json(data, distributions={...})"
                 )
-            return given[data["name"]]
+            return distributions[data["name"]]
     if kind not in KINDS:
         others = ("Struct", "Categorical", "Fixed", "Distribution")
         raise unknown_name("kind of domain", kind, (*KINDS, *others))
     arguments = {
-        name: from_plain(data[name], given) if name == "domain" else data[name]
+        name: from_plain(data[name], distributions) if name == "domain" else data[name]
         for name in FIELDS[KINDS[kind]]
     }
     return KINDS[kind](**arguments)
 
 
-def _lists(value: Any) -> Any:
+def _lists(value: PyTree) -> PyTree:
     return [_lists(entry) for entry in value] if isinstance(value, tuple) else value

@@ -1,12 +1,13 @@
-"""Rows of a table as features, many at a time, and features one rounding away."""
+"""Conversion of many rows of a table to features, and features one rounding away."""
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.precision import in_precision
@@ -22,11 +23,15 @@ ROUNDING = 2.0**-23
 
 
 def features_of_rows(
-    domains: Mapping[str, Domain], rows: Mapping[str, Any], precision: str
-) -> dict[str, Any]:
+    domains: Mapping[str, Domain], rows: Mapping[str, ArrayLike], precision: str
+) -> dict[str, PyTree]:
     """Return the features `[n, ...]` that rows of a table hold, in this precision.
 
+    **Arguments:**
+
+    - `domains`: of the features, by name.
     - `rows`: columns `[n]` by name; others than those of features are ignored.
+    - `precision`: `"float32"` or `"float64"`, of real numbers.
 
     **Raises:** as `space.from_row`.
     """
@@ -44,7 +49,7 @@ def _cast(leaf: np.ndarray, precision: str) -> np.ndarray:
     return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
 
 
-def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
+def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str) -> PyTree:
     names = domain.columns(name)
     if isinstance(domain, Struct):
         return {part: _batch(inner, columns, dotted(name, part)) for part, inner in domain.fields}
@@ -58,7 +63,7 @@ def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
     # One row at a time, but equal ones once.
     rows = list(zip(*(columns[column].tolist() for column in names), strict=True))
     count = len(next(iter(columns.values())))
-    known: dict[Any, Any] = {}
+    known: dict[tuple, PyTree] = {}
     for row in rows or [()]:
         if row not in known:
             entries = dict(zip(names, row, strict=True))
@@ -67,15 +72,15 @@ def _batch(domain: Any, columns: Mapping[str, np.ndarray], name: str) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
 
-def nudged(domains: Mapping[str, Domain], features: Mapping[str, Any]) -> dict[str, Any]:
+def nudged(domains: Mapping[str, Domain], features: Mapping[str, PyTree]) -> dict[str, PyTree]:
     """Return the same features `[n, ...]`, their real numbers one rounding of float32 away.
 
-    Not out of their domains, and not numbers of which there are only some (choices, constants).
+    They stay in their domains; choices and constants stay as they are.
     """
     return {name: _nudged(domain, features[name]) for name, domain in domains.items()}
 
 
-def _nudged(domain: Any, value: Any) -> Any:
+def _nudged(domain: Domain, value: PyTree) -> PyTree:
     if isinstance(domain, Struct):
         return {name: _nudged(part, value[name]) for name, part in domain.fields}
     if isinstance(domain, Signal):

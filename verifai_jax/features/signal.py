@@ -1,13 +1,12 @@
-"""Functions of time as features: a `Signal` is varied through its control points."""
+"""Functions of time as features (`Signal`), varied through their control points."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.waveform import HOLDS, Waveform, is_waveform, seconds
@@ -25,7 +24,7 @@ class Signal(Domain):
     **Arguments:**
 
     - `domain`: of each control point: a `Box`, of numbers or vectors, or a distribution.
-    - `knots`: how many control points, at equal distances.
+    - `knots`: number of control points, at equal distances.
     - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
       `"constant"` holds each for an equal part of the time.
     - `duration`: in seconds; that of the simulation when left out (`ode` knows it).
@@ -73,8 +72,8 @@ class Signal(Domain):
     def to_unit(self, value: Waveform) -> Float[Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit)(value.knots))
 
-    def coerce(self, value: Any) -> Waveform:
-        """A `Waveform`, a list of control points, or one value for all times."""
+    def coerce(self, value: PyTree) -> Waveform:
+        """Convert a `Waveform`, a list of control points, or one value for all times."""
         if is_waveform(value):
             return self._waveform(self.domain.coerce(value.knots))
         knots = self.domain.coerce(value)
@@ -82,8 +81,8 @@ class Signal(Domain):
             knots = jnp.broadcast_to(knots, (self.knots, *knots.shape))
         return self._waveform(knots)
 
-    def check(self, value: Any, name: str) -> None:
-        if is_waveform(value):
+    def check(self, value: object, name: str) -> None:
+        if isinstance(value, Waveform):
             if (value.hold, value.duration) not in ((self.hold, self.duration), (self.hold, None)):
                 raise ValueError(
                     f"{name} must have hold={self.hold!r} and duration={self.duration}; got "
@@ -110,12 +109,12 @@ class Signal(Domain):
             columns |= self.domain.to_columns(knots[:, i], knot)
         return columns
 
-    def from_columns(self, row: Mapping[str, Any], name: str) -> Waveform:
+    def from_columns(self, row: Mapping[str, object], name: str) -> Waveform:
         knots = [self.domain.from_columns(row, knot) for knot in indexed(name, self.knots)]
         return self._waveform(jnp.stack(knots))
 
     def refined(self, factor: int) -> "Signal":
-        """The same signal with more control points, among which are all of the coarse one's.
+        """Return the signal with more control points, among which are all of the coarse one's.
 
         `(knots - 1) * factor + 1` where linear, `knots * factor` where constant: `Waveform.refined`
         gives the same function on them, so that a search can go from coarse to fine.
@@ -128,10 +127,10 @@ class Signal(Domain):
         return replace(self, knots=finer - factor + 1 if self.hold == "linear" else finer)
 
     def refine(self, value: Waveform, factor: int) -> Waveform:
-        """A value of this signal as one of `refined(factor)`: the same function of time."""
+        """Convert a value to one of `refined(factor)`: the same function of time."""
         return value.refined(factor)
 
-    def _waveform(self, knots: Any) -> Waveform:
+    def _waveform(self, knots: Float[Array, "*knots"]) -> Waveform:
         return Waveform(knots, self.hold, self.duration)
 
     def __repr__(self) -> str:

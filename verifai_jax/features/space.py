@@ -1,9 +1,10 @@
-"""The feature space: all that varies, in the order written, over one unit cube.
+"""The feature space: all varied features, in the order written, over one unit cube.
 
 space = FeatureSpace({"x0": Box(-0.05, 0.05), "alg": Categorical("ppo", "sac")})
 features = space.unflatten(u)                        # u[dim] -> {"x0": ..., "alg": ...}
 table = space.rows(jax.vmap(space.unflatten)(us))    # us[n, dim] -> columns [n]
-space.from_row(table.loc[7])                         # what was simulated in row 7
+space.from_row(table.loc[7])                         # the features simulated in row 7
+space.distance({"x0": 0, "alg": "ppo"}, {"x0": 0.01, "alg": "sac"})
 FeatureSpace({...}, where=lambda f: f["x"] < f["y"])                 # a constraint
 space.only("x0", nominal={"alg": "ppo"})                             # a view
 """
@@ -18,12 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
+from numpy.typing import ArrayLike
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
+from verifai_jax.features.distributions import Distribution
 from verifai_jax.features.domain import Domain, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
@@ -47,41 +50,43 @@ class FeatureSpace:
     """
 
     def __init__(
-        self, domains: Mapping[str, Domain], where: Callable[[Any], Any] | None = None
+        self,
+        domains: Mapping[str, Domain],
+        where: Callable[[Any], Bool[Array, ""]] | None = None,
     ) -> None:
         self.root = Struct(domains)
         if where is not None and not callable(where):
             raise TypeError(f"where must be a function of the features; got {where!r}")
         self.where = where
-        seen: set[str] = set()
+        known: set[str] = set()
         for column in self.columns:
-            if column in seen:
+            if column in known:
                 raise ValueError(f"two features give the table column {column!r}; rename one")
-            seen.add(column)
+            known.add(column)
 
     @property
     def domains(self) -> dict[str, Domain]:
-        """Name -> domain, in the order written."""
+        """Domains by name, in the order written."""
         return dict(self.root.fields)
 
     @cached_property
     def levels(self) -> tuple[int, ...]:
-        """For each coordinate: 0 if continuous, or the number of its equally wide cells."""
+        """Number of cells of each coordinate; 0 if it is continuous."""
         return self.root.levels
 
     @cached_property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """For each coordinate the probabilities of its cells; None where they are equal."""
+        """Probabilities of the cells of each coordinate; None where they are equal."""
         return self.root.weights
 
     @cached_property
     def ordered(self) -> tuple[bool, ...]:
-        """For each coordinate whether its values have an order."""
+        """Whether the values of each coordinate have an order."""
         return self.root.ordered
 
     @cached_property
     def lengths(self) -> tuple[int, ...]:
-        """Which coordinates are lengths of arrays, on which others depend."""
+        """Indices of the coordinates that are lengths of arrays, on which others depend."""
         return self.root.lengths
 
     @cached_property
@@ -91,7 +96,7 @@ class FeatureSpace:
 
     @cached_property
     def coordinates(self) -> tuple[str, ...]:
-        """What each coordinate is called, such as `x0`, `cars.length`, `cars[0].x`."""
+        """Names of the coordinates, such as `x0`, `cars.length`, `cars[0].x`."""
         return self.root.coordinates("")
 
     @property
@@ -104,10 +109,18 @@ class FeatureSpace:
         """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""
         return self.root.columns("")
 
-    def unflatten(self, u: Float[Array, " dim"]) -> dict[str, Any]:
-        """The features at a point of the unit cube; real ones in the dtype of `u`.
+    def unflatten(self, u: ArrayLike | Float[Array, " dim"]) -> dict[str, Any]:
+        """Return the features at a point of the unit cube; real ones in the dtype of `u`.
 
         Pure JAX; `jax.vmap` it for batches.
+
+        **Arguments:**
+
+        - `u`: the point, `[dim]` with entries in `[0, 1]`.
+
+        **Returns:** the features by name, as a system sees them.
+
+        **Raises:** `ValueError` for a point of another shape.
         """
         u = as_real(u)
         if u.shape != (self.dim,):
@@ -118,9 +131,16 @@ class FeatureSpace:
         return self.root.from_unit(u)
 
     def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
-        """The point of the unit cube with these features; the middle of the cell where discrete.
+        """Return the point of the unit cube with these features; cell centres where discrete.
 
-        Pure JAX on what `unflatten` gives; takes plain Python values too. Nothing is checked.
+        Pure JAX on the values that `unflatten` gives; takes plain Python values too. Nothing is
+        checked.
+
+        **Arguments:**
+
+        - `features`: by name; constant and fixed ones may be left out.
+
+        **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self._completed(features)))
 
@@ -137,13 +157,18 @@ class FeatureSpace:
         )
 
     def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:
-        """Return the points of the unit cube that the rows of a table came from."""
+        """Return the points of the unit cube that the rows of a table came from.
+
+        **Raises:** `KeyError` for a missing column; `ValueError` for an entry of the wrong kind.
+        """
         records = rows.loc[:, list(self.columns)].to_dict("records")
         features = [self.from_row(row) for row in records]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *features)
         return np.asarray(jax.jit(jax.vmap(self.flatten))(stacked))
 
-    def features_of(self, rows: Mapping[str, Any], precision: str = "float32") -> dict[str, Any]:
+    def features_of(
+        self, rows: Mapping[str, ArrayLike], precision: str = "float32"
+    ) -> dict[str, Any]:
         """Return the features `[n, ...]` that rows of a table hold: `from_row` of each, stacked.
 
         **Arguments:**
@@ -160,7 +185,14 @@ class FeatureSpace:
         return nudged(self.domains, features)
 
     def coerce(self, features: Mapping[str, Any]) -> dict[str, Any]:
-        """Features that a person wrote (numbers, lists, choices), checked, as a system sees them.
+        """Check features that a person wrote and convert them to those that a system sees.
+
+        **Arguments:**
+
+        - `features`: numbers, lists, choices, dictionaries by name; constant and fixed ones may be
+          left out.
+
+        **Returns:** the features as `unflatten` gives them.
 
         **Raises:** as `check`.
         """
@@ -168,7 +200,7 @@ class FeatureSpace:
         return self.root.coerce(self._completed(features))
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features, of which constant and fixed ones may be left out.
+        """Check concrete features; constant and fixed ones may be left out.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, and for features that break the constraint.
@@ -181,62 +213,90 @@ class FeatureSpace:
             )
 
     def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
-        """Whether the constraint holds; True without one. Pure JAX."""
+        """Return whether the constraint holds; True without one. Pure JAX."""
         return jnp.asarray(True if self.where is None else self.where(features))
 
     @cached_property
-    def accepts_points(self) -> Callable[[Any], Bool[Array, " n"]]:
-        """Whether the constraint holds at points `[n, dim]` of the unit cube; compiled."""
+    def accepts_points(self) -> Callable[[ArrayLike | Array], Bool[Array, " n"]]:
+        """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
         return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
 
     @property
-    def constraint(self) -> Callable[[Any], Bool[Array, " n"]] | None:
+    def constraint(self) -> Callable[[ArrayLike | Array], Bool[Array, " n"]] | None:
         """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
         return None if self.where is None else self.accepts_points
 
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
-        """The share of the prior that the constraint accepts, measured; 1 without one.
+        """Measure the share of the prior that the constraint accepts; 1 without one.
+
+        **Arguments:**
+
+        - `seed`: of the samples.
 
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
         accepts none of 65 536 samples.
         """
-        return 1.0 if self.where is None else acceptance_rate(self, seed)
+        where = self.where
+        if where is None:
+            return 1.0
+        return acceptance_rate(
+            lambda u: where(self.unflatten(u)), self.accepts_points, [*self.domains], self.dim, seed
+        )
 
     def sample(self, key: Key[Array, ""], count: int) -> dict[str, Any]:
-        """`count` features drawn from the prior, stacked along a leading axis; for people.
+        """Draw features from the prior; for people.
 
-        **Raises:** as `check_where`.
+        **Arguments:**
+
+        - `key`: a random key of JAX.
+        - `count`: number of samples.
+
+        **Returns:** the features by name, stacked along a leading axis `[count, ...]`.
+
+        **Raises:** as `check_where`; `ValueError` for a count that is not a positive integer.
         """
         self.check_where()
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"the number of samples must be a positive integer; got {count!r}")
-        found, have = [], 0
+        samples, total = [], 0
         many = jax.jit(jax.vmap(self.unflatten))
-        while have < count:
+        while total < count:
             key, now = jax.random.split(key)
             points = jax.random.uniform(now, (max(count, 64), self.dim))
-            kept = np.flatnonzero(self.accepts_points(points))[: count - have]
-            found.append(jax.tree.map(lambda leaf, kept=kept: leaf[kept], many(points)))
-            have += len(kept)
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *found)
+            accepted = np.flatnonzero(self.accepts_points(points))[: count - total]
+            samples.append(jax.tree.map(lambda leaf, i=accepted: leaf[i], many(points)))
+            total += len(accepted)
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
 
     def distance(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> Float[Array, ""]:
-        """How far two features lie apart: Euclidean over the unit coordinates.
+        """Return the distance between two points of the space: Euclidean over unit coordinates.
 
         That is by probability in continuous coordinates, by difference of places (from 0 to 1)
         in integers and lengths, and 0 or 1 between choices; an absent item counts as one in the
-        middle of its domain. Pure JAX on what `unflatten` gives; a metric.
+        middle of its domain. A metric; pure JAX on the values that `unflatten` gives.
+
+        **Arguments:**
+
+        - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
+          lists, choices, dictionaries by name; constant and fixed ones may be left out).
+
+        **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
+        its domain, for values that a person wrote.
         """
         levels, ordered = np.array(self.levels, int), np.array(self.ordered, bool)
         scale = np.where(levels > 1, levels / np.maximum(levels - 1, 1), 1.0)
-        gap = jnp.abs(self.root.to_unit(one) - self.root.to_unit(other))
+        gap = jnp.abs(self._point(one) - self._point(other))
         gap = jnp.where((levels > 0) & ~ordered, (gap > 0).astype(gap.dtype), gap * scale)
-        # The square root has no slope at zero, where two points are the same.
+        # The square root has no derivative at zero, where two points are the same.
         square = jnp.sum(gap * gap)
         return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
     def fixed(self, **values: Any) -> "FeatureSpace":
-        """The same space with these features held at a value; they keep their table columns.
+        """Return the space with these features held at a value; they keep their table columns.
+
+        **Arguments:**
+
+        - `values`: by name, as a person writes them.
 
         **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
         """
@@ -248,7 +308,12 @@ class FeatureSpace:
         return FeatureSpace(domains, self.where)
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "FeatureSpace":
-        """The same space with these features varied alone, the others held at `nominal`.
+        """Return the space with these features varied alone, the others held at `nominal`.
+
+        **Arguments:**
+
+        - `features`: names of those that vary.
+        - `nominal`: values of the others, by name, as a person writes them.
 
         **Raises:** `ValueError` for no or an unknown feature, or one without a nominal value.
         """
@@ -269,10 +334,14 @@ class FeatureSpace:
             )
         return self.fixed(**{name: (nominal or {})[name] for name in others})
 
-    def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[Any], Any]]":
-        """From coarse to fine: the space with finer signals, and a map of features to it.
+    def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[dict], dict]]":
+        """Return the space with finer signals, and a map of features to it.
 
         See `Signal.refined`; the finer features are the same functions of time.
+
+        **Arguments:**
+
+        - `factor`: control points of the finer signals for one of the coarse ones.
 
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
@@ -283,7 +352,7 @@ class FeatureSpace:
         return finer, lambda features: self.root.refine(features, factor)
 
     def to_json(self) -> dict[str, Any]:
-        """The space as plain data; of a constraint only that there is one, and its name.
+        """Describe the space as plain data; of a constraint only that there is one, and its name.
 
         **Raises:** `ValueError` for domains of the user's own.
         """
@@ -294,11 +363,14 @@ class FeatureSpace:
     def from_json(
         cls,
         data: Mapping[str, Any],
-        where: Callable[[Any], Any] | None = None,
-        distributions: Mapping[str, Any] | None = None,
+        where: Callable[[Any], Bool[Array, ""]] | None = None,
+        distributions: Mapping[str, Distribution] | None = None,
     ) -> "FeatureSpace":
-        """The space that `to_json` described; code is given, never read.
+        """Build the space that `to_json` described; code is given, never read.
 
+        **Arguments:**
+
+        - `data`: as `to_json` gives it.
         - `where`: the constraint, if the space has one.
         - `distributions`: those with functions of their own, by name.
 
@@ -316,11 +388,11 @@ class FeatureSpace:
         return cls(dict(root.fields), where)
 
     def rows(self, features: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
+        """Return columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
         return self.root.to_columns(features, "")
 
     def from_row(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """The features that a row of the table (pandas or a mapping) holds, exactly.
+        """Return the features that a row of the table (pandas or a mapping) holds, exactly.
 
         Other columns are ignored; a value outside its domain is taken as it is.
 
@@ -334,13 +406,20 @@ class FeatureSpace:
         return self.root.from_columns(row, "")
 
     def describe(self) -> str:
-        """One line a feature: its name, its domain and its unit coordinates."""
+        """Describe the space, one line a feature: its name, its domain and its unit coordinates."""
         rows = self._summary()
         widths = [max(len(row[i]) for row in rows) for i in range(3)]
         return "\n".join(
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
             for row in rows
         )
+
+    def _point(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
+        """Return the point of these features, checked unless a system sees them so."""
+        leaves = jax.tree.leaves(features, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
+        if not all(isinstance(leaf, jax.Array) for leaf in leaves):
+            self.root.check(self._completed(features), "")
+        return self.flatten(features)
 
     def _completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
         if not isinstance(features, Mapping):
@@ -395,8 +474,8 @@ def _varied(domain: Domain) -> Domain:
     return domain.domain if isinstance(domain, Fixed) else domain
 
 
-def _source(where: Callable[[Any], Any]) -> str:
-    """What a constraint is called."""
+def _source(where: Callable[[Any], Bool[Array, ""]]) -> str:
+    """Return the name of a constraint."""
     name = getattr(where, "__name__", type(where).__name__)
     if name == "<lambda>":
         code = where.__code__

@@ -16,10 +16,19 @@ import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Observations, Search, check_count
 
-BITS = 32  # of the index
-PLAIN_UP_TO = 8  # coordinates; beyond, the bases are so large that lines are visible
+BITS = 32
+"""Bits of the index of a point."""
+
+PLAIN_UP_TO = 8
+"""Number of bases up to which the sequence is plain: in larger ones lines are visible."""
+
+MOST_SKIPPED_POINTS = 2**31
+"""Skipped points at most, so that as many indices remain."""
+
+MOST_SKIPPED_BASES = 10_000
+"""Skipped bases at most."""
 
 
 class HaltonState(NamedTuple):
@@ -34,27 +43,44 @@ class Halton(Search[HaltonState]):
     **Arguments:**
 
     - `scramble`: permute digits at random (from the key). `False` is the plain sequence, which
-      does not depend on the key. By default plain up to 8 coordinates and scrambled above.
+      does not depend on the key. By default plain where all bases are among the first 8 primes
+      (up to 8 coordinates), and scrambled otherwise.
+    - `skip_points`: number of points left out at the beginning of the sequence; the first one has
+      index `1 + skip_points`. VerifAI calls it `sample_index`.
+    - `skip_bases`: number of primes left out; the first coordinate has base 3 after one. VerifAI
+      calls it `bases_skipped`.
 
-    **Raises:** `ValueError` for a `scramble` other than True, False and None.
+    **Raises:** `ValueError` for a `scramble` other than True, False and None, or numbers to skip
+    that are no integers, negative or too large.
     """
 
     scramble: bool | None = None
+    skip_points: int = 0
+    skip_bases: int = 0
     learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.scramble is not None and not isinstance(self.scramble, bool):
             raise ValueError(f"scramble must be True, False or None; got {self.scramble!r}")
+        for name, most in (
+            ("skip_points", MOST_SKIPPED_POINTS),
+            ("skip_bases", MOST_SKIPPED_BASES),
+        ):
+            count = getattr(self, name)
+            check_count(name, count, 0)
+            if count > most:
+                raise ValueError(f"{name} must be at most {most}; got {count!r}")
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> HaltonState:
-        return HaltonState(key, jnp.uint32(1))
+        return HaltonState(key, jnp.uint32(1 + self.skip_points))
 
     def ask(
         self, state: HaltonState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], HaltonState]:
-        scramble = cube.dim > PLAIN_UP_TO if self.scramble is None else self.scramble
+        last = self.skip_bases + cube.dim
+        scramble = last > PLAIN_UP_TO if self.scramble is None else self.scramble
         index = state.index + jnp.arange(batch, dtype=jnp.uint32)
-        u = halton_points(index, cube.dim, state.key if scramble else None)
+        u = halton_points(index, cube.dim, state.key if scramble else None, self.skip_bases)
         return u, state._replace(index=state.index + batch)
 
     def tell(self, state: HaltonState, cube: Cube, observations: Observations) -> HaltonState:
@@ -62,10 +88,18 @@ class Halton(Search[HaltonState]):
 
 
 def halton_points(
-    index: UInt32[Array, " n"], dim: int, key: Key[Array, ""] | None = None
+    index: UInt32[Array, " n"], dim: int, key: Key[Array, ""] | None = None, skip_bases: int = 0
 ) -> Float[Array, "n dim"]:
-    """Points number `index` of the Halton sequence, in `[0, 1)`; scrambled if there is a key."""
-    bases = np.array(primes(dim), np.uint32)
+    """Compute points number `index` of the Halton sequence, in `[0, 1)`.
+
+    **Arguments:**
+
+    - `index`: of the points, from 1 on (point 0 is the corner at the origin).
+    - `dim`: number of coordinates.
+    - `key`: of the random permutations of digits; the sequence is plain without.
+    - `skip_bases`: number of primes left out before the base of the first coordinate.
+    """
+    bases = np.array(primes(skip_bases + dim)[skip_bases:], np.uint32)
     digits = np.array([_digits(int(base)) for base in bases], int)
     maps = None if key is None else _digit_maps(key, bases, int(np.max(digits, initial=0)))
     blocks = [jnp.zeros((len(index), 0), jnp.float32)]
@@ -78,7 +112,7 @@ def halton_points(
 
 
 def primes(count: int) -> list[int]:
-    """The first `count` primes."""
+    """Return the first `count` primes."""
     # The n-th prime is below n (log n + log log n) for n >= 6.
     limit = 13 if count < 6 else int(count * (np.log(count) + np.log(np.log(count)))) + 1
     sieve = np.ones(limit + 1, bool)
@@ -90,7 +124,7 @@ def primes(count: int) -> list[int]:
 
 
 def _digits(base: int) -> int:
-    """How many digits an index may have in this base."""
+    """Return the number of digits that an index may have in this base."""
     digits = 1
     while base**digits < 2**BITS:
         digits += 1
@@ -122,7 +156,7 @@ def _radical_inverse(
 def _digit_maps(
     key: Key[Array, ""], bases: UInt32[np.ndarray, " d"], digits: int
 ) -> tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]]:
-    """Random factors in `[1, base)` and shifts in `[0, base)` for every digit of every base."""
+    """Draw factors in `[1, base)` and shifts in `[0, base)` for every digit of every base."""
     factor, shift = jax.random.uniform(key, (2, digits, len(bases)), jnp.float32)
     return (
         1 + (factor * (bases - 1)).astype(jnp.uint32),

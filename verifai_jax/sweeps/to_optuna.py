@@ -72,8 +72,8 @@ def distribution(optuna: Any, domain: Domain | None, values: Any) -> Any:
             return None
         case LogUniform(low, high):
             return optuna.distributions.FloatDistribution(float(low), float(high), log=True)
-        case DiscreteBox(low, high):
-            return optuna.distributions.IntDistribution(int(low), int(high))
+        case DiscreteBox(int(low), int(high)):
+            return optuna.distributions.IntDistribution(low, high)
         case Categorical():
             plain = [
                 c if isinstance(c, bool | int | float | str) else str(c) for c in domain.choices

@@ -308,8 +308,8 @@ def probes(domain: Domain) -> list[tuple[Any, str]]:
             return [(domain.value, "the value")]
         case Categorical() if len(domain.choices) <= _PROBES:
             return [(choice, "a choice") for choice in domain.choices]
-        case DiscreteBox() if domain.count <= _PROBES:
-            inner = [(value, "a value") for value in range(domain.low + 1, domain.high)]
+        case DiscreteBox(int(low), int(high)) if high - low < _PROBES:
+            inner = [(value, "a value") for value in range(low + 1, high)]
             return [(domain.low, "the lower end"), *inner, (domain.high, "the upper end")]
         case Box() | DiscreteBox() | LogUniform() | TruncatedNormal():
             # As it was written, not as float32 has it.

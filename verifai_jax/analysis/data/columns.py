@@ -152,7 +152,11 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
         prior = tuple(float(weight) for weight in weights) if weights else (1 / count,) * count
         return {name: {"ordered": False, "choices": _shown(domain), "prior": prior}}
     if isinstance(domain, DiscreteBox):
-        return {name: _integers(domain.low, domain.high)}
+        ends = zip(np.ravel(domain.low).tolist(), np.ravel(domain.high).tolist(), strict=True)
+        return {
+            column: _integers(low, high)
+            for column, (low, high) in zip(domain.columns(name), ends, strict=True)
+        }
     if isinstance(domain, Box):
         ends = zip(np.ravel(domain.low), np.ravel(domain.high), strict=True)
         return {
