@@ -8,11 +8,12 @@ Each raises `AssertionError` that says which law is broken.
 """
 
 import operator
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
@@ -20,12 +21,20 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Observations, Search
-from verifai_jax.systems.base import as_system
+from verifai_jax.systems.base import System, as_system
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
+
+State = TypeVar("State")
 
 
 def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
-    """Check the laws of a domain on `samples` random points and on the corners of its cube.
+    """Check the laws of a domain on random points and on the corners of its cube.
+
+    **Arguments:**
+
+    - `domain`: to check.
+    - `samples`: number of random points.
+    - `seed`: of the points.
 
     **Raises:** `AssertionError` naming the broken law.
     """
@@ -42,7 +51,7 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     u = jax.random.uniform(jax.random.key(seed), (samples, size), jnp.float32)
     u = jnp.concatenate([u, jnp.zeros((1, size)), jnp.ones((1, size))])
 
-    def round_trip(u: Any) -> tuple[Any, Any, Any]:
+    def round_trip(u: Array) -> tuple[PyTree, Array, PyTree]:
         value = domain.from_unit(u)
         back = domain.to_unit(value)
         return value, back, domain.from_unit(back)
@@ -71,10 +80,10 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     columns = domain.columns("value")
     rows = domain.to_columns(jax.tree.map(np.asarray, values), "value")
     assert tuple(rows) == columns, f"to_columns must give {columns}; got {tuple(rows)}"
-    few = domain.to_columns(jax.tree.map(lambda leaf: np.asarray(leaf)[:1], values), "value")
+    one = domain.to_columns(jax.tree.map(lambda leaf: np.asarray(leaf)[:1], values), "value")
     for name, column in rows.items():
         assert column.shape == (len(u),), f"column {name} must have shape [{len(u)}]"
-        assert column.dtype == few[name].dtype, f"column {name} must have one dtype in all batches"
+        assert column.dtype == one[name].dtype, f"column {name} must have one dtype in all batches"
     for i in (0, 1, -2, -1):
         value = jax.tree.map(operator.itemgetter(i), values)
         row = {name: column[i] for name, column in rows.items()}
@@ -91,6 +100,14 @@ def check_search(
 ) -> None:
     """Check the contract of a search on one cube, on a quadratic robustness with failures.
 
+    **Arguments:**
+
+    - `search`: to check.
+    - `cube`: that it searches.
+    - `batch`: points in a round.
+    - `rounds`: number of rounds.
+    - `seed`: of its random key.
+
     **Raises:** `AssertionError` naming the broken law.
     """
     search.check(cube)
@@ -106,8 +123,10 @@ def check_search(
     key = jax.random.key(seed)
     odd = np.arange(batch) % 3 == 1
 
-    def run(state: Any, first: int, last: int, spoil: float | None = None) -> tuple[Any, list]:
-        seen = []
+    def run(
+        state: PyTree, first: int, last: int, spoil: float | None = None
+    ) -> tuple[PyTree, list[np.ndarray]]:
+        points = []
         for _ in range(first, last):
             u, asked = ask(state, cube, batch)
             assert u.shape == (batch, cube.dim), (
@@ -124,8 +143,8 @@ def check_search(
                 told = _spoiled(told, odd, spoil)
             state = tell(asked, cube, told)
             _same_type(asked, state)
-            seen.append(np.asarray(u))
-        return state, seen
+            points.append(np.asarray(u))
+        return state, points
 
     state = init(key, cube, batch)
     middle, before = run(state, 0, rounds // 2)
@@ -163,18 +182,24 @@ def check_search(
 def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) -> None:
     """Check that a passive search gives the same points whatever the batch size is.
 
+    **Arguments:**
+
+    - `search`: to check.
+    - `cube`: that it searches.
+    - `points`: number of points to compare.
+
     **Raises:** `AssertionError` if it does not.
     """
-    seen = []
+    sequences = []
     for batch in (points, points // 3, 5):
         state, parts = search.init(jax.random.key(1), cube, batch), []
         while sum(map(len, parts)) < points:
             u, state = search.ask(state, cube, batch)
             state = search.tell(state, cube, _evaluate(u, search, state, cube))
             parts.append(np.asarray(u))
-        seen.append(np.concatenate(parts)[:points])
-    for other in seen[1:]:
-        _same(seen[0], other, "points must not depend on the batch size", exact=True)
+        sequences.append(np.concatenate(parts)[:points])
+    for other in sequences[1:]:
+        _same(sequences[0], other, "points must not depend on the batch size", exact=True)
 
 
 def check_system(
@@ -182,8 +207,14 @@ def check_system(
 ) -> None:
     """Check the contract of a system on random features: pure, one clock, all its ways agree.
 
-    - `tolerance`: by how much signals may differ between the ways to simulate, relative to their
-      largest value.
+    **Arguments:**
+
+    - `system`: to check, as `Problem` takes it.
+    - `space`: of the features that it takes.
+    - `samples`: number of random features.
+    - `seed`: of features and keys.
+    - `tolerance`: difference of signals between the ways to simulate, relative to their largest
+      value.
 
     **Raises:** `AssertionError` naming the broken law.
     """
@@ -224,7 +255,7 @@ def check_system(
         assert shapes == given, f"abstract must tell the signals' shapes {given}; got {shapes}"
 
 
-def _check_trace(trace: Any) -> None:
+def _check_trace(trace: object) -> None:
     assert isinstance(trace, Trace), f"a system must return a Trace; got {type(trace).__name__}"
     times = np.asarray(trace.clock())
     assert np.all(np.diff(times) > 0), "sample times must increase"
@@ -243,11 +274,13 @@ def _check_trace(trace: Any) -> None:
             )
 
 
-def _check_fold(system: Any, features: Any, keys: Any, alone: Any, tolerance: float) -> None:
+def _check_fold(
+    system: System, features: PyTree, keys: Array, alone: list[Trace], tolerance: float
+) -> None:
     names = list(alone[0].signals)
 
-    def totals(features: Any, key: Any) -> Any:
-        def add(carry: Any, sample: Any) -> Any:
+    def totals(features: PyTree, key: Array) -> PyTree:
+        def add(carry: dict[str, Array], sample: dict[str, Array]) -> dict[str, Array]:
             return {name: carry[name] + jnp.sum(sample[name]) for name in names}
 
         start = {name: jnp.zeros(()) for name in names}
@@ -266,7 +299,7 @@ def _check_fold(system: Any, features: Any, keys: Any, alone: Any, tolerance: fl
             )
 
 
-def _agree_all(alone: Any, batch: Trace, tolerance: float, ways: str) -> None:
+def _agree_all(alone: list[Trace], batch: Trace, tolerance: float, ways: str) -> None:
     for i, trace in enumerate(alone):
         row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], batch)
         _agree(trace, row, tolerance, f"a simulation must give the same {ways}")
@@ -291,8 +324,8 @@ def _status(trace: Trace) -> str:
     return Status(0 if trace.status is None else int(trace.status)).name
 
 
-def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Observations:
-    """A bowl with its bottom, and failures, off the middle, told as the search wants it."""
+def _evaluate(u: Array, search: Search, asked: PyTree, cube: Cube) -> Observations:
+    """Evaluate a bowl with its bottom, and failures, off the middle, as the search wants it."""
     offset = u - 0.3
     rho, slope = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
     told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
@@ -314,8 +347,8 @@ def _evaluate(u: Any, search: Search, asked: Any, cube: Cube) -> Observations:
     )
 
 
-def _spoiled(told: Observations, rows: Any, value: float) -> Observations:
-    def spoil(leaf: Any) -> Any:
+def _spoiled(told: Observations, rows: np.ndarray, value: float) -> Observations:
+    def spoil(leaf: Array | None) -> Any:
         if leaf is None:
             return None
         return jnp.where(rows.reshape(-1, *(1,) * (leaf.ndim - 1)), value, leaf)
@@ -329,10 +362,10 @@ def _spoiled(told: Observations, rows: Any, value: float) -> Observations:
     )
 
 
-def _saved(state: Any) -> Any:
-    """The state after a detour through plain NumPy arrays."""
+def _saved(state: State) -> State:
+    """Return the state after a detour through plain NumPy arrays."""
 
-    def detour(leaf: Any) -> Any:
+    def detour(leaf: Array) -> Array:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             data = np.array(jax.random.key_data(leaf))
             return jax.random.wrap_key_data(jnp.asarray(data), impl=jax.random.key_impl(leaf))
@@ -341,7 +374,7 @@ def _saved(state: Any) -> Any:
     return jax.tree.map(detour, state)
 
 
-def _same_type(before: Any, after: Any, step: str = "tell") -> None:
+def _same_type(before: PyTree, after: PyTree, step: str = "tell") -> None:
     assert jax.tree.structure(before) == jax.tree.structure(after), (
         f"{step} must keep the state's form"
     )
@@ -351,7 +384,7 @@ def _same_type(before: Any, after: Any, step: str = "tell") -> None:
         )
 
 
-def _same(one: Any, two: Any, law: str, exact: bool = False) -> None:
+def _same(one: PyTree, two: PyTree, law: str, exact: bool = False) -> None:
     assert jax.tree.structure(one) == jax.tree.structure(two), f"{law}; the forms differ"
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         a, b = np.asarray(a), np.asarray(b)

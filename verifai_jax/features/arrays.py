@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from verifai_jax.core.waveform import Waveform
-from verifai_jax.features.domain import Domain, as_numbers, cell, centre, dotted, indexed
+from verifai_jax.features.domain import Domain, Row, as_numbers, cell, centre, dotted, indexed
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,7 +104,7 @@ class Array(Domain):
             columns |= self.domain.to_columns(element, item)
         return columns
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
+    def from_columns(self, row: Row, name: str) -> PyTree:
         return _stacked(
             [self.domain.from_columns(row, item) for item in indexed(name, self.length)]
         )
@@ -132,7 +132,7 @@ class Items:
     """
 
     values: PyTree
-    length: Int[jax.Array, "*n"]
+    length: Int[jax.Array, "*n"] | PyTree  # Any leaf while JAX maps over it.
 
     @property
     def mask(self) -> Bool[jax.Array, "*n places"]:
@@ -253,7 +253,7 @@ class VariableArray(Domain):
                 columns[column] = entries if i < self.least else _emptied(entries, length <= i)
         return columns
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Items:
+    def from_columns(self, row: Row, name: str) -> Items:
         length = self.least
         if self._varies:
             number = as_numbers(row[f"{name}.length"], f"{name}.length").item()

@@ -1,20 +1,21 @@
 """Intervals of real numbers (`Box`) and of integers (`DiscreteBox`), and vectors of them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     LEAST_REAL,
     MOST_LEVELS,
     MOST_REAL,
     Domain,
+    Numbers,
+    Row,
     as_number,
     as_numbers,
     as_real,
@@ -80,13 +81,13 @@ class Box(Domain):
         # From the nearer end: exact at both ends and never outside, whatever the rounding.
         return jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
 
-    def to_unit(self, value: ArrayLike | Array) -> Float[Array, " size"]:
+    def to_unit(self, value: Numbers) -> Float[Array, " size"]:
         value = as_real(value)
         low, high, middle, width = self._limits(value.dtype)
         u = jnp.where(value < middle, (value - low) / width, 1 - (high - value) / width)
         return jnp.ravel(u)
 
-    def coerce(self, value: ArrayLike | Array) -> Float[Array, "*shape"]:
+    def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
         return as_real(value)
 
     def check(self, value: object, name: str) -> None:
@@ -112,7 +113,7 @@ class Box(Domain):
     ) -> dict[str, np.ndarray]:
         return _to_columns(values, self.columns(name))
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Float[Array, "*entries"]:
+    def from_columns(self, row: Row, name: str) -> Float[Array, "*entries"]:
         entries = [as_numbers(row[column], column).item() for column in self.columns(name)]
         return as_real(entries[0] if np.ndim(self.low) == 0 else entries)
 
@@ -188,11 +189,11 @@ class DiscreteBox(Domain):
         places = (u.reshape(low.shape) * count).astype(jnp.int32)
         return jnp.clip(places, 0, count - 1) + low
 
-    def to_unit(self, value: ArrayLike | Array) -> Float[Array, " size"]:
+    def to_unit(self, value: Numbers) -> Float[Array, " size"]:
         low, count = self._limits()
         return jnp.ravel((as_real(jnp.asarray(value) - low) + 0.5) / count)
 
-    def coerce(self, value: ArrayLike | Array) -> Int[Array, "*shape"]:
+    def coerce(self, value: Numbers) -> Int[Array, "*shape"]:
         return jnp.asarray(value, jnp.int32)
 
     def check(self, value: object, name: str) -> None:
@@ -216,7 +217,7 @@ class DiscreteBox(Domain):
     ) -> dict[str, np.ndarray]:
         return _to_columns(values, self.columns(name))
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Int[Array, "*entries"]:
+    def from_columns(self, row: Row, name: str) -> Int[Array, "*entries"]:
         entries = []
         for column in self.columns(name):
             number = as_numbers(row[column], column).item()
@@ -261,12 +262,12 @@ def _in_order(intervals: Sequence[Sequence[float]]) -> list[tuple[float, float]]
     return [(min(interval), max(interval)) for interval in intervals]
 
 
-def _check_shape(numbers: np.ndarray, end: ArrayLike, name: str) -> None:
+def _check_shape(numbers: np.ndarray, end: Numbers, name: str) -> None:
     if numbers.shape != np.shape(end):
         raise ValueError(f"{name} must have shape {list(np.shape(end))}; got {list(numbers.shape)}")
 
 
-def _columns(end: ArrayLike, name: str) -> tuple[str, ...]:
+def _columns(end: Numbers, name: str) -> tuple[str, ...]:
     return (name,) if np.ndim(end) == 0 else indexed(name, np.size(end))
 
 

@@ -1,7 +1,7 @@
 """Values without an order: one of several choices (`Categorical`), or a `Constant`."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, Shaped
-from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     MOST_LEVELS,
     MOST_REAL,
     Domain,
+    Numbers,
+    Row,
     as_number,
     as_numbers,
     as_real,
@@ -148,7 +149,7 @@ class Categorical(Domain):
         dtype = u.dtype if self._dtype == np.float64 else self._dtype
         return jnp.asarray(self._shown, dtype)[index]
 
-    def to_unit(self, value: ArrayLike | Array) -> Float[Array, "1"]:
+    def to_unit(self, value: Numbers) -> Float[Array, "1"]:
         index = jnp.asarray(value)
         if self.numeric:
             index = jnp.argmin(jnp.abs(as_real(index) - self._shown.astype(np.float32)))
@@ -193,7 +194,7 @@ class Categorical(Domain):
             index = order[np.searchsorted(middles, index.astype(np.float64))]
         return {name: self._shown[index]}
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Shaped[Array, ""]:
+    def from_columns(self, row: Row, name: str) -> Shaped[Array, ""]:
         shown = as_scalar(row[name])
         if not self.numeric:
             places = {text: i for i, text in enumerate(self._shown)}
@@ -291,7 +292,7 @@ class Constant(Domain):
     def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
         return {}
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Shaped[Array, "*shape"]:
+    def from_columns(self, row: Row, name: str) -> Shaped[Array, "*shape"]:
         return self._value(jnp.result_type(float))
 
     def _value(self, real: np.dtype) -> Shaped[Array, "*shape"]:

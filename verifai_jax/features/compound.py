@@ -12,7 +12,7 @@ from jaxtyping import Float, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.features.box import Box
-from verifai_jax.features.domain import Domain, dotted
+from verifai_jax.features.domain import Domain, Row, dotted
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -131,7 +131,7 @@ class Struct(Domain):
             columns |= domain.to_columns(values[field], dotted(name, field))
         return columns
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> dict[str, PyTree]:
+    def from_columns(self, row: Row, name: str) -> dict[str, PyTree]:
         return {
             field: domain.from_columns(row, dotted(name, field)) for field, domain in self.fields
         }

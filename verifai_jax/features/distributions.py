@@ -9,7 +9,7 @@ distribution (inverse transform sampling). Both tails are computed from the smal
 
 import abc
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -17,12 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Bool, Float
-from numpy.typing import ArrayLike
 
 from verifai_jax.features.domain import (
     LEAST_REAL,
     MOST_REAL,
     Domain,
+    Numbers,
+    Row,
     as_number,
     as_numbers,
     as_real,
@@ -58,10 +59,10 @@ class Continuous(Domain):
     def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
         return self.quantile(u[0]).astype(u.dtype)
 
-    def to_unit(self, value: ArrayLike | Array) -> Float[Array, "1"]:
+    def to_unit(self, value: Numbers) -> Float[Array, "1"]:
         return jnp.clip(self.probability(as_real(value)), 0, 1)[None]
 
-    def coerce(self, value: ArrayLike | Array) -> Float[Array, "*shape"]:
+    def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
         return as_real(value)
 
     def check(self, value: object, name: str) -> None:
@@ -92,7 +93,7 @@ class Continuous(Domain):
     ) -> dict[str, np.ndarray]:
         return {name: np.asarray(values)}
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Float[Array, ""]:
+    def from_columns(self, row: Row, name: str) -> Float[Array, ""]:
         return as_real(as_numbers(row[name], name).item())
 
 

@@ -13,14 +13,13 @@ The unit cube is the probability space: uniform coordinates give the prior on th
 
 import abc
 import math
-from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
-from numpy.typing import ArrayLike
 
 MOST_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
@@ -31,7 +30,23 @@ LEAST_REAL = float(np.finfo(np.float32).tiny)
 MOST_REAL = float(np.finfo(np.float32).max)
 """Largest float32 number."""
 
+Numbers: TypeAlias = float | Sequence | np.generic | np.ndarray | jax.Array
+"""A number or an array of them, as a person, a table or a system writes it."""
+
 Value = TypeVar("Value")
+
+
+@runtime_checkable
+class Row(Protocol):
+    """A row of a table: a mapping, or a row of pandas."""
+
+    def keys(self) -> Iterable[str]:
+        """Return the names of the columns."""
+        ...
+
+    def __getitem__(self, key: str, /) -> Any:
+        """Return the entry of a column."""
+        ...
 
 
 class Domain(abc.ABC):
@@ -86,7 +101,7 @@ class Domain(abc.ABC):
         """Return a batch of values (leaves `[n, ...]`) as table columns `[n]`."""
 
     @abc.abstractmethod
-    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
+    def from_columns(self, row: Row, name: str) -> PyTree:
         """Return the value that a table row holds, exactly.
 
         **Raises:** `ValueError` for an entry that is no value of this kind.
@@ -138,12 +153,12 @@ def cell(u: Float[Array, "*shape"], count: int) -> Int[Array, "*shape"]:
     return jnp.clip((u * count).astype(jnp.int32), 0, count - 1)
 
 
-def centre(index: ArrayLike | Array, count: int) -> Float[Array, "1"]:
+def centre(index: Numbers, count: int) -> Float[Array, "1"]:
     """Return the middle of a cell."""
     return jnp.reshape((as_real(index) + 0.5) / count, (1,))
 
 
-def as_real(value: ArrayLike | Array) -> Float[Array, "*shape"]:
+def as_real(value: Numbers) -> Float[Array, "*shape"]:
     """Convert to an array of real numbers; integers and lists get JAX's default precision."""
     array = jnp.asarray(value)
     real = jnp.issubdtype(array.dtype, jnp.floating) and not array.weak_type

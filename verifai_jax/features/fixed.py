@@ -1,6 +1,5 @@
 """Features held at one value (`Fixed`): those that a view of a space does not vary."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from verifai_jax.features.domain import Domain, as_scalar
+from verifai_jax.features.domain import Domain, Row, as_scalar
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -68,7 +67,7 @@ class Fixed(Domain):
     def to_columns(self, values: PyTree, name: str) -> dict[str, np.ndarray]:
         return self.domain.to_columns(values, name)
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> PyTree:
+    def from_columns(self, row: Row, name: str) -> PyTree:
         return self.domain.from_columns(row, name)
 
     def refined(self, factor: int) -> "Fixed":

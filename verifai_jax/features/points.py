@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-from numpy.typing import ArrayLike
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.precision import in_precision
@@ -15,7 +14,7 @@ from verifai_jax.core.waveform import Waveform
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import Domain, as_numbers, dotted, indexed
+from verifai_jax.features.domain import Domain, Numbers, as_numbers, dotted, indexed
 from verifai_jax.features.signal import Signal
 
 ROUNDING = 2.0**-23
@@ -23,7 +22,7 @@ ROUNDING = 2.0**-23
 
 
 def features_of_rows(
-    domains: Mapping[str, Domain], rows: Mapping[str, ArrayLike], precision: str
+    domains: Mapping[str, Domain], rows: Mapping[str, Numbers], precision: str
 ) -> dict[str, PyTree]:
     """Return the features `[n, ...]` that rows of a table hold, in this precision.
 

@@ -1,6 +1,5 @@
 """Functions of time as features (`Signal`), varied through their control points."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import jax
@@ -12,7 +11,7 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.waveform import HOLDS, Waveform, is_waveform, seconds
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import Domain, as_numbers, indexed
+from verifai_jax.features.domain import Domain, Row, as_numbers, indexed
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class Signal(Domain):
             columns |= self.domain.to_columns(knots[:, i], knot)
         return columns
 
-    def from_columns(self, row: Mapping[str, object], name: str) -> Waveform:
+    def from_columns(self, row: Row, name: str) -> Waveform:
         knots = [self.domain.from_columns(row, knot) for knot in indexed(name, self.knots)]
         return self._waveform(jnp.stack(knots))
 

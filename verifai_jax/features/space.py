@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
-from numpy.typing import ArrayLike
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
@@ -27,7 +26,7 @@ from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Distribution
-from verifai_jax.features.domain import Domain, as_real
+from verifai_jax.features.domain import Domain, Numbers, Row, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
 from verifai_jax.features.points import features_of_rows, nudged
@@ -109,7 +108,7 @@ class FeatureSpace:
         """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""
         return self.root.columns("")
 
-    def unflatten(self, u: ArrayLike | Float[Array, " dim"]) -> dict[str, Any]:
+    def unflatten(self, u: Numbers) -> dict[str, Any]:
         """Return the features at a point of the unit cube; real ones in the dtype of `u`.
 
         Pure JAX; `jax.vmap` it for batches.
@@ -167,7 +166,7 @@ class FeatureSpace:
         return np.asarray(jax.jit(jax.vmap(self.flatten))(stacked))
 
     def features_of(
-        self, rows: Mapping[str, ArrayLike], precision: str = "float32"
+        self, rows: Mapping[str, Numbers], precision: str = "float32"
     ) -> dict[str, Any]:
         """Return the features `[n, ...]` that rows of a table hold: `from_row` of each, stacked.
 
@@ -217,12 +216,12 @@ class FeatureSpace:
         return jnp.asarray(True if self.where is None else self.where(features))
 
     @cached_property
-    def accepts_points(self) -> Callable[[ArrayLike | Array], Bool[Array, " n"]]:
+    def accepts_points(self) -> Callable[[Numbers], Bool[Array, " n"]]:
         """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
         return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
 
     @property
-    def constraint(self) -> Callable[[ArrayLike | Array], Bool[Array, " n"]] | None:
+    def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:
         """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
         return None if self.where is None else self.accepts_points
 
@@ -391,7 +390,7 @@ class FeatureSpace:
         """Return columns `[n]` of the table for a batch of features (leaves `[n, ...]`)."""
         return self.root.to_columns(features, "")
 
-    def from_row(self, row: Mapping[str, Any]) -> dict[str, Any]:
+    def from_row(self, row: Row) -> dict[str, Any]:
         """Return the features that a row of the table (pandas or a mapping) holds, exactly.
 
         Other columns are ignored; a value outside its domain is taken as it is.

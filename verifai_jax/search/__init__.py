@@ -87,12 +87,17 @@ _SEARCHES: dict[str, type[Search]] = {
 
 
 def names() -> tuple[str, ...]:
-    """The names that `named` knows."""
+    """Return the names that `named` knows."""
     return tuple(_SEARCHES)
 
 
 def named(name: str, **options: Any) -> Search:
-    """The search of that name, with its hyper-parameters.
+    """Build a search by its name.
+
+    **Arguments:**
+
+    - `name`: such as `"cross_entropy"`; `names()` lists all.
+    - `options`: hyper-parameters of the search, by name.
 
     **Raises:** `ValueError` for an unknown name or option, or a value out of range.
     """
@@ -104,16 +109,24 @@ def named(name: str, **options: Any) -> Search:
 
 
 def split(parts: Mapping[str, str | Search], rest: str | Search = "uniform") -> Split:
-    """A search for each part of the space, by name or with options; see `Split`."""
-    return Split({name: _search(part) for name, part in parts.items()}, _search(rest))
+    """Build a search that has one for each part of the space; see `Split`.
+
+    **Arguments:**
+
+    - `parts`: feature name -> search, or the name of one.
+    - `rest`: the search of all other features.
+
+    **Raises:** as `named` and `Split`.
+    """
+    return Split({name: _as_search(part) for name, part in parts.items()}, _as_search(rest))
 
 
-def _search(search: str | Search) -> Search:
+def _as_search(search: str | Search) -> Search:
     return named(search) if isinstance(search, str) else search
 
 
 def to_json(search: Search) -> dict[str, Any] | None:
-    """A search as plain data, for the record of a run; None for one that has no name here."""
+    """Describe a search as plain data; None for one that has no name here."""
     if isinstance(search, Split):
         parts = [[name, to_json(part)] for name, part in search.parts]
         rest = to_json(search.rest)
@@ -133,7 +146,7 @@ def to_json(search: Search) -> dict[str, Any] | None:
 
 
 def from_json(data: Mapping[str, Any]) -> Search:
-    """The search that `to_json` described.
+    """Build the search that `to_json` described.
 
     **Raises:** `ValueError` as `named`, and for data that describes no search.
     """

@@ -15,7 +15,7 @@ failure regions instead of resting at their deepest points.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +26,32 @@ from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, standard_normal
 
-# More ordered cells than this are stepped over as if continuous.
 MOST_CELLS = 8
-RESAMPLED, NEIGHBOURING = 0.15, 0.2  # shares of the proposals for the cell of a coordinate
-ALONG_OTHERS = 0.7  # share of proposals along differences of other chains
-ACCEPTED = 0.3  # acceptance rate that the scales of the steps aim at
-ADAPTATION = 0.3  # of the logarithm of the scale, by one acceptance
-COPIES = 4  # chains that begin at one point
-LEAST_SCALE, LARGEST_SCALE = 0.01, 0.5
+"""Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous."""
+
+RESAMPLED = 0.15
+"""Share of the proposals that draw the cell of a coordinate from the prior."""
+
+NEIGHBOURING = 0.2
+"""Share of the proposals that move to a neighbouring cell."""
+
+ALONG_OTHERS = 0.7
+"""Share of the proposals along differences of other chains."""
+
+ACCEPTED = 0.3
+"""Acceptance rate that the scales of the steps aim at."""
+
+ADAPTATION = 0.3
+"""Change of the logarithm of the scale by one acceptance."""
+
+COPIES = 4
+"""Chains that begin at one point."""
+
+LEAST_SCALE = 0.01
+"""Smallest scale of the steps, in unit coordinates."""
+
+LARGEST_SCALE = 0.5
+"""Largest scale of the steps, in unit coordinates."""
 
 
 class AnnealingState(NamedTuple):
@@ -122,7 +140,7 @@ class Annealing(Search[AnnealingState]):
         drawn = cell[:, place] * jnp.where(certain[:, few], either, 1.0)
         sideways = jnp.where(way[:, place] < 0.5, width, -width)
         step = step.at[:, few].set(jnp.where((drawn > RESAMPLED) & (drawn < either), sideways, 0.0))
-        u = _reflected(own + step)
+        u = _reflect(own + step)
         u = u.at[:, few].set(jnp.where(drawn < RESAMPLED, prior[:, few], u[:, few]))
 
         anywhere = jnp.isinf(state.energy[turn]) | (self._coldness(chains) == 0)[turn]
@@ -155,8 +173,8 @@ class Annealing(Search[AnnealingState]):
             step=state.step.at[turn].set(jnp.clip(step, LEAST_SCALE, LARGEST_SCALE)),
             spread=spread,
         )
-        state = self._begun(state, batch)
-        place = _exchanged(state.energy, coldness, chance[batch:].reshape(-1, chains))
+        state = self._start_at_best(state, batch)
+        place = _exchange(state.energy, coldness, chance[batch:].reshape(-1, chains))
         return state._replace(
             u=state.u[place], energy=state.energy[place], rests=state.rests[place]
         )
@@ -173,8 +191,8 @@ class Annealing(Search[AnnealingState]):
         spread = jnp.where(state.spread == 0, _best_to_median(new), state.spread)
         return state._replace(u=u[best], energy=energy[best], spread=spread)
 
-    def _begun(self, state: AnnealingState, batch: int) -> AnnealingState:
-        """After the first round, with all chains at the best quarter of its points."""
+    def _start_at_best(self, state: AnnealingState, batch: int) -> AnnealingState:
+        """Move all chains to the best quarter of the first round's points, after that round."""
         chains = len(state.energy)
         if chains > batch:
             return state
@@ -183,7 +201,7 @@ class Annealing(Search[AnnealingState]):
         return state._replace(u=state.u[place], energy=state.energy[place])
 
     def _turn(self, state: AnnealingState, batch: int) -> Int[Array, " batch"]:
-        """Which chains the rows of the next `tell` belong to."""
+        """Return the chains that the rows of the next `tell` belong to."""
         chains = len(state.energy)
         if chains == batch:
             return jnp.arange(batch, dtype=jnp.int32)
@@ -192,7 +210,7 @@ class Annealing(Search[AnnealingState]):
         return turn.astype(jnp.int32)
 
     def _coldness(self, chains: int) -> Float[Array, " chains"]:
-        """Inverse temperatures in units of the inverse spread, zero for the prior."""
+        """Return inverse temperatures in units of the inverse spread, zero for the prior."""
         warm = chains - int(np.ceil(self.exploration * chains))
         place = np.arange(chains) / max(warm - 1, 1)
         cold = self.coldest * (self.hottest / self.coldest) ** np.minimum(place, 1)
@@ -201,32 +219,32 @@ class Annealing(Search[AnnealingState]):
     def _spread(
         self, state: AnnealingState, turn: Int[Array, " n"], new: Float[Array, " n"]
     ) -> Float[Array, ""]:
-        """Of the energy where the chains start; then it stays, unless it is zero."""
+        """Return the spread of the energy where the chains start; it stays unless it is zero."""
         energy = state.energy
         met = jnp.where(jnp.isinf(energy), energy.at[turn].set(new), energy)
         first = jnp.any(jnp.isinf(energy)) & (state.tells * len(turn) < len(energy))
         return jnp.where(first | (state.spread == 0), _best_to_median(met), state.spread)
 
     def _smooth(self, cube: Cube, i: int) -> bool:
-        """Whether steps in this coordinate are those of a continuous one."""
+        """Return whether steps in this coordinate are those of a continuous one."""
         return cube.levels[i] == 0 or (cube.ordered[i] and cube.levels[i] > MOST_CELLS)
 
 
 def _best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
-    """Of the finite entries; unlike a standard deviation it is deaf to a few large ones."""
+    """Return the spread of the finite entries, which a few large ones do not change."""
     known = jnp.sum(jnp.isfinite(energy))
     ranked = jnp.sort(energy)
     return jnp.where(known > 0, ranked[jnp.maximum(known - 1, 0) // 2] - ranked[0], 0.0)
 
 
-def _reflected(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Into the cube, back and forth between its sides."""
+def _reflect(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Reflect points into the cube, back and forth between its sides."""
     folded = jnp.abs(u - 2 * jnp.round(u / 2))
     return jnp.clip(folded, 0.0, 1.0)
 
 
 def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
-    """Partners for exchanges: distances halve, so that a point can get anywhere in one go."""
+    """Return partners for exchanges; distances halve, so that a point can get anywhere at once."""
     place = np.arange(chains, dtype=np.int32)
     matchings = []
     for distance in (1 << i for i in reversed(range((chains - 1).bit_length()))):
@@ -237,17 +255,19 @@ def _matchings(chains: int) -> Int[np.ndarray, "matchings chains"]:
     return np.stack(matchings)
 
 
-def _exchanged(
+def _exchange(
     energy: Float[Array, " chains"],
     coldness: Float[Array, " chains"],
     chance: Float[Array, "matchings chains"],
 ) -> Int[Array, " chains"]:
-    """Where each chain gets its point from; chains without a point pass theirs to the hot ones."""
+    """Return the chain from which each chain takes its point; hot ones get the missing points."""
     place = jnp.arange(len(energy), dtype=jnp.int32)
 
-    def exchange(held: tuple[Array, Array], given: tuple[Array, Array]) -> tuple[Any, None]:
-        energy, source = held
-        partner, chance = given
+    def exchange(
+        carry: tuple[Array, Array], inputs: tuple[Array, Array]
+    ) -> tuple[tuple[Array, Array], None]:
+        energy, source = carry
+        partner, chance = inputs
         gain = (coldness - coldness[partner]) * (energy - energy[partner])
         # One chance for both, that of the colder.
         taken = jnp.where(chance[jnp.minimum(partner, place)] < gain, partner, place)

@@ -32,6 +32,7 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
 BISECTIONS = 20
+"""Halvings of the interval that holds the common level of the bounds."""
 
 
 class BanditState(NamedTuple):
@@ -120,7 +121,7 @@ class Bandit(Search[BanditState]):
         return state._replace(u=jnp.concatenate([u, state.u])[kept], score=score[kept])
 
     def _rewards(self, score: Float[Array, " window"]) -> Float[Array, " window"]:
-        """From 1 for the best to 0 beyond the best share; equal scores share their ranks."""
+        """Return rewards: 1 for the best to 0 beyond the best share; equal scores share ranks."""
         ranked = jnp.sort(score)
         below = jnp.searchsorted(ranked, score, side="left")
         upto = jnp.searchsorted(ranked, score, side="right")
@@ -130,7 +131,7 @@ class Bandit(Search[BanditState]):
     def _bandits(
         self, cube: Cube
     ) -> list[tuple[np.ndarray, Float[np.ndarray, "d leaves+1"], tuple[int, ...]]]:
-        """Groups of coordinates, the edges of their finest buckets, and how these branch."""
+        """Return groups of coordinates, the edges of their finest buckets, and their branchings."""
         cells = dict(zip(cube.discrete.tolist(), cube.probabilities, strict=True))
         choices = [i for i in cells if not cube.ordered[i]]
         others = [i for i in range(cube.dim) if i not in choices]
@@ -160,7 +161,7 @@ class Bandit(Search[BanditState]):
         branching: tuple[int, ...],
         batch: int,
     ) -> Float[Array, "d leaves"]:
-        """The share of the next batch that each leaf gets."""
+        """Return the share of the next batch that each leaf gets."""
         d, leaves = len(places), edges.shape[1] - 1
         find = jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"), (0, 1), 1)
         leaf = find(jnp.asarray(edges[:, 1:-1]), state.u[:, places])
@@ -192,7 +193,7 @@ def _fill(
     budget: Float[Array, "*nodes 1"],
     bonus: Float[Array, "*nodes 1"],
 ) -> Float[Array, "*nodes arms"]:
-    """Shares of `budget` draws that go one by one to the arm with the highest bound.
+    """Share `budget` draws, which go one by one to the arm with the highest bound.
 
     The bound of an arm after `n` more draws is `mean + sqrt(bonus / (count + n))`, so that it gets
     `bonus / (level - mean)^2 - count` draws until its bound is down at `level`.
@@ -221,7 +222,7 @@ def _draw(
     edges: Float[np.ndarray, "d leaves+1"],
     even: Float[Array, "n d"],
 ) -> Float[Array, "n d"]:
-    """The density's quantiles; it is constant in each leaf."""
+    """Return quantiles of the density, which is constant in each leaf."""
     limits = jnp.cumsum(density, axis=1)
     limits = limits / limits[:, -1:]
     find = jax.vmap(lambda limit, x: jnp.searchsorted(limit, x, side="right"), (0, 1), 1)

@@ -166,7 +166,7 @@ class Bayes(Search[BayesState]):
         u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
         score = jnp.concatenate([score, state.score])
         luck = jnp.concatenate([luck, state.luck])
-        kept = _kept(score, luck, self.capacity)
+        kept = _rows_to_keep(score, luck, self.capacity)
         state = state._replace(
             told=state.told + np.uint32(len(usable)),
             u=u[kept],
@@ -180,7 +180,7 @@ class Bayes(Search[BayesState]):
         return state._replace(hyper=hyper, fitted=jnp.where(due, state.seen, state.fitted))
 
     def _fit(self, state: BayesState, cube: Cube) -> Hyper:
-        some = _kept(state.score, state.luck, min(FIT_POINTS, self.capacity))
+        some = _rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
         data = _training_data(state, cube)
         return _process(cube).fit(
             state.hyper, jax.tree.map(lambda leaf: leaf[some], data), FIT_STEPS
@@ -194,7 +194,7 @@ class Bayes(Search[BayesState]):
         batch: int,
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
-        """Points that the acquisition likes best."""
+        """Return the points that the acquisition function ranks first."""
         posterior = _process(cube).condition(state.hyper, _training_data(state, cube))
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
@@ -232,18 +232,18 @@ def _minima(
     random: Float[Array, "2 parents children r"],
     count: int,
 ) -> Float[Array, "parents d"]:
-    """Minima of `count` functions drawn from the posterior, several of each."""
+    """Return minima of `count` functions drawn from the posterior, several of each."""
     process = _process(cube)
     paths = process.paths(posterior, key, count, WAVES)
     parents, children = random.shape[1:3]
     each = parents // count
 
     def basis(u: Float[Array, "m d"]) -> tuple[Array, Array]:
-        basis = process.basis(posterior, paths, _encoded(u, cube))
+        basis = process.basis(posterior, paths, _encode(u, cube))
         # Simulated already: to be chosen only if there is nothing else.
-        return basis, 100.0 * _known(posterior, basis[:, WAVES:])
+        return basis, 100.0 * _already_simulated(posterior, basis[:, WAVES:])
 
-    shared = _snapped(shared, cube)
+    shared = _snap(shared, cube)
     terms, penalty = basis(shared)
     value, place = jax.lax.top_k(-(terms @ paths.weights + penalty[:, None]).T, each)
 
@@ -254,7 +254,7 @@ def _minima(
         best, least = carry
         parent = jnp.repeat(best, children, axis=0)
         u = _near(parent, step[1].reshape(len(parent), -1), cube, step[0])
-        u = _snapped(u, cube)
+        u = _snap(u, cube)
         terms, penalty = basis(u)
         value = jnp.einsum("pcf,fp->pc", terms.reshape(count, each * children, -1), paths.weights)
         value = (value.reshape(-1) + penalty).reshape(parents, children)
@@ -276,34 +276,34 @@ def _improving(
     random: Float[Array, "parents children r"],
     batch: int,
 ) -> Float[Array, "batch d"]:
-    """Points with the largest expected improvement, each away from those before it."""
+    """Return points with the largest expected improvement, each away from those before it."""
     process = _process(cube)
     least = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
 
     def merit(u: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = process.predict(posterior, _encoded(u, cube))
+        mean, std = process.predict(posterior, _encode(u, cube))
         z = (least - mean) / std
         density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
         gain = std * (z * ndtr(z) + density)
         # Far below zero the difference above is rounding errors; order by the distance instead.
         worth = jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2)
-        known = _known(posterior, process.cross(posterior, _encoded(u, cube)))
+        known = _already_simulated(posterior, process.cross(posterior, _encode(u, cube)))
         return jnp.where(known, worth - 1e6, worth), mean, std
 
-    shared = _snapped(shared, cube)
+    shared = _snap(shared, cube)
     worth, mean, std = merit(shared)
     _, best = jax.lax.top_k(worth, random.shape[0])
     parent = jnp.repeat(shared[best], random.shape[1], axis=0)
     near = _near(parent, random.reshape(len(parent), -1), cube, jnp.array(CLOSER[0]))
-    near = _snapped(near, cube)
+    near = _snap(near, cube)
     u = jnp.concatenate([shared, near])
     worth, mean, std = (
         jnp.concatenate([one, two])
         for one, two in zip((worth, mean, std), merit(near), strict=True)
     )
-    x = _encoded(u, cube)
-    slope = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
-    steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(slope**2, axis=1))), 1e-3)
+    x = _encode(u, cube)
+    gradient = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
+    steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
     codes = np.array(process.unordered)
 
     def choose(worth: Float[Array, " m"], _: None) -> tuple[Array, Array]:
@@ -325,7 +325,7 @@ def _near(
     cube: Cube,
     scales: Float[Array, " 2"],
 ) -> Float[Array, "n d"]:
-    """Points around others: some coordinates moved by a step between two scales."""
+    """Draw points around others: some coordinates moved by a step between two scales."""
     d = cube.dim
     step = scales[0] * (scales[1] / scales[0]) ** random[:, 1:2]
     # From all coordinates to one on average, and always one.
@@ -338,7 +338,7 @@ def _near(
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)
 
 
-def _known(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
+def _already_simulated(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
     return jnp.max(cross, axis=1) > KNOWN * jnp.exp(posterior.hyper.variance)
 
 
@@ -351,15 +351,15 @@ def _process(cube: Cube) -> GaussianProcess:
     )
 
 
-def _snapped(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
-    """With discrete coordinates in the middles of their cells."""
+def _snap(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
+    """Move discrete coordinates to the middles of their cells."""
     if len(cube.discrete) == 0:
         return u
     return u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
 
 
-def _encoded(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
-    """As the process wants them: middles of ordered cells, numbers of unordered ones."""
+def _encode(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
+    """Encode points for the process: middles of ordered cells, numbers of unordered ones."""
     if len(cube.discrete) == 0:
         return u
     cells = cube.cells(u)
@@ -368,7 +368,7 @@ def _encoded(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
 
 
 def _training_data(state: BayesState, cube: Cube) -> TrainingData:
-    """What the process is told: a logarithm of the robustness, with mean 0 and deviation 1."""
+    """Return the process' data: a logarithm of the robustness, with mean 0 and deviation 1."""
     mask = jnp.isfinite(state.score)
     score = jnp.where(mask, state.score, 0.0)
     positive = jnp.sort(jnp.where(score > 0, score, jnp.inf))
@@ -378,11 +378,13 @@ def _training_data(state: BayesState, cube: Cube) -> TrainingData:
     count = jnp.maximum(jnp.sum(mask), 1)
     y = y - jnp.sum(y, where=mask) / count
     std = jnp.sqrt(jnp.sum(y**2, where=mask) / count)
-    return TrainingData(_encoded(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
+    return TrainingData(_encode(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
 
 
-def _kept(score: Float[Array, " n"], luck: Float[Array, " n"], count: int) -> Int[Array, " count"]:
-    """Which rows to keep: the best half and the luckiest others; rows that are there come first."""
+def _rows_to_keep(
+    score: Float[Array, " n"], luck: Float[Array, " n"], count: int
+) -> Int[Array, " count"]:
+    """Choose rows to keep: the best half and the luckiest others; present rows come first."""
     rank = jnp.argsort(jnp.lexsort((luck, score)))
     best = (rank < count // 2) & jnp.isfinite(score)
     return jnp.argsort(jnp.where(best, -1.0, jnp.where(jnp.isfinite(score), luck, 2.0)))[:count]

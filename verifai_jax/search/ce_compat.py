@@ -20,7 +20,10 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
 MOST_COMBINATIONS = 1024
+"""Combinations of the lengths of arrays at most."""
+
 MOST_BINS = 2**22
+"""Bins of all histograms at most."""
 
 
 class CECompatState(NamedTuple):
@@ -127,7 +130,7 @@ class CECompat(Search[CECompatState]):
         return state._replace(histograms=histograms)
 
     def _power(self, count: Int[Array, "..."]) -> Float[Array, "..."]:
-        """`alpha` to the power of whole numbers; the zeroth of zero is one."""
+        """Return `alpha` to the power of whole numbers; the zeroth of zero is one."""
         return jnp.power(jnp.float32(self.alpha), count.astype(jnp.float32))
 
     def _sizes(self, cube: Cube) -> tuple[int, ...]:
@@ -138,7 +141,7 @@ class CECompat(Search[CECompatState]):
         return bins.at[:, cube.discrete].set(cube.cells(u))
 
     def _set(self, u: Float[Array, "n d"], cube: Cube) -> Int[Array, " n"]:
-        """Number of the combination of lengths that each point has."""
+        """Return the number of the combination of lengths that each point has."""
         number = jnp.zeros(len(u), jnp.int32)
         cells = cube.cells(u)
         for i in cube.lengths:

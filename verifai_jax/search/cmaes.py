@@ -2,7 +2,7 @@
 
 Hansen, The CMA Evolution Strategy: A Tutorial, 2016; one step of it is in `evolution.py`.
 
-What is made for falsification:
+Additions for falsification:
 
 - a run begins with a generation of the prior. As long as all of it has the same robustness there is
   nothing to learn, and the next generation is another one;
@@ -20,7 +20,7 @@ What is made for falsification:
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,20 @@ from verifai_jax.search.base import Observations, Search, standard_normal
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 
-# More cells than this are an ordered quantity: a generation cannot tell their probabilities.
 MOST_CELLS = 32
-MARGIN = 0.25  # standard deviation of an ordered discrete coordinate, in cells, at least
-LEARNING = 0.3  # of the probabilities of unordered cells, per generation
-LARGEST = 1e30  # robustness
+"""Cells up to which an unordered coordinate has probabilities: a generation cannot learn more."""
+
+MARGIN = 0.25
+"""Least standard deviation of an ordered discrete coordinate, in cells."""
+
+LEARNING = 0.3
+"""Learning rate of the probabilities of unordered cells, per generation."""
+
+LARGEST = 1e30
+"""Robustness above which all is equally bad."""
+
+
+Tree = TypeVar("Tree")
 
 
 class CMAESState(NamedTuple):
@@ -137,7 +146,7 @@ class CMAES(Search[CMAESState]):
         u, score = _scored(observations)
         # Points of exploration are far away from the run: they say nothing about its next step.
         outside = self._explores(state, batch) & (state.generation > 0)
-        state = _reserved(state, u, jnp.where(outside, score, jnp.inf))
+        state = _with_reserve(state, u, jnp.where(outside, score, jnp.inf))
         row = state.filled * batch
         inside = jnp.where(outside, jnp.inf, score)
         state = state._replace(
@@ -155,12 +164,12 @@ class CMAES(Search[CMAESState]):
         u, score = _scored(observations)
         # The best of all calls so far is the mean of the run that would begin now.
         better = jnp.min(score, initial=jnp.inf) < state.best
-        found = _reserved(state._replace(reserve_score=jnp.float32(jnp.inf)), u, score)
+        found = _with_reserve(state._replace(reserve_score=jnp.float32(jnp.inf)), u, score)
         begun = self._begin(found, cube, jnp.array(True), jnp.float32(self.small_step))
         return _where(better, begun._replace(best=found.reserve_score), state)
 
     def _explores(self, state: CMAESState, batch: int) -> Bool[Array, " batch"]:
-        """Every tenth row, say, whatever the batch is; in integers, which do not drift."""
+        """Return the rows from the prior: every tenth, say, whatever the batch; in integers."""
         row = (state.told % 1000 + jnp.arange(batch, dtype=jnp.uint32)) % 1000
         share = np.uint32(np.ceil(1000 * self.exploration))
         return row * share % 1000 < share
@@ -168,7 +177,7 @@ class CMAES(Search[CMAESState]):
     def _draw(
         self, key: Key[Array, ""], state: CMAESState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
-        """Points of the Gaussian, and of the choices."""
+        """Draw points of the Gaussian, and of the choices."""
         plain, codes = _plain(cube), _codes(cube)
         sizes = [batch * len(plain), batch * len(codes)]
         # Drawn flat and kept: to compile it takes a fifth of the time.
@@ -187,7 +196,7 @@ class CMAES(Search[CMAESState]):
         return u.at[:, codes].set(cube.centres(cells)[:, among])
 
     def _next(self, state: CMAESState, cube: Cube) -> CMAESState:
-        """After a whole generation: learn from it, wait, or begin another run."""
+        """Learn from a whole generation, wait, or begin another run."""
         following = _where(state.rest > 0, self._wait(state, cube), self._learn(state, cube))
         empty = jnp.full_like(state.score, jnp.inf)
         return following._replace(score=empty, filled=jnp.int32(0))
@@ -205,7 +214,7 @@ class CMAES(Search[CMAESState]):
         gaussian = gaussian._replace(size=jnp.minimum(gaussian.size, 1.0))
         learned = state._replace(
             gaussian=gaussian.widened(_margins(cube)),
-            choices=_learned(state, cube, weights),
+            choices=_updated_choices(state, cube, weights),
             generation=state.generation + 1,
         )
         # Without differences between points there is nothing to learn.
@@ -218,7 +227,7 @@ class CMAES(Search[CMAESState]):
         return _where(self._over(learned, cube), self._after(learned, cube), learned)
 
     def _over(self, state: CMAESState, cube: Cube) -> Bool[Array, ""]:
-        """Whether a run has failed often enough, or leads nowhere."""
+        """Return whether a run has failed often enough, or leads nowhere."""
         n, population = len(_plain(cube)), len(state.score)
         stuck = state.stale >= self.patience + 5 * n // population
         if n:
@@ -228,7 +237,7 @@ class CMAES(Search[CMAESState]):
         return failed | (stuck & (state.generation > 0))
 
     def _after(self, state: CMAESState, cube: Cube) -> CMAESState:
-        """What follows a run: another one, or first many points of the prior."""
+        """Begin what follows a run: another one, or first many points of the prior."""
         fruitful = (state.failures > 0) | (state.reserve_score == 0)
         fruitless = jnp.where(fruitful, 0, state.fruitless + 1).astype(jnp.int32)
         small = (state.run % 2 == 0) & jnp.isfinite(state.reserve_score)
@@ -244,8 +253,8 @@ class CMAES(Search[CMAESState]):
         return _where(fruitful, next_run._replace(fruitless=fruitless), waiting)
 
     def _wait(self, state: CMAESState, cube: Cube) -> CMAESState:
-        """After a generation of the prior between two runs."""
-        waiting = _reserved(state, state.u, state.score)._replace(rest=state.rest - 1)
+        """Advance after a generation of the prior between two runs."""
+        waiting = _with_reserve(state, state.u, state.score)._replace(rest=state.rest - 1)
         over = (waiting.rest == 0) | (waiting.reserve_score == 0)
         size = jnp.where(state.run % 2 == 0, self.step, self.small_step)
         begun = self._begin(waiting, cube, jnp.array(True), size)._replace(run=state.run)
@@ -254,7 +263,7 @@ class CMAES(Search[CMAESState]):
     def _begin(
         self, state: CMAESState, cube: Cube, there: Bool[Array, ""], size: Float[Array, ""]
     ) -> CMAESState:
-        """A new run: at the reserve with steps of this size, or with a generation of the prior."""
+        """Begin a run: at the reserve with steps of this size, or by a generation of the prior."""
         plain, codes = _plain(cube), _codes(cube)
         choices = prior = jnp.asarray(_prior(cube))
         if len(codes):
@@ -280,12 +289,12 @@ class CMAES(Search[CMAESState]):
 
 
 def _plain(cube: Cube) -> Int[np.ndarray, " n"]:
-    """Indices of the coordinates that the Gaussian has."""
+    """Return indices of the coordinates that the Gaussian has."""
     return np.setdiff1d(np.arange(cube.dim), _codes(cube))
 
 
 def _codes(cube: Cube) -> Int[np.ndarray, " k"]:
-    """Indices of the coordinates that have probabilities."""
+    """Return indices of the coordinates that have probabilities."""
     return np.array(
         [i for i in cube.discrete if not cube.ordered[i] and cube.levels[i] <= MOST_CELLS], np.int64
     )
@@ -300,15 +309,15 @@ def _prior(cube: Cube) -> Float[np.ndarray, "k cells"]:
 
 
 def _population(cube: Cube, batch: int) -> int:
-    """Points in a generation: whole batches, and no fewer than the tutorial's default."""
+    """Return the points in a generation: whole batches, no fewer than the tutorial's default."""
     least = 4 + int(3 * math.log(max(cube.dim, 1)))
     return batch * -(-least // batch)
 
 
-def _learned(
+def _updated_choices(
     state: CMAESState, cube: Cube, weights: Float[Array, " population"]
 ) -> Float[Array, "k cells"]:
-    """Probabilities of the unordered cells after this generation."""
+    """Return probabilities of the unordered cells after this generation."""
     codes = _codes(cube)
     if len(codes) == 0:
         return state.choices
@@ -322,21 +331,23 @@ def _learned(
 
 
 def _margins(cube: Cube) -> Float[np.ndarray, " n"]:
-    """Least standard deviation of each coordinate of the Gaussian."""
+    """Return the least standard deviation of each coordinate of the Gaussian."""
     return np.array(
         [MARGIN / cube.levels[i] if cube.levels[i] else 0.0 for i in _plain(cube)], np.float32
     )
 
 
 def _scored(observations: Observations) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
-    """Points and their scores: 0 for all failures, infinite where there is no verdict."""
+    """Return points and their scores: 0 for all failures, infinite where there is no verdict."""
     usable = observations.valid & (observations.rho < jnp.inf)
     score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
     return jnp.where(usable[:, None], observations.u, 0.5), score
 
 
-def _reserved(state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n"]) -> CMAESState:
-    """The state with the best point of exploration, of equally good ones the newest."""
+def _with_reserve(
+    state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n"]
+) -> CMAESState:
+    """Record the best point of exploration, of equally good ones the newest."""
     place = jnp.argmin(score)
     better = jnp.isfinite(score[place]) & (score[place] <= state.reserve_score)
     return state._replace(
@@ -345,5 +356,6 @@ def _reserved(state: CMAESState, u: Float[Array, "n d"], score: Float[Array, " n
     )
 
 
-def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:
+def _where(condition: Bool[Array, ""], one: Tree, other: Tree) -> Tree:
+    """Choose one of two pytrees of the same structure."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -1,4 +1,4 @@
-"""Cross-entropy: sample around the best points seen, and look again.
+"""Cross-entropy: sample around the best points so far, and repeat.
 
 The method fits a parametric family to an elite of the samples and draws the next ones from the fit
 (de Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method, Annals of Operations
@@ -27,8 +27,8 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, standard_normal
 from verifai_jax.search.halton import halton_points
 
-# More cells than this are an ordered quantity: a batch cannot fill a histogram of them.
 MOST_CELLS = 32
+"""Cells up to which a coordinate has a histogram: a batch cannot fill one of more."""
 
 
 class CrossEntropyState(NamedTuple):
@@ -122,7 +122,7 @@ class CrossEntropy(Search[CrossEntropyState]):
     def _draw(
         self, key: Key[Array, ""], state: CrossEntropyState, cube: Cube, batch: int
     ) -> Float[Array, "batch d"]:
-        """Points from the mixture that the elite gives."""
+        """Draw points from the mixture around the elite."""
         # Places among the discrete coordinates, and their indices among all.
         narrow = np.array(
             [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MOST_CELLS], np.int32
@@ -151,8 +151,8 @@ class CrossEntropy(Search[CrossEntropyState]):
         prior = np.zeros((len(cells), levels.max()), np.float32)
         for row, j in zip(prior, narrow, strict=True):
             row[: len(cube.probabilities[j])] = cube.probabilities[j]
-        seen = cube.cells(state.elite)[:, narrow]
-        counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(seen, levels.max()))
+        elite_cells = cube.cells(state.elite)[:, narrow]
+        counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(elite_cells, levels.max()))
         # With one pseudo-count of the prior, so that no choice dies out.
         limits = jnp.cumsum((counts + prior) / (count + 1), axis=1)
         drawn = jnp.sum(draw[:, :, None] > limits, axis=-1)

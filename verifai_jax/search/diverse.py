@@ -13,13 +13,14 @@ begins afresh from the best points that lie elsewhere. When it comes no nearer t
 radius shrinks, so that first the modes are found and then the insides of them filled.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
@@ -27,12 +28,13 @@ from verifai_jax.search.base import Observations, Plan, Search
 
 AT_ONCE = 16
 """Failures archived in a round at most."""
+
 ABSENT = -1e8
-"""Clauses below are none."""
+"""Values of clauses below mean that there is no such clause."""
 
 
 class DiverseState(NamedTuple):
-    inner: Any
+    inner: PyTree
     key: Key[Array, ""]
     round: Int[Array, ""]
     archive: Float[Array, "capacity d"]
@@ -48,7 +50,7 @@ class DiverseState(NamedTuple):
 
 @dataclass(frozen=True)
 class Diverse(Search[DiverseState]):
-    """Another search, kept away from failures already found.
+    """Another search, kept away from earlier failures.
 
     **Arguments:**
 
@@ -101,12 +103,12 @@ class Diverse(Search[DiverseState]):
 
     @staticmethod
     def count(state: DiverseState) -> Int[Array, ""]:
-        """How many distinct failures there are so far."""
+        """Return the number of distinct failures so far."""
         return state.count
 
     @staticmethod
     def archive(state: DiverseState) -> Float[np.ndarray, "k d"]:
-        """The distinct failures, in the order in which they were found."""
+        """Return the distinct failures `[k, d]`, in the order of their discovery."""
         return np.asarray(state.archive)[: int(state.count)]
 
     def check(self, cube: Cube) -> None:
@@ -145,14 +147,14 @@ class Diverse(Search[DiverseState]):
         return u, state._replace(inner=inner)
 
     def tell(self, state: DiverseState, cube: Cube, observations: Observations) -> DiverseState:
-        return self._told(state, cube, observations, warm=False)
+        return self._learn(state, cube, observations, warm=False)
 
     def warm_start(
         self, state: DiverseState, cube: Cube, observations: Observations
     ) -> DiverseState:
-        return self._told(state, cube, observations, warm=True)
+        return self._learn(state, cube, observations, warm=True)
 
-    def _told(
+    def _learn(
         self, state: DiverseState, cube: Cube, observations: Observations, warm: bool
     ) -> DiverseState:
         usable = observations.usable
@@ -164,36 +166,38 @@ class Diverse(Search[DiverseState]):
             size=state.size + size.astype(jnp.float32),
             seen=state.seen + jnp.sum(usable),
         )
-        state = self._archived(state, cube, u, usable & (observations.rho < 0))
-        found = state.count > before
-        raised = self._raised(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
+        state = self._archive(state, cube, u, usable & (observations.rho < 0))
+        discovered = state.count > before
+        raised = self._raise(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
         nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
-        progress = found | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
+        progress = discovered | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
         idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
         tired = idle >= self.patience
         smaller = jnp.maximum(self.shrink * state.radius, self.least_radius)
         state = state._replace(
             idle=jnp.where(tired, 0, idle),
             radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
-            level=jnp.where(found | tired, jnp.inf, jnp.minimum(state.level, nearest)),
+            level=jnp.where(discovered | tired, jnp.inf, jnp.minimum(state.level, nearest)),
         )
-        state = self._remembered(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
-        # What it had come to without finding anything leads nowhere.
+        state = self._remember(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
+        # The best points of a fruitless period lead nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
-        told = self._deflated(state, cube, observations)
+        told = self._deflate(state, cube, observations)
         verb = self.search.warm_start if warm else self.search.tell
         inner = verb(state.inner, cube, told)
         if self.search.learns and self.search.total(cube) is None:
-            inner = jax.lax.cond(found | tired, lambda: self._afresh(state, cube), lambda: inner)
+            inner = jax.lax.cond(
+                discovered | tired, lambda: self._restart(state, cube), lambda: inner
+            )
         return state._replace(inner=inner)
 
-    def _archived(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], failing: Any
+    def _archive(
+        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], failing: Bool[Array, " n"]
     ) -> DiverseState:
-        """With the failures that are beyond the radius of all archived ones, the farthest first."""
+        """Archive the failures beyond the radius of all archived ones, the farthest first."""
 
-        def add(_: Any, carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        def add(_: Int[Array, ""], carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             archive, count, far = carry
             place = jnp.argmax(jnp.where(failing, far, -1.0))
             fresh = failing[place] & (far[place] > state.radius) & (count < self.capacity)
@@ -210,14 +214,14 @@ class Diverse(Search[DiverseState]):
     def _distances(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
     ) -> Float[Array, "n capacity"]:
-        """To all archived failures; infinite for places in the archive that are empty."""
+        """Return distances to all archived failures; infinite for empty places of the archive."""
         known = jnp.arange(self.capacity) < state.count
         return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
 
     def _nearness(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
     ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-        """1 at an archived failure, 0 from one and a half radii on; and which one it is."""
+        """Return 1 at an archived failure, 0 from one and a half radii on; and its index."""
         far = self._distances(state, cube, u)
         nearest = jnp.argmin(far, axis=1)
         least = jnp.min(far, axis=1)
@@ -226,21 +230,19 @@ class Diverse(Search[DiverseState]):
     def _scale(self, state: DiverseState) -> Float[Array, ""]:
         return 2.0 * state.size / jnp.maximum(state.seen, 1.0) + 1e-6
 
-    def _raised(
+    def _raise(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
     ) -> Float[Array, " n"]:
-        """Robustness, raised near archived failures to that of safe points and beyond."""
+        """Raise robustness near archived failures to that of safe points and beyond."""
         near, _ = self._nearness(state, cube, u)
         return jnp.where(near > 0, jnp.maximum(rho, 0.0) + self._scale(state) * near, rho)
 
-    def _deflated(
-        self, state: DiverseState, cube: Cube, observations: Observations
-    ) -> Observations:
+    def _deflate(self, state: DiverseState, cube: Cube, observations: Observations) -> Observations:
         usable = observations.usable
         u = jnp.where(usable[:, None], observations.u, 0.5)
         near, nearest = self._nearness(state, cube, u)
         inside = usable & (near > 0)
-        rho = jnp.where(inside, self._raised(state, cube, u, observations.rho), observations.rho)
+        rho = jnp.where(inside, self._raise(state, cube, u, observations.rho), observations.rho)
         told = observations._replace(rho=rho)
         if observations.gradient is None and observations.clauses is None:
             return told
@@ -268,28 +270,28 @@ class Diverse(Search[DiverseState]):
                 told = told._replace(clause_gradients=own)
         return told
 
-    def _remembered(
+    def _remember(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
     ) -> DiverseState:
-        """The best points so far that are away from the archive as it is now."""
+        """Update the best points so far that are away from the archive."""
         points = jnp.concatenate([u, state.points])
         values = jnp.concatenate([rho.astype(jnp.float32), state.rho])
-        raised = self._raised(state, cube, points, values)
+        raised = self._raise(state, cube, points, values)
         score = jnp.where(jnp.isfinite(values), raised, jnp.inf)
         _, best = jax.lax.top_k(-score, len(state.rho))
         return state._replace(points=points[best], rho=values[best])
 
-    def _afresh(self, state: DiverseState, cube: Cube) -> Any:
-        """The search inside as if it knew only the remembered points."""
+    def _restart(self, state: DiverseState, cube: Cube) -> PyTree:
+        """Start the search inside afresh, from the remembered points alone."""
         batch = len(state.rho)
         inner = self.search.init(jax.random.fold_in(state.key, state.round), cube, batch)
         known = jnp.isfinite(state.rho)
-        raised = self._raised(state, cube, state.points, jnp.where(known, state.rho, 1.0))
+        raised = self._raise(state, cube, state.points, jnp.where(known, state.rho, 1.0))
         return self.search.warm_start(inner, cube, Observations(state.points, raised, known))
 
 
 def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:
-    """Root mean square difference over the coordinates; of places in cells, 0 or 1 for choices."""
+    """Return root mean square differences over coordinates; of choices they are 0 or 1."""
     if cube.dim == 0:
         return jnp.zeros((len(one), len(other)), jnp.float32)
     square = jnp.zeros((len(one), len(other)), jnp.float32)
@@ -307,23 +309,31 @@ def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> F
 
 
 def distinct(
-    points: Any, radius: float, cube: Cube | None = None, order: Any = None
+    points: Sequence | np.ndarray | Array,
+    radius: float,
+    cube: Cube | None = None,
+    order: Sequence[int] | np.ndarray | None = None,
 ) -> Int[np.ndarray, " k"]:
-    """Which of these points `[n, d]` are distinct: no two chosen ones are within the radius.
+    """Choose distinct points: no two of them are within the radius.
 
-    - `order`: of the points, the most wanted first, such as `np.argsort(rho)`; as they come when
-      left out. The first is chosen, and then each that is beyond the radius of all chosen ones.
-    - `radius`: as of `Diverse`.
+    The first is chosen, and then each that is beyond the radius of all chosen ones.
 
-    Returns their numbers, in that order.
+    **Arguments:**
+
+    - `points`: `[n, d]`, in the unit cube.
+    - `radius`: root mean square distance over the coordinates, as of `Diverse`.
+    - `cube`: the unit cube of the space; with continuous coordinates alone when left out.
+    - `order`: indices of the points, the most wanted first, such as `np.argsort(rho)`; as they come
+      when left out.
+
+    **Returns:** indices `[k]` of the chosen points, in that order.
     """
-    points = np.asarray(points, np.float32)
-    cube = cube or Cube((0,) * points.shape[1])
-    order = np.arange(len(points)) if order is None else np.asarray(order)
+    u = np.asarray(points, np.float32)
+    cube = cube or Cube((0,) * u.shape[1])
     chosen: list[int] = []
-    near = np.zeros(len(points), bool)
-    for i in order:
+    near = np.zeros(len(u), bool)
+    for i in range(len(u)) if order is None else np.asarray(order):
         if not near[i]:
             chosen.append(int(i))
-            near |= np.asarray(apart(cube, points[i][None], points))[0] <= radius  # pyright: ignore[reportArgumentType]
+            near |= np.asarray(apart(cube, u[i][None], u))[0] <= radius  # pyright: ignore[reportArgumentType]
     return np.array(chosen, int)

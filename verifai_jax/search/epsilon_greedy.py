@@ -151,7 +151,7 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         # Whatever the robustness says, close to failures there are others.
         useless &= state.score[0] > 0
 
-        state = self._learned(state, observations.u, score)
+        state = self._with_best(state, observations.u, score)
         stale = jnp.where(state.begun < self.begin, 0, state.stale)
         again = (stale >= self.patience * max(len(score), self.begin)) | useless
         # The newest draws of the prior first.
@@ -171,14 +171,14 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     def warm_start(
         self, state: EpsilonGreedyState, cube: Cube, observations: Observations
     ) -> EpsilonGreedyState:
-        """Take the best points; what the prior gives has to be seen yet."""
+        """Take the best points; the scores of the prior have to be sampled yet."""
         score = observations.score
-        return self._learned(state, observations.u, score)._replace(stale=state.stale)
+        return self._with_best(state, observations.u, score)._replace(stale=state.stale)
 
-    def _learned(
+    def _with_best(
         self, state: EpsilonGreedyState, u: Float[Array, "n d"], score: Float[Array, " n"]
     ) -> EpsilonGreedyState:
-        """The best points with these among them, and whether that was progress."""
+        """Update the best points, and count the points without progress."""
         points = jnp.concatenate([jnp.where(jnp.isinf(score)[:, None], 0.5, u), state.best])
         # New points come first: of equally good ones the newest are kept.
         scores = jnp.concatenate([score, state.score])
@@ -191,7 +191,7 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         return state._replace(best=points[best], score=scores[best], stale=stale)
 
     def _exploring(self, state: EpsilonGreedyState, batch: int) -> Bool[Array, " batch"]:
-        """Which rows of the next `tell` are from the prior: every tenth, say, or all at first."""
+        """Return the rows of the next `tell` from the prior: every tenth, say, or all at first."""
         number = state.tells * batch + jnp.arange(batch, dtype=jnp.uint32)
         # In whole numbers, that may wrap around.
         share = np.uint32(round(self.epsilon * 2**16))
@@ -199,6 +199,6 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
         return due | (state.begun < self.begin)
 
     def _median(self, state: EpsilonGreedyState) -> Float[Array, ""]:
-        """Of the scores that the prior gives; infinite at first."""
+        """Return the median score of the prior; infinite at first."""
         known = jnp.sum(jnp.isfinite(state.prior))
         return jnp.sort(state.prior)[jnp.maximum(known - 1, 0) // 2]

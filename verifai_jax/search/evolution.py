@@ -37,17 +37,17 @@ class Evolution(NamedTuple):
         )
 
     def variance(self) -> Float[Array, " n"]:
-        """Of each coordinate, over the squared size."""
+        """Return the variance of each coordinate, over the squared size."""
         return jnp.diagonal(self.covariance) if self.covariance.ndim == 2 else self.covariance
 
     def draw(self, normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        """Points of the Gaussian, from standard normal numbers."""
+        """Draw points of the Gaussian, from standard normal numbers."""
         if self.covariance.ndim == 1:
             return self.mean + self.size * jnp.sqrt(self.covariance) * normal
         return self.mean + self.size * normal @ jnp.linalg.cholesky(self.covariance).T
 
     def learn(self, points: Float[Array, "m n"], weights: Float[Array, " m"]) -> "Evolution":
-        """After points with these recombination weights; in comments the tutorial's names."""
+        """Update by points with these recombination weights; in comments the tutorial's names."""
         n = len(self.mean)
         if n == 0:
             return self
@@ -97,7 +97,7 @@ class Evolution(NamedTuple):
         )
 
     def widened(self, least: Float[np.ndarray, " n"]) -> "Evolution":
-        """With standard deviations of at least `least`, and a covariance that has a factor."""
+        """Raise standard deviations to at least `least`, and give the covariance a factor."""
         if len(self.mean) == 0:
             return self
         # A direction may become narrow, but not so that 32 bits lose it.
@@ -118,7 +118,7 @@ class Evolution(NamedTuple):
 
 
 def recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Weights of points: logarithmic in the rank, zero in the worse half, equal where tied.
+    """Weight points: logarithmic in the rank, zero in the worse half, equal where tied.
 
     Points of infinite score have none.
     """

@@ -22,9 +22,17 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
-# What the logarithms of the hyper-parameters may be; the noise keeps 32-bit factors finite.
-VARIANCE, LENGTH, NOISE = (-3.0, 4.0), (-4.0, 8.0), (-9.0, 0.0)
-SMALLEST = 2.0**-24  # uniform numbers below are zero, where a normal quantile is infinite
+VARIANCE = (-3.0, 4.0)
+"""Range of the logarithm of the variance."""
+
+LENGTH = (-4.0, 8.0)
+"""Range of the logarithms of the length scales."""
+
+NOISE = (-9.0, 0.0)
+"""Range of the logarithm of the noise, which keeps 32-bit factors finite."""
+
+SMALLEST = 2.0**-24
+"""Smallest uniform number above zero, where a normal quantile is infinite."""
 
 
 class Hyper(NamedTuple):
@@ -36,7 +44,7 @@ class Hyper(NamedTuple):
 
 
 class TrainingData(NamedTuple):
-    """Points, their targets, and which rows there are."""
+    """Points `x`, their targets `y`, and a `mask` of the rows that are present."""
 
     x: Float[Array, "n d"]
     y: Float[Array, " n"]
@@ -75,7 +83,7 @@ class GaussianProcess:
     unordered: tuple[bool, ...]
 
     def first(self) -> Hyper:
-        """Where fitting starts: neighbours are related over half the diagonal of the cube."""
+        """Return the start of the fit: neighbours are related over half the cube's diagonal."""
         plain, codes = self._places()
         lengths = np.zeros(len(self.unordered))
         lengths[plain] = math.log(0.5 * math.sqrt(max(len(plain), 1)))
@@ -85,7 +93,7 @@ class GaussianProcess:
     def covariance(
         self, hyper: Hyper, a: Float[Array, "n d"], b: Float[Array, "m d"]
     ) -> Float[Array, "n m"]:
-        """Of the values at the points `a` and `b`, without noise."""
+        """Return the covariance of the values at the points `a` and `b`, without noise."""
         plain, codes = self._places()
         inverse = jnp.exp(-hyper.lengths)
         # About the middle, so that the difference below loses few digits.
@@ -98,13 +106,13 @@ class GaussianProcess:
         return value * jnp.exp(-differ @ inverse[codes])
 
     def evidence(self, hyper: Hyper, data: TrainingData) -> Float[Array, ""]:
-        """Logarithm of the marginal likelihood of the observations."""
+        """Return the logarithm of the marginal likelihood of the observations."""
         return _evidence(self._noisy(hyper, data.x, data.mask), _masked(data)) - (
             0.5 * math.log(2 * math.pi) * jnp.sum(data.mask)
         )
 
     def log_prior(self, hyper: Hyper) -> Float[Array, ""]:
-        """Of the hyper-parameters, up to a constant.
+        """Return the log density of the hyper-parameters, up to a constant.
 
         Length scales grow with the root of the dimension, so that the prior's complexity does not
         (Hvarfner, Hellsten, Nardi, Vanilla Bayesian optimization performs great in high dimensions,
@@ -118,7 +126,7 @@ class GaussianProcess:
         return -0.5 * (lengths + hyper.variance**2 + (hyper.noise + 6.0) ** 2 / 2)
 
     def fit(self, hyper: Hyper, data: TrainingData, steps: int, rate: float = 0.15) -> Hyper:
-        """The most probable hyper-parameters, by Adam from `hyper` on.
+        """Find the most probable hyper-parameters, by Adam from `hyper` on.
 
         A step that is not finite is not taken.
         """
@@ -135,11 +143,11 @@ class GaussianProcess:
             first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, gradient)
             second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, gradient)
 
-            def moved(h: Array, m: Array, v: Array) -> Array:
+            def update(h: Array, m: Array, v: Array) -> Array:
                 root = jnp.sqrt(v / (1 - 0.95**count)) + 1e-8
                 return h - rate * (m / (1 - 0.8**count)) / root
 
-            return (_bounded(jax.tree.map(moved, hyper, first, second)), first, second), None
+            return (_bounded(jax.tree.map(update, hyper, first, second)), first, second), None
 
         zero = jax.tree.map(jnp.zeros_like, hyper)
         counts = jnp.arange(1, steps + 1, dtype=hyper.variance.dtype)
@@ -147,7 +155,7 @@ class GaussianProcess:
         return fitted
 
     def condition(self, hyper: Hyper, data: TrainingData) -> Posterior:
-        """The process given these observations."""
+        """Condition the process on these observations."""
         noisy = self._noisy(hyper, data.x, data.mask)
         y = _masked(data)
 
@@ -167,7 +175,7 @@ class GaussianProcess:
     def predict(
         self, posterior: Posterior, x: Float[Array, "m d"]
     ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and standard deviation of the values at these points, without noise."""
+        """Return mean and standard deviation of the values at these points, without noise."""
         cross = self.cross(posterior, x)
         left = solve_triangular(posterior.factor, cross.T, lower=True)
         variance = jnp.exp(posterior.hyper.variance) - jnp.sum(left**2, axis=0)
@@ -208,12 +216,12 @@ class GaussianProcess:
     def basis(
         self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
     ) -> Float[Array, "m f+n"]:
-        """Times the paths' weights it is the paths' values at these points."""
+        """Return basis functions at these points; times the paths' weights the paths' values."""
         waves = self._waves(posterior.hyper, paths, x)
         return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)
 
     def cross(self, posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, "m n"]:
-        """Covariance of the values at these points with the observations; zero for absent ones."""
+        """Return covariances of the values with the observations; zero for absent ones."""
         return jnp.where(posterior.mask, self.covariance(posterior.hyper, x, posterior.x), 0.0)
 
     def _waves(self, hyper: Hyper, paths: Paths, x: Float[Array, "m d"]) -> Float[Array, "m f"]:
@@ -232,13 +240,13 @@ class GaussianProcess:
     def _noisy(
         self, hyper: Hyper, x: Float[Array, "n d"], mask: Bool[Array, " n"]
     ) -> Float[Array, "n n"]:
-        """Covariance of the observations; that of the absent ones is the identity."""
+        """Return the covariance of the observations; that of the absent ones is the identity."""
         both = mask[:, None] & mask[None]
         value = jnp.where(both, self.covariance(hyper, x, x), 0.0)
         return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
 
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the quantities and of the codes."""
+        """Return indices of the quantities and of the codes."""
         codes = np.array(self.unordered, bool)
         return np.flatnonzero(~codes), np.flatnonzero(codes)
 
@@ -257,7 +265,7 @@ def _bounded(hyper: Hyper) -> Hyper:
 
 @jax.custom_jvp
 def _matern(square: Array) -> Array:
-    """Matern-5/2 of the squared distance; its derivative is finite at zero."""
+    """Return Matern-5/2 of the squared distance; its derivative is finite at zero."""
     r = jnp.sqrt(5 * square)
     return (1 + r + r**2 / 3) * jnp.exp(-r)
 

@@ -1,22 +1,23 @@
-"""Descent on the slopes of what has to be broken, from many starts.
+"""Descent on the gradients of the clauses to violate, from many starts.
 
 A system fails where all clauses of a goal are negative at once (`mtl.clauses`). Around a point
-where their values and slopes are known, each clause is taken for linear, and the next point is
+where their values and gradients are known, each clause is taken for linear, and the next point is
 where the greatest of them is least: a corner of the cube or of a box around the point, or where two
 clauses meet. That is sequential linear programming for a minimax problem (Fletcher, Practical
 Methods of Optimization, 1987, section 14.6); for one clause it is a jump along the signs of its
 gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
-does a plain gradient, because all slopes count.
+does a plain gradient, because the gradients of all clauses count.
 
 The box is the whole cube at first. It shrinks while points turn out no better, several sizes in one
 batch where there is room, and grows again on success. A corner that nothing points out of is left
-by its weakest coordinates, one at a time, since a small slope says little about the other end of
-the range. After that, or when slopes are zero or not finite, the descent starts again elsewhere.
+by its weakest coordinates, one at a time, since a small derivative says little about the other end
+of the range. After that, or when gradients are zero or not finite, the descent starts again
+elsewhere.
 """
 
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,9 +31,11 @@ from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
-"""Values below are of clauses that a goal does not have."""
+"""Values of clauses below mean that a goal has no such clause."""
+
 LITTLE = 0.9
-"""A step is little better if it leaves so much of what has to be lost."""
+"""Share of the robustness that is left after a step which is only a little better."""
+
 SIZES = 6
 """Boxes tried at once at most."""
 
@@ -41,7 +44,7 @@ class GradientState(NamedTuple):
     key: Key[Array, ""]
     starts: UInt32[Array, ""]  # how many starts were made
     fresh: Bool[Array, " descents"]  # descents that take a new start
-    known: Bool[Array, " descents"]  # descents that know the slopes at their point
+    known: Bool[Array, " descents"]  # descents that know the gradients at their point
     point: Float[Array, "descents d"]
     clauses: Float[Array, "descents clauses"]
     gradients: Float[Array, "descents clauses d"]
@@ -53,7 +56,7 @@ class GradientState(NamedTuple):
     temperature: Float[Array, " descents"]
     offered: Float[Array, "descents d"]  # starts from elsewhere
     near: Float[Array, " descents"]  # their robustness; infinite where there is none
-    useless: Int[Array, ""]  # starts in a row whose slopes said nothing
+    useless: Int[Array, ""]  # starts in a row whose gradients were zero or not finite
     descent: Int[Array, " batch"]  # of the last ask: whose row it is, and in which box
     box: Float[Array, " batch"]
     flipped: Bool[Array, " batch"]
@@ -113,7 +116,7 @@ class Gradient(Search[GradientState]):
             )
 
     def at_once(self, batch: int) -> int:
-        """How many descents there are in batches of this size."""
+        """Return the number of descents in batches of this size."""
         return max(1, min(self.descents, batch // 4))
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GradientState:
@@ -148,10 +151,10 @@ class Gradient(Search[GradientState]):
         if not cube.dim:  # One point is all that there is.
             return jnp.zeros((batch, 0), jnp.float32), state._replace(rows=jnp.int32(batch))
         n = self.at_once(batch)
-        # Slopes first, once half of the descents wait for them.
+        # Gradients first, once half of the descents wait for them.
         known = jnp.sum(state.known)
         differentiates = 2 * (n - known) >= n
-        starts, begun = self._started(state, cube)
+        starts, begun = self._starts(state, cube)
         state = _either(differentiates, begun, state)
 
         first = jnp.argsort(jnp.where(differentiates, state.known, ~state.known), stable=True)
@@ -162,14 +165,14 @@ class Gradient(Search[GradientState]):
         size = jnp.where(differentiates, 0, row // there)
         rows = jnp.where(differentiates, there, jnp.minimum(there * min(SIZES, batch // n), batch))
         box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
-        solve = jax.vmap(_least, in_axes=(0, 0, 0, 0, None))
+        solve = jax.vmap(_minimax, in_axes=(0, 0, 0, 0, None))
         free = np.array(cube.levels) == 0
         tried = solve(
             state.clauses[descent], state.gradients[descent], state.point[descent], box, free
         )
         stays = jnp.max(jnp.abs(tried - state.point[descent]), axis=1, initial=0.0) < 1e-6
         number = state.flips[descent] + size
-        other = jax.vmap(_turned, in_axes=(0, 0, 0, 0, None))(
+        other = jax.vmap(_flip, in_axes=(0, 0, 0, 0, None))(
             state.clauses[descent], state.gradients[descent], state.point[descent], number, free
         )
         tried = jnp.where(stays[:, None], other, tried)
@@ -186,7 +189,7 @@ class Gradient(Search[GradientState]):
         return Plan(state.rows, state.differentiates, state.temperature[state.descent])
 
     def tell(self, state: GradientState, cube: Cube, observations: Observations) -> GradientState:
-        assert observations.clauses is not None, "the gradient search is told of clauses"
+        assert observations.clauses is not None, "the gradient search needs clauses"
         assert observations.clause_gradients is not None
         if not cube.dim:
             return state
@@ -208,7 +211,7 @@ class Gradient(Search[GradientState]):
         gradients = jnp.where(usable[best][:, None, None], observations.clause_gradients[best], 0.0)
         finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
         gradients = jnp.where(finite[:, None, None], gradients, 0.0)
-        told = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(least)
+        informative = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(least)
         asked = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
 
@@ -216,20 +219,22 @@ class Gradient(Search[GradientState]):
         # Of descents that may be given up early every second one begins with a smaller box.
         begin = jnp.where((state.number % 3 > 0) & (state.number % 2 == 1), self.shrinks, 1.0)
         differentiated = state._replace(
-            point=_rows(told & asked, observations.u[best], state.point),
-            clauses=_rows(told & asked, clauses[best], state.clauses),
-            gradients=_rows(told & asked, gradients, state.gradients),
-            known=jnp.where(asked, told & ~failed, state.known),
-            fresh=jnp.where(asked, ~told | failed, state.fresh),
+            point=_rows(informative & asked, observations.u[best], state.point),
+            clauses=_rows(informative & asked, clauses[best], state.clauses),
+            gradients=_rows(informative & asked, gradients, state.gradients),
+            known=jnp.where(asked, informative & ~failed, state.known),
+            fresh=jnp.where(asked, ~informative | failed, state.fresh),
             radius=jnp.where(asked & state.fresh, begin, state.radius),
             flips=jnp.where(asked, 0, state.flips),
             steps=jnp.where(asked & state.fresh, 0, state.steps),
             slow=jnp.where(asked & state.fresh, 0, state.slow),
             useless=jnp.where(
-                jnp.any(told), 0, state.useless + jnp.sum(asked & jnp.isfinite(least) & ~told)
+                jnp.any(informative),
+                0,
+                state.useless + jnp.sum(asked & jnp.isfinite(least) & ~informative),
             ).astype(jnp.int32),
         )
-        # Without: a better point, whose slopes are asked for next, or a smaller box.
+        # Without: a better point, whose gradients are wanted next, or a smaller box.
         better = least < before - 1e-4 * jnp.abs(before)
         smallest = jnp.min(jnp.where(owner, state.box[None], jnp.inf), axis=1)
         turned = state.flipped[best] & asked
@@ -243,16 +248,18 @@ class Gradient(Search[GradientState]):
         over = failed | (~better & jnp.where(turned, flips >= limit, radius < least_radius))
         slow = jnp.where(least > LITTLE * before, state.slow + 1, 0)
         over |= better & (slow >= self.patience)
-        kept = asked & ~over
+        goes_on = asked & ~over
         colder = jnp.maximum(0.5 * state.temperature, self.coldest)
         undifferentiated = state._replace(
-            point=_rows(kept & better, observations.u[best], state.point),
-            clauses=_rows(kept & better, clauses[best], state.clauses),
+            point=_rows(goes_on & better, observations.u[best], state.point),
+            clauses=_rows(goes_on & better, clauses[best], state.clauses),
             known=jnp.where(asked, ~over & ~better, state.known),
             fresh=jnp.where(asked, over, state.fresh),
-            radius=jnp.where(kept & (better | ~turned), radius, state.radius),
-            flips=jnp.where(kept, jnp.where(better, 0, jnp.where(turned, flips, 0)), state.flips),
-            temperature=jnp.where(kept & better, colder, state.temperature),
+            radius=jnp.where(goes_on & (better | ~turned), radius, state.radius),
+            flips=jnp.where(
+                goes_on, jnp.where(better, 0, jnp.where(turned, flips, 0)), state.flips
+            ),
+            temperature=jnp.where(goes_on & better, colder, state.temperature),
             steps=jnp.where(asked & better, state.steps + 1, state.steps),
             slow=jnp.where(asked & better, slow, state.slow).astype(jnp.int32),
         )
@@ -261,17 +268,17 @@ class Gradient(Search[GradientState]):
     def warm_start(
         self, state: GradientState, cube: Cube, observations: Observations
     ) -> GradientState:
-        """Start the first descents from the most nearly failing points; failures are found."""
+        """Start the first descents from the points nearest to failing, failures left out."""
         usable = observations.usable & (observations.rho >= 0)
         rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), state.near])
         points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.offered])
         _, nearest = jax.lax.top_k(-rho, len(state.near))
         return state._replace(offered=points[nearest], near=rho[nearest])
 
-    def _started(
+    def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:
-        """Where slopes are wanted: new starts for fresh descents, the middle of the cube first."""
+        """Return the points to differentiate: new starts for fresh descents, the middle first."""
         number = state.starts + jnp.cumsum(state.fresh).astype(jnp.uint32) - 1
         points = halton_points(number, cube.dim, state.key)
         free = np.array(cube.levels) == 0
@@ -296,23 +303,23 @@ def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:
     return jnp.where(chosen.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
 
 
-def _least(
+def _minimax(
     clauses: Float[Array, " clauses"],
     gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
     radius: Float[Array, ""],
     free: Bool[np.ndarray, " d"],
 ) -> Float[Array, " d"]:
-    """Where in a box the greatest of linear clauses is least.
+    """Minimise the greatest of linear clauses over a box.
 
     Exact for two clauses; for more the best of all points where one is least or two meet, or part
     of the way there where they lie higher than the point itself.
     """
     low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
 
-    def corner(slope: Float[Array, "*m d"]) -> Float[Array, "*m d"]:
-        found = jnp.where(slope > 0, low, jnp.where(slope < 0, high, point))
-        return jnp.where(free, found, point)
+    def corner(gradient: Float[Array, "*m d"]) -> Float[Array, "*m d"]:
+        place = jnp.where(gradient > 0, low, jnp.where(gradient < 0, high, point))
+        return jnp.where(free, place, point)
 
     def linear(points: Float[Array, "*m d"]) -> Float[Array, "*m clauses"]:
         return clauses + (points - point) @ gradients.T
@@ -325,7 +332,7 @@ def _least(
         rows = np.arange(len(pairs))
         return values[rows, pairs[:, 0]] - values[rows, pairs[:, 1]]
 
-    def halve(_: Any, weights: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Int[Array, ""], weights: tuple[Array, Array]) -> tuple[Array, Array]:
         # At the least weight on the first clause it is the greater one, at the most the second.
         least, most = weights
         middle = (least + most) / 2
@@ -351,14 +358,14 @@ def _least(
     return jnp.where(whole, candidates[jnp.argmin(greatest)], nearer)
 
 
-def _turned(
+def _flip(
     clauses: Float[Array, " clauses"],
     gradients: Float[Array, "clauses d"],
     point: Float[Array, " d"],
     number: Int[Array, ""],
     free: Bool[np.ndarray, " d"],
 ) -> Float[Array, " d"]:
-    """The point with its `number`-th weakest coordinate at the other end of its range."""
+    """Move the `number`-th weakest coordinate to the other end of its range."""
     steep = jnp.abs(gradients[jnp.argmax(clauses)])
     # Coordinates without a derivative come last: they seem to have no effect.
     order = jnp.argsort(jnp.where((steep > 0) & free, steep, jnp.inf))

@@ -13,6 +13,7 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
 MOST_POINTS = 2**31 - 1
+"""Points of a grid at most."""
 
 
 class GridState(NamedTuple):
@@ -29,8 +30,8 @@ class Grid(Search[GridState]):
 
     **Arguments:**
 
-    - `points`: how many values each continuous coordinate takes, or a tuple with one number each;
-      1 is the middle.
+    - `points`: number of values of each continuous coordinate, or a tuple with one number each; 1
+      is the middle.
 
     **Raises:** `ValueError` for numbers below 1. `check` raises it for a tuple that does not go
     with the space, and for more than `2^31 - 1` points in all.
@@ -93,7 +94,7 @@ class Grid(Search[GridState]):
         return state
 
     def _sizes(self, cube: Cube) -> tuple[int, ...]:
-        """How many values each coordinate takes, the fastest first: discrete, then continuous."""
+        """Return the number of values of each coordinate, the fastest first: discrete ones."""
         cells = tuple(cube.levels[i] for i in cube.discrete)
         if isinstance(self.points, tuple):
             return cells + self.points

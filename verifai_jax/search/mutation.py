@@ -25,15 +25,27 @@ from verifai_jax.search.base import Observations, Search, standard_normal
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before."""
-LEAST_STEP, MOST_STEP = 0.02, 0.6
-"""Standard deviations of steps, in unit coordinates; log-uniform between them."""
+
+LEAST_STEP = 0.02
+"""Smallest standard deviation of steps, in unit coordinates; they are log-uniform."""
+
+MOST_STEP = 0.6
+"""Largest standard deviation of steps, in unit coordinates."""
+
 MOST_EXPLORATION = 0.9
+"""Share of proposals that explore after many simulations without progress."""
+
 EVENLY = 0.1
 """Share of exploration that samples the prior; it grows where nothing else helps."""
-SELDOM, SWINGING = 0.35, 0.35
-"""Shares of exploration in which signals change seldom, and in which they swing to and fro."""
+
+SELDOM = 0.35
+"""Share of exploration in which signals change seldom."""
+
+SWINGING = 0.35
+"""Share of exploration in which signals swing to and fro."""
+
 TO_AND_FRO = 0.9
-"""Share of control points, in the latter, on the other side of the middle than the one before."""
+"""Share of control points, in such signals, on the other side of the middle than the one before."""
 
 
 class MutationState(NamedTuple):
@@ -51,7 +63,7 @@ class Mutation(Search[MutationState]):
 
     **Arguments:**
 
-    - `kept`: how many of the best points are kept.
+    - `kept`: number of best points that are kept.
     - `first`: simulations that explore before anything is mutated.
     - `exploration`: share of proposals that explore.
     - `idle`: simulations without progress after which nearly all do.
@@ -97,8 +109,8 @@ class Mutation(Search[MutationState]):
             random, [16, 16 + d, 16 + 2 * d, 16 + 3 * d], 1
         )
         idle = jnp.minimum(state.stale / self.idle, 1.0)
-        fresh = _explored(cube, coins[:, 0], coins[:, 1], coins[:, 14], idle, values, cuts)
-        changed = self._mutated(state, cube, coins[:, 2:], values, masks, standard_normal(noise))
+        fresh = _explore(cube, coins[:, 0], coins[:, 1], coins[:, 14], idle, values, cuts)
+        changed = self._mutate(state, cube, coins[:, 2:], values, masks, standard_normal(noise))
         # Where all points are equally good there is nothing to start from.
         there = jnp.isfinite(state.score)
         level = jnp.max(jnp.where(there, state.score, -jnp.inf)) <= jnp.min(state.score)
@@ -127,7 +139,7 @@ class Mutation(Search[MutationState]):
             stale=jnp.where(again, 0, stale),
         )
 
-    def _mutated(
+    def _mutate(
         self,
         state: MutationState,
         cube: Cube,
@@ -152,8 +164,8 @@ class Mutation(Search[MutationState]):
 
         size = LEAST_STEP * (MOST_STEP / LEAST_STEP) ** coins[:, 6]
         # One coordinate, two, an eighth or a third of them; at least one.
-        few = np.array([1, 2, max(1, d // 8), max(1, d // 3)], np.float32)
-        count = jnp.asarray(few)[(coins[:, 7] * 4).astype(jnp.int32)]
+        counts = np.array([1, 2, max(1, d // 8), max(1, d // 3)], np.float32)
+        count = jnp.asarray(counts)[(coins[:, 7] * 4).astype(jnp.int32)]
         forced = (coins[:, 8] * d).astype(jnp.int32)[:, None] == jnp.arange(d)
         moves = forced | (masks * d < (count - 1)[:, None])
         step = size[:, None] * normal * moves
@@ -175,7 +187,7 @@ class Mutation(Search[MutationState]):
         return jnp.clip(jnp.where((coins[:, 11] < 0.5)[:, None], inside, moved), 0.0, 1.0)
 
 
-def _explored(
+def _explore(
     cube: Cube,
     way: Float[Array, " n"],
     change: Float[Array, " n"],
@@ -184,7 +196,7 @@ def _explored(
     values: Float[Array, "n d"],
     cuts: Float[Array, "n d"],
 ) -> Float[Array, "n d"]:
-    """Points towards the ends of the range, of signals that change seldom, always or at random."""
+    """Draw points towards the ends of the range; signals change seldom, always or at random."""
     # Arcsine distributed: dense at both ends, as the best controls often are.
     u = jnp.sin(0.5 * np.pi * values) ** 2
     evenly = even < EVENLY + (MOST_EXPLORATION - EVENLY) * idle
@@ -208,7 +220,7 @@ def _explored(
 def _stretch(
     cube: Cube, which: Float[Array, " n"], start: Float[Array, " n"], length: Float[Array, " n"]
 ) -> Float[Array, "n d"]:
-    """One where a random stretch of a random signal is, zero elsewhere."""
+    """Return one in a random stretch of a random signal, zero elsewhere."""
     number = (which * len(cube.signals)).astype(jnp.int32)
     found = jnp.zeros((len(which), cube.dim), jnp.float32)
     for i, signal in enumerate(cube.signals):

@@ -1,7 +1,8 @@
-"""Points given beforehand, in their order: those of a table, of an analysis, of a person."""
+"""A list of points to simulate in order: those of a table, of an analysis, of a person."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,13 +20,15 @@ class PointListState(NamedTuple):
 class PointList(Search[PointListState]):
     """Given points of the unit cube, one after the other; it ends with the last one.
 
-    **Arguments:** `points`: `[n, d]`, in `[0, 1]`.
+    **Arguments:**
+
+    - `points`: `[n, d]`, in `[0, 1]`.
 
     **Raises:** `ValueError` for no points, or points outside the unit cube; `check` for points of
     another dimension than the cube's.
     """
 
-    points: Any
+    points: Float[np.ndarray, "n d"] | Sequence[Sequence[float]]
     learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -37,10 +40,9 @@ class PointList(Search[PointListState]):
         object.__setattr__(self, "points", points)
 
     def check(self, cube: Cube) -> None:
-        if self.points.shape[1] != cube.dim:
-            raise ValueError(
-                f"the points have {self.points.shape[1]} coordinates, the space has {cube.dim}"
-            )
+        dim = np.shape(self.points)[1]
+        if dim != cube.dim:
+            raise ValueError(f"the points have {dim} coordinates, the space has {cube.dim}")
 
     def total(self, cube: Cube) -> int | None:
         return len(self.points)

@@ -1,4 +1,4 @@
-"""Several searches that share what they learn, and a budget that goes where it helps.
+"""A portfolio of searches that share their observations, with a budget that follows success.
 
 The members are complementary: gradients of clauses jump to corners and along where clauses meet,
 mutations need few simulations and no gradients, cross-entropy fills the region of failures in large
@@ -23,15 +23,25 @@ from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
 from verifai_jax.search.mutation import Mutation, MutationState
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
-PRIOR_GAINS, PRIOR_COSTS = np.array([4.0, 2.0, 0.5]), np.array([4.0, 4.0, 4.0])
-"""What each member is taken to have gained, at what cost, before there is evidence."""
+"""Numbers of the members."""
+
+PRIOR_GAINS = np.array([4.0, 2.0, 0.5])
+"""Gains of each member before there is evidence."""
+
+PRIOR_COSTS = np.array([4.0, 4.0, 4.0])
+"""Cost of these gains, in simulations."""
+
 DISCOUNT = 0.98
-"""Of evidence, for each simulation since."""
+"""Discount of evidence, for each simulation since."""
+
 LEAST_SHARE = 0.05
+"""Least share of the budget of a member."""
+
 OPENING = 6
 """Descents before the budget is shared by evidence."""
+
 AMONG = 4
-"""A gain is a point among so many best ones."""
+"""Number of best points among which a new one is a gain."""
 
 
 class PortfolioState(NamedTuple):
@@ -172,20 +182,22 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is None:
             return state
         own = observations._replace(valid=observations.valid & (member == GRADIENT))
-        told = Gradient().tell(state.gradient, cube, own)
+        updated = Gradient().tell(state.gradient, cube, own)
         turn = state.rows[GRADIENT] > 0
-        told = jax.tree.map(
-            lambda new, old: new if new is old else jnp.where(turn, new, old), told, state.gradient
+        updated = jax.tree.map(
+            lambda new, old: new if new is old else jnp.where(turn, new, old),
+            updated,
+            state.gradient,
         )
         # Every fourth start is from one of the best points of all.
-        n = len(told.fresh)
+        n = len(updated.fresh)
         ranks = ((state.mutation.round + jnp.arange(n)) % AMONG).astype(jnp.int32)
         score = state.mutation.score[ranks]
-        offers = told.fresh & (score > 0) & jnp.isfinite(score)
-        offers &= (told.starts + jnp.arange(n)) % 4 == 3
+        offers = updated.fresh & (score > 0) & jnp.isfinite(score)
+        offers &= (updated.starts + jnp.arange(n)) % 4 == 3
         near = jnp.where(offers, score, jnp.inf)
-        told = told._replace(offered=state.mutation.points[ranks], near=near)
-        return state._replace(gradient=told)
+        updated = updated._replace(offered=state.mutation.points[ranks], near=near)
+        return state._replace(gradient=updated)
 
     def warm_start(
         self, state: PortfolioState, cube: Cube, observations: Observations
@@ -220,7 +232,7 @@ class Portfolio(Search[PortfolioState]):
         return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
 
     def _common(self, observations: Observations) -> Observations:
-        """What those members are told that know of no clauses."""
+        """Return the observations for members that use no clauses."""
         rho = observations.rho
         if observations.clauses is not None:
             # Where clauses of different units have to be broken together, without unit.

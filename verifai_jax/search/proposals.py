@@ -1,4 +1,4 @@
-"""What a search proposes to simulate, with the constraint of the space honoured.
+"""Proposals of a search that satisfy the constraint of the space.
 
     proposals = Proposals(search, space.cube, batch=1024, key=key, accepts=space.constraint)
     points = proposals.next(1024)                       # [m, d], m <= 1024
@@ -14,12 +14,13 @@ valid.
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
@@ -27,6 +28,7 @@ from verifai_jax.search import Diverse, Observations, Plan, Search
 
 TRIES = 32
 """Asks in one round at most until every row of a search that learns is accepted."""
+
 MOST_REFUSED = 2000
 """Asks in a row without a single accepted point, after which a run ends."""
 
@@ -38,8 +40,8 @@ class ConstraintError(ValueError):
 class Proposals:
     """The stream of points to simulate; see the module's docstring.
 
-    `asked` and `accepted` count the points that the search proposed and that the constraint let
-    through.
+    - `asked`: number of points that the search proposed.
+    - `accepted`: number of these that the constraint accepted.
     """
 
     def __init__(
@@ -48,7 +50,7 @@ class Proposals:
         cube: Cube,
         batch: int,
         key: Key[Array, ""],
-        accepts: Callable[[Any], Bool[Any, " n"]] | None = None,
+        accepts: Callable[[ArrayLike], Bool[Array, " n"]] | None = None,
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
@@ -67,22 +69,22 @@ class Proposals:
 
     @property
     def exhausted(self) -> bool:
-        """Whether a finite search has no further point."""
+        """True when a finite search has no further point."""
         return self.total is not None and self.asked >= self.total and not len(self._queue)
 
     @property
     def distinct(self) -> int:
-        """Failures far from each other that a search for diverse ones has found."""
+        """Number of failures far from each other, of a search for diverse ones."""
         return int(Diverse.count(self._state))
 
     @property
     def differentiate(self) -> bool:
-        """Whether the search wants the clauses' gradients at the points that `next` gave last."""
+        """True if the search wants gradients of the clauses at the points of the last `next`."""
         return self._plan is not None and bool(self._plan.differentiate)
 
     @property
-    def temperature(self) -> Any:
-        """Of the smooth robustness to differentiate; only for searches with gradients.
+    def temperature(self) -> Float[Array, ""] | Float[np.ndarray, " m"] | float:
+        """Temperature of the smooth robustness; only for searches with gradients.
 
         One for the next points, or, for a search that wants clauses, one for each of the last.
         """
@@ -90,12 +92,20 @@ class Proposals:
             return self._program.temperature(self._state)
         return np.asarray(self._plan.temperature)[self._rows]
 
-    def next(self, most: int) -> Float[Any, "m d"]:
-        """The next points, at most `most`; none if all rows of a round are refused.
+    def next(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+        """Return the next points; none if the constraint refuses all rows of a round.
+
+        **Arguments:**
+
+        - `most`: number of points at most.
+
+        **Returns:** points of the unit cube, `[m, d]`.
 
         **Raises:** `ConstraintError` when the constraint has refused everything for long.
         """
-        points = self._learned(most) if self.search.learns else self._sequence(most)
+        points = (
+            self._next_to_learn_from(most) if self.search.learns else self._next_of_sequence(most)
+        )
         self.accepted += len(points)
         return points
 
@@ -107,10 +117,18 @@ class Proposals:
         clauses: Float[np.ndarray, "m clauses"] | None = None,
         clause_gradients: Float[np.ndarray, "m clauses d"] | None = None,
     ) -> None:
-        """Tell the search what came of the points that `next` gave last."""
+        """Let the search learn from the simulations of the points that `next` gave last.
+
+        **Arguments:**
+
+        - `rho`: robustness of each point.
+        - `valid`: False for simulations without a verdict.
+        - `gradient`: of the smooth robustness, for a search that wants it.
+        - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
+        """
         if not self.search.learns:
             return
-        told = Observations(
+        observations = Observations(
             u=self._points,
             rho=self._spread(rho, np.nan),
             valid=self._spread(valid, False),
@@ -118,16 +136,16 @@ class Proposals:
         )
         if self.search.wants_clauses:
             none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
-            told = told._replace(
+            observations = observations._replace(
                 clauses=self._spread(none[:, :, 0] if clauses is None else clauses, 0.0),
                 clause_gradients=self._spread(
                     none if clause_gradients is None else clause_gradients, 0.0
                 ),
             )
-        self._state = self._program.tell(self._state, told)
+        self._state = self._program.tell(self._state, observations)
 
     def tell_refused(self) -> None:
-        """Tell the search that no row of the last round could be simulated."""
+        """Let the search know that no row of the last round could be simulated."""
         gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient)
 
@@ -135,19 +153,19 @@ class Proposals:
         """Let the search learn from the points of an earlier table, before the first round."""
         if not self.search.learns or not len(u):
             return
-        warm = jax.jit(lambda state, told: self.search.warm_start(state, self.cube, told))
+        warm_start = jax.jit(lambda state, rows: self.search.warm_start(state, self.cube, rows))
         for start in range(0, len(u), self.batch):
             part, values = u[start : start + self.batch], rho[start : start + self.batch]
             missing = self.batch - len(part)
-            told = Observations(
+            observations = Observations(
                 u=np.pad(part.astype(np.float32), ((0, missing), (0, 0)), constant_values=0.5),  # pyright: ignore[reportArgumentType]
                 rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
                 valid=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
             )
-            self._state = warm(self._state, told)
+            self._state = warm_start(self._state, observations)
 
-    def snapshot(self) -> dict[str, Any]:
-        """All that decides what comes next; its values are arrays and never change."""
+    def snapshot(self) -> dict[str, np.ndarray | Array]:
+        """Return the state that decides the next points; its values are arrays and never change."""
         leaves = jax.tree.leaves(self._state)
         return {
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
@@ -155,8 +173,8 @@ class Proposals:
             "counts": np.array([self.asked, self.accepted], np.int64),
         }
 
-    def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on where `snapshot` was taken.
+    def restore(self, snapshot: Mapping[str, np.ndarray | Array]) -> None:
+        """Continue from a snapshot.
 
         **Raises:** `ValueError` for a snapshot of another search, space or batch size.
         """
@@ -176,21 +194,25 @@ class Proposals:
         self._queue = np.asarray(snapshot["queue"])
         self.asked, self.accepted = (int(count) for count in snapshot["counts"])
 
-    def _ask(self) -> Any:
+    def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
         if self.total is not None:
             points = points[: max(0, self.total - self.asked)]
         return points
 
-    def _accepted_rows(self, points: Any) -> Bool[np.ndarray, " n"]:
+    def _accepted_rows(
+        self, points: Float[Array, "n d"] | Float[np.ndarray, "n d"]
+    ) -> Bool[np.ndarray, " n"]:
         if self._accepts is None:
             return np.ones(len(points), bool)
         missing = self.batch - len(points)
         padded = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
         return np.asarray(self._accepts(padded))[: len(points)]
 
-    def _sequence(self, most: int) -> Float[np.ndarray, "m d"]:
-        parts, ready, barren = [self._queue], len(self._queue), 0
+    def _next_of_sequence(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+        """Return the next accepted points of a search that does not learn."""
+        ready, barren = len(self._queue), 0
+        parts: list[np.ndarray | Array] = [self._queue]
         while ready < most and not (self.total is not None and self.asked >= self.total):
             points = self._ask()
             self.asked += len(points)
@@ -210,7 +232,8 @@ class Proposals:
         self._queue = whole[most:]
         return whole[:most]
 
-    def _learned(self, most: int) -> Float[Any, "m d"]:
+    def _next_to_learn_from(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
+        """Return the points of one round of a search that learns."""
         points = self._ask()
         self._plan = None
         planned = len(points)
@@ -238,15 +261,15 @@ class Proposals:
         self._rows = np.flatnonzero(accepted)[:most]
         return points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
 
-    def _spread(self, values: np.ndarray, filler: Any) -> Any:
-        """Values of the simulated rows in an array of all rows of the batch."""
+    def _spread(self, values: np.ndarray, filler: float) -> Any:
+        """Put values of the simulated rows into an array of all rows of the batch."""
         if len(values) == self.batch:
             return values
         whole = np.full((self.batch, *values.shape[1:]), filler, values.dtype)
         whole[self._rows] = values
         return whole
 
-    def _give_up(self) -> None:
+    def _give_up(self) -> NoReturn:
         raise ConstraintError(
             f"where refused all that search {self.search!r} has proposed for {MOST_REFUSED} "
             f"rounds; it accepted {self.accepted} of {self.asked} points in all. Make the space "
@@ -255,16 +278,18 @@ class Proposals:
 
 
 class _Program(NamedTuple):
-    init: Any
-    ask: Any
-    tell: Any
-    temperature: Any
-    plan: Any
+    """Compiled functions of a search."""
+
+    init: Callable[..., PyTree]
+    ask: Callable[..., tuple[Array, PyTree]]
+    tell: Callable[..., PyTree]
+    temperature: Callable[..., Any]
+    plan: Callable[..., Plan]
 
 
 @lru_cache(maxsize=64)
 def _program(search: Search, cube: Cube, batch: int) -> _Program:
-    """The compiled `init / ask / tell` of one search on one cube."""
+    """Compile `init / ask / tell` of one search on one cube."""
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     init = jax.jit(lambda key: search.init(key, cube, batch)).lower(key).compile()
     state = jax.eval_shape(lambda key: search.init(key, cube, batch), key)
@@ -280,9 +305,9 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
             clause_gradients=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
         )
         plan = jax.jit(lambda state: search.plan(state, cube, batch)).lower(state).compile()
-    tell = None
+    tell: Any = None
     if search.learns:
-        tell = jax.jit(lambda state, told: search.tell(state, cube, told))
+        tell = jax.jit(lambda state, rows: search.tell(state, cube, rows))
         tell = tell.lower(state, observations).compile()
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants_gradient:

@@ -23,7 +23,10 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search
 
 BITS = 32
-MOST_DIMENSIONS = 21201  # direction numbers are known for
+"""Bits of the index of a point."""
+
+MOST_DIMENSIONS = 21201
+"""Coordinates for which direction numbers are known."""
 
 
 class SobolState(NamedTuple):
@@ -69,7 +72,7 @@ class Sobol(Search[SobolState]):
         shift = jnp.zeros(cube.dim, jnp.uint32)
         if self.scramble:
             random = jax.random.bits(key, (BITS + 1, cube.dim), jnp.uint32)
-            directions, shift = _scrambled(directions, random[1:]), random[0]
+            directions, shift = _scramble(directions, random[1:]), random[0]
         return SobolState(directions, shift, jnp.uint32(0))
 
     def ask(
@@ -90,7 +93,7 @@ class Sobol(Search[SobolState]):
 
 @lru_cache(maxsize=8)
 def direction_numbers(dim: int) -> UInt32[np.ndarray, "bits dim"]:
-    """Direction numbers of the first `dim` coordinates, their binary point before the first bit."""
+    """Compute direction numbers of `dim` coordinates, binary point before the first bit."""
     polynomials, initial = _joe_kuo()
     numbers = np.zeros((BITS, dim), np.uint32)
     for j in range(dim):
@@ -111,17 +114,17 @@ def direction_numbers(dim: int) -> UInt32[np.ndarray, "bits dim"]:
 
 @lru_cache(maxsize=1)
 def _joe_kuo() -> tuple[np.ndarray, np.ndarray]:
-    """Primitive polynomials and initial numbers, from SciPy's file (importing it takes longer)."""
+    """Load primitive polynomials and initial numbers from SciPy's file; an import takes longer."""
     scipy = importlib.util.find_spec("scipy")
     assert scipy is not None, "JAX depends on SciPy"
     with np.load(Path(str(scipy.origin)).parent / "stats/_sobol_direction_numbers.npz") as file:
         return file["poly"], file["vinit"]
 
 
-def _scrambled(
+def _scramble(
     directions: UInt32[Array, "bits d"], random: UInt32[Array, "bits d"]
 ) -> UInt32[Array, "bits d"]:
-    """The direction numbers times a random lower triangular matrix of bits for each coordinate."""
+    """Multiply direction numbers by a random lower triangular bit matrix for each coordinate."""
     digit = np.arange(BITS, dtype=np.uint32)
     own = (np.uint32(1) << (BITS - 1 - digit))[:, None]
     # Each digit is flipped by random ones of the digits before it, and keeps itself.

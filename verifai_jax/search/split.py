@@ -1,4 +1,4 @@
-"""Compositions: a search for each part of the space.
+"""Composition of searches: one for each part of the space.
 
     Split({"wind": CrossEntropy(), "cars": "halton"}, rest="uniform")
     Split({"x0": Grid(5), "alg": Grid()}, rest=Uniform())
@@ -9,7 +9,6 @@ takes the others for noise, so that what belongs together belongs into one part.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +54,7 @@ class Split(Search[tuple[PyTree, ...]]):
 
     @property
     def searches(self) -> tuple[Search, ...]:
-        """One a part, that of the rest last."""
+        """The searches, one a part, that of the rest last."""
         return (*(search for _, search in self.parts), self.rest)
 
     @property
@@ -82,7 +81,7 @@ class Split(Search[tuple[PyTree, ...]]):
         totals = [search.total(part) for search, _, part in self._shares(cube)]
         return min((total for total in totals if total is not None), default=None)
 
-    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> tuple[Any, ...]:
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> tuple[PyTree, ...]:
         shares = self._shares(cube)
         keys = jax.random.split(key, len(shares))
         return tuple(
@@ -91,8 +90,8 @@ class Split(Search[tuple[PyTree, ...]]):
         )
 
     def ask(
-        self, state: tuple[Any, ...], cube: Cube, batch: int
-    ) -> tuple[Float[Array, "batch d"], tuple[Any, ...]]:
+        self, state: tuple[PyTree, ...], cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], tuple[PyTree, ...]]:
         u = jnp.zeros((batch, cube.dim), jnp.float32)
         states = []
         for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
@@ -102,32 +101,32 @@ class Split(Search[tuple[PyTree, ...]]):
         return u, tuple(states)
 
     def tell(
-        self, state: tuple[Any, ...], cube: Cube, observations: Observations
-    ) -> tuple[Any, ...]:
-        return self._told("tell", state, cube, observations)
+        self, state: tuple[PyTree, ...], cube: Cube, observations: Observations
+    ) -> tuple[PyTree, ...]:
+        return self._learn("tell", state, cube, observations)
 
     def warm_start(
-        self, state: tuple[Any, ...], cube: Cube, observations: Observations
-    ) -> tuple[Any, ...]:
-        return self._told("warm_start", state, cube, observations)
+        self, state: tuple[PyTree, ...], cube: Cube, observations: Observations
+    ) -> tuple[PyTree, ...]:
+        return self._learn("warm_start", state, cube, observations)
 
-    def temperature(self, state: tuple[Any, ...]) -> Float[Array, ""]:
-        """That of the first part that wants gradients."""
+    def temperature(self, state: tuple[PyTree, ...]) -> Float[Array, ""]:
+        """Return the temperature of the first part that wants gradients."""
         for search, its in zip(self.searches, state, strict=True):
             if search.wants_gradient:
                 return search.temperature(its)
         return super().temperature(state)
 
-    def plan(self, state: tuple[Any, ...], cube: Cube, batch: int) -> Plan:
-        """That of the first part that has plans."""
+    def plan(self, state: tuple[PyTree, ...], cube: Cube, batch: int) -> Plan:
+        """Return the plan of the first part that has plans."""
         for its, (search, _, part) in zip(state, self._shares(cube), strict=True):
             if search.wants_clauses:
                 return search.plan(its, part, batch)
         return super().plan(state, cube, batch)
 
-    def _told(
-        self, verb: str, state: Any, cube: Cube, observations: Observations
-    ) -> tuple[Any, ...]:
+    def _learn(
+        self, verb: str, state: tuple[PyTree, ...], cube: Cube, observations: Observations
+    ) -> tuple[PyTree, ...]:
         states = []
         for its, (search, places, part) in zip(state, self._shares(cube), strict=True):
             gradient, clause_gradients = observations.gradient, observations.clause_gradients
@@ -142,7 +141,7 @@ class Split(Search[tuple[PyTree, ...]]):
         return tuple(states)
 
     def _shares(self, cube: Cube) -> list[tuple[Search, np.ndarray, Cube]]:
-        """Each search with its coordinates, as indices and as a cube of their own."""
+        """Return each search with its coordinates, as indices and as a cube of their own."""
         owner = np.full(cube.dim, len(self.parts))
         for number, (names, _) in enumerate(self.parts):
             for name in map(str.strip, names.split(",")):
@@ -161,7 +160,7 @@ class Split(Search[tuple[PyTree, ...]]):
 
 
 def _covers(name: str, label: str) -> bool:
-    """Whether a coordinate called `label` belongs to the feature `name`."""
+    """Return whether a coordinate called `label` belongs to the feature `name`."""
     return label == name or label.startswith((f"{name}.", f"{name}["))
 
 

@@ -39,6 +39,6 @@ class Uniform(Search[UniformState]):
 def uniform_points(
     key: Key[Array, ""], index: UInt32[Array, " n"], dim: int
 ) -> Float[Array, "n dim"]:
-    """Points number `index` of the random sequence that `key` starts."""
+    """Compute points number `index` of the random sequence that `key` starts."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
     return jax.vmap(lambda key: jax.random.uniform(key, (dim,), jnp.float32))(keys)
