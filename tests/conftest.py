@@ -16,7 +16,7 @@ from jaxtyping import install_import_hook
 
 matplotlib.use("Agg")
 
-CHECKED_ROOMS: list[str] = ["estimation", "features"]
+CHECKED_ROOMS: list[str] = ["estimation"]
 """Rooms whose annotations, shapes included, are checked at run time in tests."""
 
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")

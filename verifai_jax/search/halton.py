@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
+from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, check_count
+from verifai_jax.search.base import Observations, Search
 
 BITS = 32
 """Bits of the index of a point."""

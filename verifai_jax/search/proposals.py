@@ -19,7 +19,6 @@ from typing import Any, NamedTuple, NoReturn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
@@ -50,7 +49,7 @@ class Proposals:
         cube: Cube,
         batch: int,
         key: Key[Array, ""],
-        accepts: Callable[[ArrayLike], Bool[Array, " n"]] | None = None,
+        accepts: Callable[[Any], Bool[Array, " n"]] | None = None,
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
