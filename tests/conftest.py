@@ -23,7 +23,21 @@ install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_
 
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
 
-LONG_FILES: tuple[str, ...] = ()
+LONG_FILES = (
+    "test_sweep_driver.py",
+    "test_falsify.py",
+    "test_confirm.py",
+    "test_shrink.py",
+    "test_repair.py",
+    "test_synthesize.py",
+    "test_cli.py",
+    "test_mujoco.py",
+    "test_certify.py",
+    "test_train.py",
+    "test_gymnax.py",
+    "test_brax.py",
+    "test_explain_counterexample.py",
+)
 """Test files that take longest, the longest first: what begins last must be short."""
 
 

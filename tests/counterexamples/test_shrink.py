@@ -13,8 +13,8 @@ import verifai_jax as vj
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.counterexamples import Shrunk, shrink
 from verifai_jax.counterexamples.fixed_key import fix_key, key_of
-from verifai_jax.counterexamples.minimize_distance import least
 from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.statistics.least_distance import shortest_in_box
 
 
 def problem_of(name, d, rho, nominal=None, black_box=False, space=None):
@@ -243,14 +243,14 @@ def test_a_system_that_draws_is_simulated_with_the_key_of_the_row():
 
 def test_the_nearest_point_of_half_spaces():
     rows, levels = np.array([[-1.0, 0.0], [0.0, -2.0]]), np.array([-0.3, -0.4])
-    found = least(rows, levels, np.full(2, -1.0), np.full(2, 1.0))
+    found = shortest_in_box(rows, levels, np.full(2, -1.0), np.full(2, 1.0))
     np.testing.assert_allclose(found, [0.3, 0.2], atol=1e-9)
-    assert least(rows, np.array([-2.0, 0.0]), np.full(2, -1.0), np.full(2, 1.0)) is None
+    assert shortest_in_box(rows, np.array([-2.0, 0.0]), np.full(2, -1.0), np.full(2, 1.0)) is None
     slanted = np.array([[-3.0, -4.0]])
     np.testing.assert_allclose(
-        least(slanted, np.array([-1.0]), np.full(2, -1.0), np.full(2, 1.0)), [0.12, 0.16]
+        shortest_in_box(slanted, np.array([-1.0]), np.full(2, -1.0), np.full(2, 1.0)), [0.12, 0.16]
     )
-    capped = least(slanted, np.array([-1.0]), np.full(2, -1.0), np.array([1.0, 0.1]))
+    capped = shortest_in_box(slanted, np.array([-1.0]), np.full(2, -1.0), np.array([1.0, 0.1]))
     np.testing.assert_allclose(capped, [0.2, 0.1], atol=1e-9)
 
 

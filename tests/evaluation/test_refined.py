@@ -196,13 +196,13 @@ def test_brax_converges_where_it_is_the_same_model():
     pytest.importorskip("brax")
     with jax.enable_x64(False):
         still = lambda observation: jnp.zeros(1)  # noqa: E731
-        system = vj.systems.brax("inverted_pendulum", still, steps=30, backend="generalized")
+        system = vj.brax("inverted_pendulum", still, steps=30, backend="generalized")
         angles = [
             np.asarray(jax.jit(system.refined(n).__call__)({}, jax.random.key(0))["q"])[:, 1]
             for n in (1, 2, 4)
         ]
         gaps = [np.max(np.abs(a - b)) for a, b in itertools.pairwise(angles)]
         assert 1.6 < gaps[0] / gaps[1] < 2.5
-        other = vj.systems.brax("inverted_pendulum", still, steps=3, backend="positional")
+        other = vj.brax("inverted_pendulum", still, steps=3, backend="positional")
         with pytest.raises(ValueError, match="backend 'positional': its constraints are as stiff"):
             other.refined(2)

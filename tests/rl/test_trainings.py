@@ -38,6 +38,7 @@ def policies(group):
     return trained(group)
 
 
+@pytest.mark.slow
 def test_a_training_does_not_depend_on_its_company(group, policies):
     alone = leaves(train(CartPoleTask(), ppo(RATES[1]), seed=3, steps=STEPS).policy)
     for a, b in zip(alone, policies[1], strict=True):
