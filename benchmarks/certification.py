@@ -122,7 +122,7 @@ def count_wrong(name, rates, runs, p, draw_of=bernoulli):
 def trained(configurations):
     """Policies of PPO with learning rates, discounts and seeds all over the place."""
     from envs.cartpole import CartPoleTask
-    from verifai_jax.rl import PPO, Configuration, Trainings
+    from verifai_jax.rl import PPO, BatchedTraining, Configuration
 
     random = np.random.default_rng(0)
     made = [
@@ -137,10 +137,10 @@ def trained(configurations):
         )
         for seed in range(configurations)
     ]
-    trainings = Trainings(made)
-    for _ in trainings.advance(dict.fromkeys(range(configurations), 32_768)):
+    training = BatchedTraining(made)
+    for _ in training.advance(dict.fromkeys(range(configurations), 32_768)):
         pass
-    return [trainings.policy(number) for number in range(configurations)]
+    return [training.policy(number) for number in range(configurations)]
 
 
 def policies(configurations, runs, heavy):

@@ -22,10 +22,10 @@ from benchmarks.control_tasks import Acrobot, Pendulum
 from envs.cartpole import CartPoleTask
 from envs.mountain_car import ContinuousMountainCarTask, MountainCarTask
 from verifai_jax.rl import PPO, evaluate
+from verifai_jax.rl.batched_training import BatchedTraining, Configuration
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
 from verifai_jax.rl.task.task import Task
-from verifai_jax.rl.trainings import Configuration, Trainings
 
 
 @dataclass(frozen=True)
@@ -110,12 +110,12 @@ CURVES = (
 def returns(curve: Curve, seeds: int) -> np.ndarray:
     """Mean return of each seed's policy, on the nominal task."""
     task = curve.nominal or curve.task
-    trainings = Trainings(
+    training = BatchedTraining(
         [Configuration(curve.task, curve.algorithm, curve.steps, seed) for seed in range(seeds)]
     )
-    for _ in trainings.advance(dict.fromkeys(range(seeds), curve.steps)):
+    for _ in training.advance(dict.fromkeys(range(seeds), curve.steps)):
         pass
-    policies = [trainings.policy(seed) for seed in range(seeds)]
+    policies = [training.policy(seed) for seed in range(seeds)]
     return np.array([evaluate(task, p, seed=99, episodes=100).mean() for p in policies])
 
 

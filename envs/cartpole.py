@@ -30,7 +30,7 @@ from envs.randomisation import check_ranges, factor
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.rl import Discrete, Policy, load_policy
 from verifai_jax.rl.algorithm import Number
-from verifai_jax.rl.policy import Layers, written_out
+from verifai_jax.rl.policy import Layers, scalar_network
 from verifai_jax.systems.ode import Ode, ode, sin_cos
 from verifai_jax.systems.ode.integrators import euler
 
@@ -170,7 +170,7 @@ def neural(
 
     def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         if layers is not None:
-            (preference,) = written_out(layers, state, policy.activation)
+            (preference,) = scalar_network(layers, state, policy.activation)
         else:
             left, right = policy(jnp.stack(state))
             preference = right - left

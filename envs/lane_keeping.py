@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.waveform import Waveform
 from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.rl.policy import network, written_out
+from verifai_jax.rl.policy import network, scalar_network
 from verifai_jax.systems.ode import Ode, ode, sin_cos
 from verifai_jax.systems.ode.integrators import rk4
 
@@ -228,7 +228,7 @@ def neural(policy: Policy | str | Path = POLICY_FILE) -> Controller:
     def control(time: Scalar | float, state: State, features: Features) -> Scalar:
         sees = observation(measured(time, state, features))
         if small:
-            (unit,) = written_out(layers, sees, policy.activation)
+            (unit,) = scalar_network(layers, sees, policy.activation)
         else:
             (unit,) = network(layers, jnp.stack(sees), policy.activation)
         if policy.squash:

@@ -14,7 +14,7 @@ from envs import train_hopper, training
 from specs import hopper as specs
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.rl import Discrete, Trained, evaluate, load_policy, policy_notes
+from verifai_jax.rl import Discrete, Training, evaluate, load_policy, policy_notes
 
 KEY = jax.random.key(0)
 PROBLEMS = ("upright", "gusts", "advances")  # that of "familiar" is that of "upright"
@@ -153,7 +153,7 @@ def test_the_engines_agree_until_contacts_make_them_part(native):
 @pytest.mark.parametrize(("earned", "status"), [(499.0, 1), (501.0, 0)])
 def test_a_policy_that_did_not_learn_is_not_written(earned, status, tmp_path, capsys, monkeypatch):
     policy, out = load_policy(h.POLICY_FILE), tmp_path / "policy.npz"
-    trained = Trained(policy, np.array([8192]), np.array([np.nan]))
+    trained = Training(policy, np.array([8192]), np.array([np.nan]))
     monkeypatch.setattr(training, "train", lambda *task, **options: trained)
     monkeypatch.setattr(training, "evaluate", lambda *task, **options: np.full(256, earned))
     assert train_hopper.TRAINING.main(None, ["--seed", "5", "--out", str(out)]) == status

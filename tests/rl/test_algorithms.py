@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.control_tasks import Acrobot, Pendulum
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.rl import PPO, Configuration, Continuous, Discrete, Trainings, train
+from verifai_jax.rl import PPO, BatchedTraining, Configuration, Continuous, Discrete, train
 from verifai_jax.rl.algorithm import Algorithm
-from verifai_jax.rl.algorithms import ALGORITHMS, algorithm_named, fitting
+from verifai_jax.rl.algorithms import ALGORITHMS, algorithm_named, algorithms_for
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
 
@@ -22,8 +22,8 @@ def test_algorithms_by_name():
 
 
 def test_which_fit_an_action():
-    assert fitting(Discrete(3)) == ("ppo", "pqn")
-    assert fitting(Continuous(-1.0, 1.0)) == ("ppo", "sac")
+    assert algorithms_for(Discrete(3)) == ("ppo", "pqn")
+    assert algorithms_for(Continuous(-1.0, 1.0)) == ("ppo", "sac")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -73,15 +73,15 @@ def test_in_a_group_and_under_vmap_as_alone(name):
 
     def trained(configurations, **options):
         one = jax.local_devices()[:1]
-        trainings = Trainings(configurations, devices=one, **options)
+        training = BatchedTraining(configurations, devices=one, **options)
         for steps_so_far in (256, steps):
-            list(trainings.advance(dict.fromkeys(range(len(configurations)), steps_so_far)))
-        return [jax.tree.leaves(trainings.policy(n)) for n in range(len(configurations))]
+            list(training.advance(dict.fromkeys(range(len(configurations)), steps_so_far)))
+        return [jax.tree.leaves(training.policy(n)) for n in range(len(configurations))]
 
     policies = trained(group)
     for ours, alone in zip(policies[1], trained(group[1:2])[0], strict=True):
         np.testing.assert_array_equal(ours, alone)
-    for one, other in zip(policies, trained(group, together=3), strict=True):
+    for one, other in zip(policies, trained(group, per_device=3), strict=True):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-3)
     assert np.any(policies[0][0] != policies[1][0])
@@ -96,7 +96,7 @@ class Broken(Pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", fitting(Pendulum().action))
+@pytest.mark.parametrize("name", algorithms_for(Pendulum().action))
 def test_what_is_no_number_is_told_and_stops_nothing(name):
     trained = train(Broken(), SMALL[name], steps=4_096)
     assert len(trained.mean_return) == len(trained.steps)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from verifai_jax.rl import Discrete
-from verifai_jax.rl.experience import advance, begin, observation_size, progress
-from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
+from verifai_jax.rl.experience import advance, observation_size, progress, start_episodes
+from verifai_jax.rl.observations import ObservationStatistics, mean_and_scale, normalise, update
 
 
 @jax.tree_util.register_dataclass
@@ -36,22 +36,26 @@ class Count:
 @jax.jit
 def six_steps(task, action):
     def step(episodes, key):
-        seen = jax.vmap(task.observe)(episodes.state)
+        observation = jax.vmap(task.observe)(episodes.state)
         episodes, transition = advance(task, episodes, action, key)
-        return episodes, (seen, transition)
+        return episodes, (observation, transition)
 
-    start = begin(task, jax.random.key(0), 3)
-    episodes, (seen, transition) = jax.lax.scan(step, start, jax.random.split(jax.random.key(1), 6))
-    return episodes, seen, transition, progress(transition)
+    start = start_episodes(task, jax.random.key(0), 3)
+    episodes, (observed, transition) = jax.lax.scan(
+        step, start, jax.random.split(jax.random.key(1), 6)
+    )
+    return episodes, observed, transition, progress(transition)
 
 
 LEFT = jnp.array([0, 0, 1])
 
 
 def test_cut_off_is_not_terminated_and_leads_to_the_state_before_the_reset():
-    episodes, seen, transition, told = six_steps(Count(), LEFT)
-    np.testing.assert_array_equal(seen[:, 0, 0], [10, 11, 12, 13, 10, 11])
-    np.testing.assert_array_equal(transition.next_observation, seen + jnp.array([1.0, 0.0, 0.0]))
+    episodes, observed, transition, told = six_steps(Count(), LEFT)
+    np.testing.assert_array_equal(observed[:, 0, 0], [10, 11, 12, 13, 10, 11])
+    np.testing.assert_array_equal(
+        transition.next_observation, observed + jnp.array([1.0, 0.0, 0.0])
+    )
     assert not np.any(transition.ends.terminated)
     cut = np.array([False, False, False, True, False, False])
     np.testing.assert_array_equal(transition.ends.truncated, np.tile(cut[:, None], 3))
@@ -63,12 +67,12 @@ def test_cut_off_is_not_terminated_and_leads_to_the_state_before_the_reset():
 
 
 def test_terminated_is_terminated_and_the_next_episode_is_another():
-    _, seen, transition, told = six_steps(Count(end=12.0), LEFT)
+    _, observed, transition, told = six_steps(Count(end=12.0), LEFT)
     np.testing.assert_array_equal(transition.ends.terminated[:, 0], [False, True] * 3)
     assert not np.any(transition.ends.truncated)
-    places = np.asarray(seen[::2, :, 1:]).reshape(9, 2)
+    places = np.asarray(observed[::2, :, 1:]).reshape(9, 2)
     assert len(np.unique(places, axis=0)) == 9
-    np.testing.assert_array_equal(seen[::2, :, 1:], seen[1::2, :, 1:])
+    np.testing.assert_array_equal(observed[::2, :, 1:], observed[1::2, :, 1:])
     assert int(told.episodes) == 9
     assert float(told.mean_return) == pytest.approx(21 + 200 / 3)
 
@@ -84,7 +88,7 @@ def test_size_of_an_observation():
     sizes = []
 
     def look(key):
-        sizes.append(observation_size(Count(), begin(Count(), key, 2)))
+        sizes.append(observation_size(Count(), start_episodes(Count(), key, 2)))
 
     jax.eval_shape(look, jax.random.key(0))
     assert sizes == [3]
@@ -92,14 +96,14 @@ def test_size_of_an_observation():
 
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
-    seen = Seen.nothing(2)
-    np.testing.assert_array_equal(normaliser(seen), [[0, 0], [1, 1]])
+    statistics = ObservationStatistics.initial(2)
+    np.testing.assert_array_equal(mean_and_scale(statistics), [[0, 0], [1, 1]])
     for batch in rows:
-        seen = watch(seen, jnp.asarray(batch))
+        statistics = update(statistics, jnp.asarray(batch))
     every = rows.reshape(-1, 2)
-    np.testing.assert_allclose(seen.mean, every.mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(seen.variance, every.var(axis=0), rtol=1e-4)
-    got = np.asarray(normalised(seen, jnp.asarray(every)))
+    np.testing.assert_allclose(statistics.mean, every.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(statistics.variance, every.var(axis=0), rtol=1e-4)
+    got = np.asarray(normalise(statistics, jnp.asarray(every)))
     np.testing.assert_allclose(got.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(got.std(axis=0), 1, rtol=1e-4)
-    np.testing.assert_array_equal(normalised(seen, jnp.asarray(every), really=False), every)
+    np.testing.assert_array_equal(normalise(statistics, jnp.asarray(every), enabled=False), every)

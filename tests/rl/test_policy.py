@@ -15,7 +15,7 @@ from verifai_jax.rl import (
     policy_notes,
     save_policy,
 )
-from verifai_jax.rl.policy import new_layers, written_out
+from verifai_jax.rl.policy import new_layers, scalar_network
 
 LAYERS = (
     (jnp.array([[1.0, -1.0], [0.5, 2.0]]), jnp.array([0.1, -0.2])),
@@ -33,7 +33,7 @@ def test_network_by_hand():
     policy = Policy(LAYERS, None, None, None, Discrete(2))
     np.testing.assert_allclose(policy(SEEN), by_hand(SEEN), rtol=1e-6)
     assert int(policy.act(SEEN)) == int(np.argmax(by_hand(SEEN)))
-    np.testing.assert_allclose(written_out(LAYERS, list(SEEN)), by_hand(SEEN), rtol=1e-6)
+    np.testing.assert_allclose(scalar_network(LAYERS, list(SEEN)), by_hand(SEEN), rtol=1e-6)
 
 
 def test_observations_are_normalised():
@@ -53,7 +53,7 @@ def test_relu_between_the_layers():
     (w0, b0), (w1, b1) = [(np.asarray(w), np.asarray(b)) for w, b in LAYERS]
     expected = np.maximum(np.asarray(SEEN) @ w0 + b0, 0.0) @ w1 + b1
     np.testing.assert_allclose(policy(SEEN), expected, rtol=1e-6)
-    np.testing.assert_allclose(written_out(LAYERS, list(SEEN), "relu"), expected, rtol=1e-6)
+    np.testing.assert_allclose(scalar_network(LAYERS, list(SEEN), "relu"), expected, rtol=1e-6)
 
 
 def test_squashed_outputs():

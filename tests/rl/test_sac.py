@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verifai_jax.rl import Configuration, Continuous, Discrete, Trainings, evaluate, train
+from verifai_jax.rl import BatchedTraining, Configuration, Continuous, Discrete, evaluate, train
 from verifai_jax.rl.algorithm import Algorithm
-from verifai_jax.rl.replay_buffer import Remembered, draw, empty, remember, split
+from verifai_jax.rl.replay_buffer import StoredTransitions, add, empty_buffer, sample, unpack
 from verifai_jax.rl.sac import SAC, _act, _loss, squash_log_prob
 
 
@@ -84,19 +84,19 @@ def test_density_and_its_slope_stay_finite_at_the_ends():
 
 def rows(values):
     column = np.array(values, np.float32)[:, None]
-    return Remembered(column, column + 0.5, 10 * column, -column[:, 0], column[:, 0] > 3)
+    return StoredTransitions(column, column + 0.5, 10 * column, -column[:, 0], column[:, 0] > 3)
 
 
-filled = jax.jit(remember)
+filled = jax.jit(add)
 
 
 @jax.jit
 def drawn_of(buffer):
-    return draw(buffer, jax.random.key(0), 600, actions=1)
+    return sample(buffer, jax.random.key(0), 600, actions=1)
 
 
 def test_buffer_is_a_ring_and_gives_back_whole_transitions():
-    buffer = empty(6, size=1, actions=1)
+    buffer = empty_buffer(6, size=1, actions=1)
     for start in (0, 2, 4, 6):
         buffer = filled(buffer, rows([start, start + 1]))
     assert (int(buffer.filled), int(buffer.place)) == (6, 2)
@@ -110,7 +110,7 @@ def test_buffer_is_a_ring_and_gives_back_whole_transitions():
 
 
 def test_only_what_happened_is_drawn():
-    buffer = filled(empty(6, size=1, actions=1), rows([7, 8]))
+    buffer = filled(empty_buffer(6, size=1, actions=1), rows([7, 8]))
     drawn = drawn_of(buffer)
     assert set(np.asarray(drawn.observation[:, 0])) == {7, 8}
 
@@ -128,7 +128,7 @@ def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
 
         start = sac.init(Blind(time_limit=4), key, updates=1)
         state, _ = jax.lax.scan(step, start, jax.random.split(key, 5))
-        return split(state.buffer.rows, actions=1)
+        return unpack(state.buffer.rows, actions=1)
 
     seen = collect(jax.random.key(0))
     action = np.clip(np.asarray(seen.action, np.float64), -0.999_999, 0.999_999)
@@ -148,7 +148,7 @@ def test_each_loss_has_a_gradient_for_its_own_weights():
     def part(*shape):
         return generator.normal(size=shape).astype(np.float32)
 
-    batch = Remembered(part(8, 1), part(8, 1), np.tanh(part(8, 1)), part(8), np.zeros(8))
+    batch = StoredTransitions(part(8, 1), part(8, 1), np.tanh(part(8, 1)), part(8), np.zeros(8))
     noise = part(2, 8, 1)
 
     @jax.jit
@@ -224,5 +224,5 @@ def test_hyper_parameters_that_cannot_train_are_refused(options, message):
 def test_trains_on_all_devices_at_once():
     # Decompositions of several matrices at once once waited for each other for ever here.
     group = [Configuration(Aim(), SAC(), steps=2_000, seed=seed) for seed in range(4)]
-    trainings = Trainings(group)
-    assert list(trainings.advance(dict.fromkeys(range(4), 2_000))) == [0, 1, 2, 3]
+    training = BatchedTraining(group)
+    assert list(training.advance(dict.fromkeys(range(4), 2_000))) == [0, 1, 2, 3]

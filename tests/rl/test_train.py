@@ -7,7 +7,7 @@ import pytest
 
 from envs.cartpole import CartPoleTask
 from verifai_jax.rl import PPO, Continuous, Discrete, Task, evaluate, train
-from verifai_jax.rl.observations import Seen, watch
+from verifai_jax.rl.observations import ObservationStatistics, update
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def test_same_seed_same_policy_and_other_values_reuse_the_program(compiled):
         horizon=16,
     )
     changed = train(Recall(), faster, seed=1, steps=8_000)
-    assert "jit(_reach)" not in compiled
+    assert "jit(_advance_updates)" not in compiled
     assert np.any(changed.policy.layers[0][0] != first.policy.layers[0][0])
 
 
@@ -115,11 +115,11 @@ def test_episodes_are_cut_off_and_counted():
 
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
-    seen = Seen.nothing(2)
+    statistics = ObservationStatistics.initial(2)
     for batch in rows:
-        seen = watch(seen, jnp.asarray(batch))
-    np.testing.assert_allclose(seen.mean, rows.reshape(-1, 2).mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(seen.variance, rows.reshape(-1, 2).var(axis=0), rtol=1e-4)
+        statistics = update(statistics, jnp.asarray(batch))
+    np.testing.assert_allclose(statistics.mean, rows.reshape(-1, 2).mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(statistics.variance, rows.reshape(-1, 2).var(axis=0), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import numpy as np
 
 import verifai_jax as vj
 from verifai_jax.rl import Continuous, Discrete, Policy, Progress
-from verifai_jax.rl.algorithm import check_values, shape
+from verifai_jax.rl.algorithm import check_values, static_field
 from verifai_jax.statistics.binomial import clopper_pearson
 from verifai_jax.sweeps.safety import Judged, Judgement
 from verifai_jax.sweeps.study import Study
@@ -56,9 +56,9 @@ class Drift:
     rate: Any = 0.1
     noise: Any = 0.01
     limit: Any = 1e3
-    hidden: tuple[int, ...] = shape((4,))
-    environments: int = shape(4)
-    parts: int = shape(1)
+    hidden: tuple[int, ...] = static_field((4,))
+    environments: int = static_field(4)
+    parts: int = static_field(1)
 
     @property
     def steps_per_update(self):

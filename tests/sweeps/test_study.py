@@ -71,8 +71,8 @@ def test_a_good_study_is_checked_without_training(monkeypatch):
     def trained(*_, **__):
         raise AssertionError("trained")
 
-    for name in ("_start", "_reach", "_policy"):
-        monkeypatch.setattr(f"verifai_jax.rl.trainings.{name}", trained)
+    for name in ("_start", "_advance_updates", "_policy"):
+        monkeypatch.setattr(f"verifai_jax.rl.batched_training.{name}", trained)
     study().check()
     drifting({"steps": vj.DiscreteBox(64, 256), "width": vj.Categorical(4, 8)}).check()
 

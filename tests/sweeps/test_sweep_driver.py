@@ -10,7 +10,7 @@ from drifting import Drift, Point, drifting, quick_certificates
 import verifai_jax as vj
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import evaluate, train
-from verifai_jax.rl.policy_evaluation import nominal_returns
+from verifai_jax.rl._evaluate import mean_returns
 from verifai_jax.sweeps import _sweep as driver
 from verifai_jax.sweeps import training_runs as lessons
 from verifai_jax.sweeps._sweep import sweep
@@ -76,9 +76,9 @@ def test_rows_are_what_a_training_of_their_own_gives(whole):
         cell = {name: column[row] for name, column in whole.record.columns.items()}
         alone = train(
             Point(), Drift(rate=float(cell["rate"])), seed=int(cell["seed"]), steps=128,
-            snapshots=(32, 64),
+            checkpoints=(32, 64),
         )  # fmt: skip
-        of_it = {at.steps: at.policy for at in alone.snapshots} | {128: alone.policy}
+        of_it = {at.steps: at.policy for at in alone.checkpoints} | {128: alone.policy}
         same_policies(whole.record.policies[row], of_it[cell["steps"]])
         steps, returns = whole.record.curves[cell["configuration"], cell["seed"]]
         np.testing.assert_array_equal(steps, alone.steps)
@@ -100,10 +100,10 @@ def test_nominal_returns_are_those_of_the_task_itself():
 
 def test_returns_do_not_depend_on_company(whole):
     policies = whole.record.policies
-    together = nominal_returns(Point(), policies, episodes=4)
+    together = mean_returns(Point(), policies, episodes=4)
     for some in ([0], [29, 3], list(range(7, 29))):
         np.testing.assert_array_equal(
-            nominal_returns(Point(), [policies[i] for i in some], episodes=4), together[some]
+            mean_returns(Point(), [policies[i] for i in some], episodes=4), together[some]
         )
 
 
@@ -217,7 +217,7 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
         assert again.record.complete
         same_tables(again, through)
     # Nothing is trained again: all is remembered, with the seconds that it took.
-    monkeypatch.setattr(lessons.Trainings, "advance", None)
+    monkeypatch.setattr(lessons.BatchedTraining, "advance", None)
     same_tables(sweep(study, store=tmp_path / "through", **how), through, but=())
 
 

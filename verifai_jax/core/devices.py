@@ -10,11 +10,14 @@ for compiled programs, or `off`).
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+
+Device: TypeAlias = jax.Device  # pyright: ignore[reportInvalidTypeForm]
+"""A device of JAX; its own name of the class is a variable to type checkers."""
 
 
 def spread_over_devices(

@@ -1,12 +1,14 @@
 """Training of the policies whose closed loops are then tested."""
 
-from verifai_jax.rl._train import Snapshot as Snapshot
-from verifai_jax.rl._train import Trained as Trained
-from verifai_jax.rl._train import evaluate as evaluate
+from verifai_jax.rl._evaluate import evaluate as evaluate
+from verifai_jax.rl._train import Checkpoint as Checkpoint
+from verifai_jax.rl._train import Training as Training
 from verifai_jax.rl._train import train as train
 from verifai_jax.rl.algorithm import Algorithm as Algorithm
 from verifai_jax.rl.algorithm import Progress as Progress
 from verifai_jax.rl.algorithms import ALGORITHMS as ALGORITHMS
+from verifai_jax.rl.batched_training import BatchedTraining as BatchedTraining
+from verifai_jax.rl.batched_training import Configuration as Configuration
 from verifai_jax.rl.policy import Policy as Policy
 from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
 from verifai_jax.rl.policy import load_policy as load_policy
@@ -22,8 +24,6 @@ from verifai_jax.rl.task.ode import ode_task as ode_task
 from verifai_jax.rl.task.task import Continuous as Continuous
 from verifai_jax.rl.task.task import Discrete as Discrete
 from verifai_jax.rl.task.task import Task as Task
-from verifai_jax.rl.trainings import Configuration as Configuration
-from verifai_jax.rl.trainings import Trainings as Trainings
 
 __all__ = [
     "ALGORITHMS",
@@ -31,16 +31,16 @@ __all__ = [
     "PQN",
     "SAC",
     "Algorithm",
+    "BatchedTraining",
+    "Checkpoint",
     "Configuration",
     "Continuous",
     "Discrete",
     "Policy",
     "PolicyFileError",
     "Progress",
-    "Snapshot",
     "Task",
-    "Trained",
-    "Trainings",
+    "Training",
     "brax_task",
     "evaluate",
     "gymnax_task",

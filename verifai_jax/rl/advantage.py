@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from verifai_jax.rl.algorithm import Number
+
 
 class Ends(NamedTuple):
-    """How the step at each time ended: for good, or (also) cut off."""
+    """The ends of episodes at each time: terminated for good, or (also) cut off."""
 
-    terminated: Bool[Array, " time"]
-    truncated: Bool[Array, " time"]
+    terminated: Bool[Array, "*time"]
+    truncated: Bool[Array, "*time"]
 
 
 def advantages(
@@ -23,22 +25,29 @@ def advantages(
     value: Float[Array, " time"],
     next_value: Float[Array, " time"],
     ends: Ends,
-    discount: Float[Array, ""] | float,
-    gae_lambda: Float[Array, ""] | float,
+    discount: Number,
+    gae_lambda: Number,
 ) -> Float[Array, " time"]:
-    """Advantage of each action taken; advantage plus `value` is the critic's target.
+    """Estimate the advantage of each action taken; advantage plus `value` is the critic's target.
 
+    **Arguments:**
+
+    - `reward`: of each step.
     - `value`: of the state in which the action was taken.
     - `next_value`: of the state it led to, *before* any reset.
+    - `ends`: the steps that ended an episode.
+    - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
 
     Source: Schulman et al., High-dimensional continuous control using generalized advantage
     estimation (2016), eqs. 10 and 16.
     """
-    goes_on = 1.0 - ends.terminated
-    delta = reward + discount * goes_on * next_value - value
+    continues = 1.0 - ends.terminated
+    delta = reward + discount * continues * next_value - value
     same_episode = 1.0 - (ends.terminated | ends.truncated)
 
-    def backwards(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+    def backwards(
+        later: Float[Array, ""], step: tuple[Float[Array, ""], Float[Array, ""]]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         delta, same_episode = step
         advantage = delta + discount * gae_lambda * same_episode * later
         return advantage, advantage

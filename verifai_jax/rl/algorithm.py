@@ -1,4 +1,4 @@
-"""What a training algorithm is: hyper-parameters with pure functions `init / step / policy`.
+"""The contract of a training algorithm: hyper-parameters with functions `init / step / policy`.
 
     algorithm = PPO(learning_rate=1e-3, hidden=(32, 32))
     state = algorithm.init(task, key, updates=200)
@@ -7,23 +7,31 @@
 
 An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no
 shape are its leaves, so one compiled program serves all their values; those that do are static
-fields (`shape`), and each combination of them is compiled once.
+fields (`static_field`), and each combination of them is compiled once.
 """
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, Num, PyTree
 
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import Task
 
-Number = Float[Array, ""] | float
+T = TypeVar("T")
+Number = Num[Array, ""] | float | int
+"""A hyper-parameter that JAX may trace."""
+AlgorithmState: TypeAlias = PyTree
+"""The state of a training run: any pytree of arrays, of the same structure after every update."""
 
 
 class Progress(NamedTuple):
-    """Of one update: mean return of the episodes that ended in it (NaN: none), and their number."""
+    """The episodes that ended in one update.
+
+    - `mean_return`: mean of their returns, exploration included; NaN where none ended.
+    - `episodes`: their number.
+    """
 
     mean_return: Float[Array, ""]
     episodes: Int[Array, ""]
@@ -45,24 +53,39 @@ class Algorithm(Protocol):
         ...
 
     def check(self) -> None:
-        """Refuse hyper-parameters that cannot train, by a `ValueError` that names one."""
+        """Refuse hyper-parameters that cannot train.
+
+        **Raises:** `ValueError`, naming the hyper-parameter and its value.
+        """
         ...
 
-    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> Any:
-        """The state before the first of `updates` updates."""
+    def init(
+        self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]
+    ) -> AlgorithmState:
+        """Make the state before the first update.
+
+        **Arguments:**
+
+        - `task`: the task to learn.
+        - `key`: a random key, from which all randomness of the training run comes.
+        - `updates`: the number of updates, at whose end schedules end.
+        """
         ...
 
-    def step(self, task: Task, state: Any) -> tuple[Any, Progress]:
-        """One update: some steps of the environments, and what is learnt from them."""
+    def step(self, task: Task, state: AlgorithmState) -> tuple[AlgorithmState, Progress]:
+        """Take some steps of the environments and learn from them: one update.
+
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
         ...
 
-    def policy(self, task: Task, state: Any) -> Policy:
-        """The policy as learnt so far, without exploration."""
+    def policy(self, task: Task, state: AlgorithmState) -> Policy:
+        """Return the policy learnt so far, without exploration."""
         ...
 
 
-def shape(default: Any) -> Any:
-    """A field that decides shapes or structure: static under `jit`."""
+def static_field(default: T) -> T:
+    """Make a dataclass field that decides shapes or structure: static under `jit`."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
@@ -70,6 +93,13 @@ def check_values(
     algorithm: object, names: Iterable[str], holds: Callable[[Any], bool], wanted: str
 ) -> None:
     """Refuse the first of the named hyper-parameters for which `holds` is false.
+
+    **Arguments:**
+
+    - `algorithm`: the object with the hyper-parameters.
+    - `names`: fields to check.
+    - `holds(value) -> bool`: the condition on each value.
+    - `wanted`: the condition in words, which follow "must be".
 
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """

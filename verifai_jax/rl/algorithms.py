@@ -1,10 +1,8 @@
-"""The training algorithms by name, and which of them fit a task.
+"""The training algorithms by name, and those that fit a task.
 
 algorithm_named("sac")                    # the class SAC
-fitting(Discrete(2))                      # ("ppo", "pqn")
+algorithms_for(Discrete(2))               # ("ppo", "pqn")
 """
-
-from typing import Any
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.rl.algorithm import Algorithm
@@ -13,11 +11,12 @@ from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
 from verifai_jax.rl.task.task import Action
 
-ALGORITHMS: dict[str, type[Any]] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
+ALGORITHMS: dict[str, type[PPO] | type[PQN] | type[SAC]] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
+"""The classes of the training algorithms, by name."""
 
 
 def algorithm_named(name: str) -> type[Algorithm]:
-    """The class of an algorithm.
+    """Return the class of an algorithm.
 
     **Raises:** `UnknownNameError`, with the nearest names.
     """
@@ -26,6 +25,6 @@ def algorithm_named(name: str) -> type[Algorithm]:
     return ALGORITHMS[name]
 
 
-def fitting(action: Action) -> tuple[str, ...]:
-    """Names of the algorithms that learn this kind of action."""
+def algorithms_for(action: Action) -> tuple[str, ...]:
+    """Return the names of the algorithms that learn this kind of action."""
     return tuple(name for name, cls in ALGORITHMS.items() if isinstance(action, cls.actions))

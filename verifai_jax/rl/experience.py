@@ -1,61 +1,81 @@
-"""Environments side by side, each begun anew as its episode ends.
+"""Environments side by side, each with a new episode as soon as its last one ends.
 
-    episodes = begin(task, key, environments=8)
+    episodes = start_episodes(task, key, environments=8)
     episodes, transition = advance(task, episodes, actions, key)
-    progress([transitions])                    # what to report of an update
+    progress(transitions)                      # the episodes that ended in an update
 
 A transition keeps the observation that its step led to *before* the reset: an episode that only
 the time limit cut off goes on to have a value, and that is where it has it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from verifai_jax.rl.advantage import Ends
 from verifai_jax.rl.algorithm import Progress
-from verifai_jax.rl.task.task import Task
+from verifai_jax.rl.task.task import State, Task
 
 
 class Episodes(NamedTuple):
-    """Where each environment stands: its state, and steps and rewards of the episode so far."""
+    """The present episode of each environment.
 
-    state: Any
+    - `state`: states of the task with a leading axis `[environments]`.
+    - `age`: steps of the episode so far.
+    - `total`: rewards of the episode so far.
+    """
+
+    state: State
     age: Int[Array, " environments"]
     total: Float[Array, " environments"]
 
 
 class Transition(NamedTuple):
-    """One step of each environment. `total` is the episode's return with this step in it."""
+    """One step of each environment, or several.
 
-    reward: Float[Array, "*time environments"]
-    next_observation: Float[Array, "*time environments k"]
+    - `reward`: of the step.
+    - `next_observation`: of the state that it led to, before any reset.
+    - `ends`: the episodes that it ended.
+    - `total`: the episode's return with this step in it.
+    """
+
+    reward: Float[Array, "*steps"]
+    next_observation: Float[Array, "*steps k"]
     ends: Ends
-    total: Float[Array, "*time environments"]
+    total: Float[Array, "*steps"]
 
     @property
-    def over(self) -> Bool[Array, "*time environments"]:
-        """Where an episode ended, for good or cut off."""
+    def over(self) -> Bool[Array, "*steps"]:
+        """The ends of episodes, for good or cut off."""
         return self.ends.terminated | self.ends.truncated
 
 
-def begin(task: Task, key: Key[Array, ""], environments: int) -> Episodes:
-    """Fresh episodes."""
+def start_episodes(task: Task, key: Key[Array, ""], environments: int) -> Episodes:
+    """Start an episode in each of so many environments."""
     state = jax.vmap(task.reset)(jax.random.split(key, environments))
     return Episodes(state, jnp.zeros(environments, jnp.int32), jnp.zeros(environments))
 
 
 def observation_size(task: Task, episodes: Episodes) -> int:
-    """Numbers in an observation."""
+    """Return the number of entries of an observation."""
     return jax.eval_shape(jax.vmap(task.observe), episodes.state).shape[-1]
 
 
 def advance(
-    task: Task, episodes: Episodes, action: Array, key: Key[Array, ""]
+    task: Task, episodes: Episodes, action: Shaped[Array, "environments ..."], key: Key[Array, ""]
 ) -> tuple[Episodes, Transition]:
-    """One step of each environment with its `action`, as `task.step` takes it."""
+    """Take one step of each environment.
+
+    **Arguments:**
+
+    - `episodes`: the episodes before it.
+    - `action`: of each environment, as `task.step` takes it.
+    - `key`: a random key, of this step of all environments.
+
+    **Returns:** the episodes after it, new ones where it ended one; the transition.
+    """
     step_key, reset_key = jax.random.split(key)
     environments = len(episodes.age)
     step_keys = jax.random.split(step_key, environments)
@@ -67,20 +87,20 @@ def advance(
     transition = Transition(reward, jax.vmap(task.observe)(state), ends, total)
 
     def reset() -> Episodes:
-        fresh = begin(task, reset_key, environments)
+        fresh = start_episodes(task, reset_key, environments)
 
-        def chosen(new: Array, old: Array) -> Array:
+        def select(new: Shaped[Array, "..."], old: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
             over = transition.over.reshape(-1, *[1] * (old.ndim - 1))
             return jnp.where(over, new.astype(old.dtype), old)
 
-        return jax.tree.map(chosen, fresh, after)
+        return jax.tree.map(select, fresh, after)
 
     # Most steps end no episode, and a reset draws random numbers for every environment.
     return jax.lax.cond(jnp.any(transition.over), reset, lambda: after), transition
 
 
 def progress(transition: Transition) -> Progress:
-    """Number and mean return of the episodes that ended in some steps."""
+    """Summarise the episodes that ended in some steps: their mean return and number."""
     count = jnp.sum(transition.over)
     total = jnp.sum(jnp.where(transition.over, transition.total, 0.0))
     return Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)

@@ -20,14 +20,17 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
-Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
+Layers = tuple[Layer, ...]
+"""Weights `[inputs, outputs]` and biases `[outputs]` of each layer, first layer first."""
 
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
+ACTIVATIONS: dict[str, Callable[[ArrayLike], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
+"""Functions between the layers, by name. All are 0 at 0."""
 
 _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
     "discrete": Discrete,
@@ -36,29 +39,34 @@ _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
 
 
 class PolicyFileError(ValueError):
-    """A file that holds no policy of ours."""
+    """A file that holds no policy written by `save_policy`."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A network, what it sees, and what its outputs mean.
+    """A network with the scale of its observations and the meaning of its outputs.
 
     - `layers`: weights `[inputs, outputs]` and biases `[outputs]`, first layer first.
-    - `mean`, `scale`: `[k]`; the network sees `(observation - mean) / scale`. None: as it is.
-    - `log_std`: `[size]`, of the Gaussian that explores; None for discrete actions, and where the
-      deviation depends on the observation.
-    - `activation`: between the layers, of `ACTIVATIONS`. All are 0 at 0, so that units whose
-      weights are 0 change nothing.
+    - `mean`, `scale`: `[k]`; the network is given `(observation - mean) / scale`. None: the
+      observation itself.
+    - `log_std`: `[size]`, logarithm of the deviation of the Gaussian that explores; None for
+      discrete actions, and where the deviation depends on the observation.
+    - `action`: the kind of action.
+    - `activation`: name of the function between the layers, of `ACTIVATIONS`. All are 0 at 0, so
+      that units whose weights are 0 change nothing.
     - `squash`: the outputs of a continuous policy go through tanh; otherwise they are clipped.
 
     **Raises:** `UnknownNameError` for another activation; `ValueError` for squashed logits.
     """
 
+    # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
+    __no_type_check__ = True
+
     layers: Layers
-    mean: Float[Array, " k"] | None
-    scale: Float[Array, " k"] | None
-    log_std: Float[Array, " size"] | None
+    mean: Float[Array | np.ndarray, " k"] | None
+    scale: Float[Array | np.ndarray, " k"] | None
+    log_std: Float[Array | np.ndarray, " size"] | None
     action: Action = dataclasses.field(metadata={"static": True})
     activation: str = dataclasses.field(default="tanh", metadata={"static": True})
     squash: bool = dataclasses.field(default=False, metadata={"static": True})
@@ -68,33 +76,38 @@ class Policy:
         if self.squash and isinstance(self.action, Discrete):
             raise ValueError(f"only continuous actions can be squashed; got {self.action}")
 
-    def __call__(self, observation: Float[Array, " k"]) -> Float[Array, " outputs"]:
-        """Logits or values of the `n` actions, or the mean action in units of half its range."""
+    def __call__(self, observation: Float[Array | np.ndarray, " k"]) -> Float[Array, " outputs"]:
+        """Return logits or values `[n]` of the actions, or the mean action `[size]`.
+
+        A continuous action is in units of half its range around the middle of it.
+        """
         if self.mean is not None and self.scale is not None:
             observation = (observation - self.mean) / self.scale
         outputs = network(self.layers, observation, self.activation)
         return jnp.tanh(outputs) if self.squash else outputs
 
-    def act(self, observation: Float[Array, " k"]) -> Int[Array, ""] | Float[Array, " size"]:
-        """The likeliest action: an index, or a vector within its range."""
-        return likeliest(self.action, self(observation))
+    def act(
+        self, observation: Float[Array | np.ndarray, " k"]
+    ) -> Int[Array, ""] | Float[Array, " size"]:
+        """Return the most likely action: an index, or a vector `[size]` within its range."""
+        return most_likely_action(self.action, self(observation))
 
 
 def network(
-    layers: Layers, x: Float[Array, "*batch inputs"], activation: str = "tanh"
+    layers: Layers, x: Float[Array | np.ndarray, "*batch inputs"], activation: str = "tanh"
 ) -> Float[Array, "*batch outputs"]:
-    """A multilayer perceptron with the activation between its layers."""
+    """Evaluate a multilayer perceptron with the activation between its layers."""
     between = ACTIVATIONS[activation]
     for weight, bias in layers[:-1]:
         x = between(x @ weight + bias)
     weight, bias = layers[-1]
-    return x @ weight + bias
+    return jnp.asarray(x @ weight + bias)
 
 
-def written_out(
+def scalar_network(
     layers: Layers, inputs: Sequence[Float[Array, ""]], activation: str = "tanh"
 ) -> list[Float[Array, ""]]:
-    """The same network number by number, for a few hundred weights that are known constants.
+    """Evaluate the same network number by number, for a few hundred weights that are constants.
 
     Under `vmap` each number is a row of lanes and all of them fuse into straight-line vector code:
     in a rollout of hundreds of lanes 1.5 times as fast as small matrix products, at more compile
@@ -114,7 +127,7 @@ def written_out(
 
 
 def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers:
-    """Orthogonal weights and zero biases; `gain` scales the last layer, sqrt(2) the others.
+    """Draw orthogonal weights and zero biases; `gain` scales the last layer, sqrt(2) the others.
 
     Source: Saxe, McClelland and Ganguli (2014), section 3.
     """
@@ -132,21 +145,32 @@ def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers
     return tuple(layers)
 
 
-def likeliest(action: Action, outputs: Float[Array, " outputs"]) -> Array:
-    """The mode of the distribution over actions that a network's outputs describe."""
+def most_likely_action(
+    action: Action, outputs: Float[Array, " outputs"]
+) -> Int[Array, ""] | Float[Array, " size"]:
+    """Return the mode of the distribution over actions that a network's outputs describe."""
     if isinstance(action, Discrete):
         return jnp.argmax(outputs).astype(jnp.int32)
-    return in_range(action, outputs)
+    return scale_to_range(action, outputs)
 
 
-def in_range(action: Continuous, unit: Float[Array, " size"]) -> Float[Array, " size"]:
-    """From units of half the range around its middle to the action itself, clipped."""
+def scale_to_range(
+    action: Continuous, unit: Float[Array, "*batch size"]
+) -> Float[Array, "*batch size"]:
+    """Turn units of half the range around its middle into the action itself, clipped."""
     middle, half = (action.high + action.low) / 2, (action.high - action.low) / 2
     return jnp.clip(middle + half * unit, action.low, action.high)
 
 
-def save_policy(policy: Policy, path: str | Path, **notes: Any) -> None:
-    """Write a policy as a compressed `.npz` of float32 arrays, with `notes` (JSON) beside them."""
+def save_policy(policy: Policy, path: str | Path, **notes: object) -> None:
+    """Write a policy as a compressed `.npz` of float32 arrays.
+
+    **Arguments:**
+
+    - `policy`: the policy to write.
+    - `path`: the file.
+    - `notes`: plain data that JSON can hold, kept beside the arrays; `policy_notes` reads them.
+    """
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
     about = {
         "action": {"kind": kind, **dataclasses.asdict(policy.action)},
@@ -165,6 +189,8 @@ def save_policy(policy: Policy, path: str | Path, **notes: Any) -> None:
 
 def load_policy(path: str | Path) -> Policy:
     """Read a policy that `save_policy` wrote. The file can hold numbers and text only.
+
+    **Returns:** the policy, with JAX arrays of float32.
 
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
@@ -193,7 +219,10 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def policy_notes(path: str | Path) -> dict[str, Any]:
-    """The notes that were saved with a policy: how it was trained, how well it did."""
+    """Read the notes that were saved with a policy: how it was trained, how well it did.
+
+    **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
+    """
     return _read(path)[1].get("notes", {})
 
 

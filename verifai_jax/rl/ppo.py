@@ -1,38 +1,44 @@
 """Proximal policy optimisation: experience of many environments, a few clipped passes over it.
 
     ppo = PPO(learning_rate=1e-3, hidden=(32, 32))
-    training = ppo.init(task, key, updates=200)
-    training, progress = ppo.step(task, training)
+    state = ppo.init(task, key, updates=200)
+    state, progress = ppo.step(task, state)
 
 Source: Schulman et al., Proximal policy optimization algorithms (2017).
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from verifai_jax.rl.advantage import Ends, advantages
-from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
+from verifai_jax.rl.algorithm import Number, Progress, check_values, static_field
 from verifai_jax.rl.experience import (
     Episodes,
     Transition,
-    begin,
     observation_size,
     progress,
+    start_episodes,
 )
-from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
-from verifai_jax.rl.policy import Layers, Policy, in_range, network, new_layers
-from verifai_jax.rl.shuffling import permutation
-from verifai_jax.rl.task.task import Action, Continuous, Discrete, Task
+from verifai_jax.rl.observations import (
+    ObservationStatistics,
+    mean_and_scale,
+    normalise,
+    update,
+)
+from verifai_jax.rl.on_policy import minibatch_epochs
+from verifai_jax.rl.optimizer import adam, annealed
+from verifai_jax.rl.policy import Layers, Policy, network, new_layers, scale_to_range
+from verifai_jax.rl.task.task import Action, Continuous, Discrete, State, Task
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PPO:
-    """Hyper-parameters.
+    """Proximal policy optimisation, for discrete and continuous actions, by its hyper-parameters.
 
     - `learning_rate`: of Adam; falls linearly to 0 over the training if `anneal`.
     - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
@@ -45,6 +51,8 @@ class PPO:
     - `normalise`: observations by their running mean and deviation.
     """
 
+    # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
+    __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete, Continuous)
 
     learning_rate: Number = 2.5e-4
@@ -54,14 +62,14 @@ class PPO:
     entropy: Number = 0.01
     value_weight: Number = 0.5
     max_gradient: Number = 0.5
-    environments: int = shape(8)
-    horizon: int = shape(128)
-    epochs: int = shape(4)
-    minibatches: int = shape(4)
-    hidden: tuple[int, ...] = shape((64, 64))
-    value_hidden: tuple[int, ...] = shape((64, 64))
-    normalise: bool = shape(False)
-    anneal: bool = shape(True)
+    environments: int = static_field(8)
+    horizon: int = static_field(128)
+    epochs: int = static_field(4)
+    minibatches: int = static_field(4)
+    hidden: tuple[int, ...] = static_field((64, 64))
+    value_hidden: tuple[int, ...] = static_field((64, 64))
+    normalise: bool = static_field(False)
+    anneal: bool = static_field(True)
 
     @property
     def steps_per_update(self) -> int:
@@ -87,10 +95,10 @@ class PPO:
         widths = ("hidden", "value_hidden")
         check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
 
-    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "Training":
-        """The state before the first of `updates` updates."""
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PPOState":
+        """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
-        episodes = begin(task, reset_key, self.environments)
+        episodes = start_episodes(task, reset_key, self.environments)
         size = observation_size(task, episodes)
         discrete = isinstance(task.action, Discrete)
         outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
@@ -100,47 +108,66 @@ class PPO:
             critic=new_layers(critic_key, (size, *self.value_hidden, 1), gain=1.0),
             log_std=None if discrete else jnp.zeros(outputs),
         )
-        return Training(
+        return PPOState(
             weights=weights,
-            moments=_optimizer(self).init(weights),
-            seen=Seen.nothing(size),
+            moments=adam(self.max_gradient).init(weights),
+            statistics=ObservationStatistics.initial(size),
             episodes=episodes,
             key=key,
             done=jnp.int32(0),
             updates=jnp.int32(updates),
         )
 
-    def step(self, task: Task, state: "Training") -> tuple["Training", Progress]:
-        """Collect `horizon` steps of each environment and learn from them."""
+    def step(self, task: Task, state: "PPOState") -> tuple["PPOState", Progress]:
+        """Collect `horizon` steps of each environment and learn from them.
+
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         episodes, experience = _collect(self, task, state, collect_key)
-        seen = watch(state.seen, experience.observation) if self.normalise else state.seen
+        statistics = (
+            update(state.statistics, experience.observation) if self.normalise else state.statistics
+        )
         weights, moments = _learn(self, task, state, experience, learn_key)
-        after = Training(weights, moments, seen, episodes, key, state.done + 1, state.updates)
+        after = PPOState(weights, moments, statistics, episodes, key, state.done + 1, state.updates)
         return after, progress(experience.transition)
 
-    def policy(self, task: Task, state: "Training") -> Policy:
-        """The policy as learnt so far, without exploration."""
-        mean, scale = normaliser(state.seen) if self.normalise else (None, None)
+    def policy(self, task: Task, state: "PPOState") -> Policy:
+        """Return the policy learnt so far, without exploration."""
+        mean, scale = mean_and_scale(state.statistics) if self.normalise else (None, None)
         return Policy(state.weights.policy, mean, scale, state.weights.log_std, task.action)
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What is learnt: the policy's layers, the critic's, and the width of exploration."""
+    """The numbers that are learnt.
+
+    - `policy`, `critic`: layers of the two networks.
+    - `log_std`: `[size]`, logarithm of the deviation that explores; None for discrete actions.
+    """
+
+    # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
+    __no_type_check__ = True
 
     policy: Layers
     critic: Layers
     log_std: Float[Array, " size"] | None
 
 
-class Training(NamedTuple):
-    """Everything that goes from one update to the next."""
+class PPOState(NamedTuple):
+    """The state between two updates.
+
+    - `weights`, `moments`: what is learnt, and the optimizer's state.
+    - `statistics`: of the observations so far.
+    - `episodes`: the present episode of each environment.
+    - `key`: the random key of the next update.
+    - `done`, `updates`: updates so far, and in all.
+    """
 
     weights: Weights
-    moments: Any
-    seen: Seen
+    moments: PyTree
+    statistics: ObservationStatistics
     episodes: Episodes
     key: Key[Array, ""]
     done: Int[Array, ""]
@@ -148,34 +175,60 @@ class Training(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """One step of one environment."""
+    """Steps of the environments, `[environments, horizon]`.
 
-    observation: Float[Array, " k"]
-    action: Array
-    outputs: Float[Array, " outputs"]
+    - `observation`: the policy's input.
+    - `action`: an index, or a vector in units of half its range.
+    - `outputs`: of the policy's network.
+    - `transition`: what the action led to.
+    """
+
+    observation: Float[Array, "*steps k"]
+    action: Shaped[Array, "..."]
+    outputs: Float[Array, "*steps outputs"]
     transition: Transition
 
 
-def _collect(
-    ppo: PPO, task: Task, training: Training, key: Key[Array, ""]
-) -> tuple[Episodes, Experience]:
-    """Experience `[environments, horizon]` under the present policy, resetting as episodes end."""
-    log_std = training.weights.log_std
+class Minibatch(NamedTuple):
+    """Steps to learn from, with a leading axis `[rows]`.
 
-    def step(carry: Any, drawn: Any) -> Any:
-        state, age, total = carry
+    - `observation`: normalised, if the algorithm does so.
+    - `action`: as in `Experience`.
+    - `log_probability`: of the action under the policy that took it.
+    - `advantage`: of the action.
+    - `target`: of the critic.
+    """
+
+    observation: Float[Array, "*rows k"]
+    action: Shaped[Array, "..."]
+    log_probability: Float[Array, "*rows"]
+    advantage: Float[Array, "*rows"]
+    target: Float[Array, "*rows"]
+
+
+def _collect(
+    ppo: PPO, task: Task, state: PPOState, key: Key[Array, ""]
+) -> tuple[Episodes, Experience]:
+    """Collect experience `[environments, horizon]`, with a new episode where one ends."""
+    log_std = state.weights.log_std
+
+    def step(
+        episode: tuple[State, Int[Array, ""], Float[Array, ""]],
+        drawn: tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]],
+    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
+        before, age, total = episode
         noise, step_key, reset_key = drawn
-        observation = task.observe(state)
+        observation = task.observe(before)
         outputs = network(
-            training.weights.policy, normalised(training.seen, observation, ppo.normalise)
+            state.weights.policy, normalise(state.statistics, observation, ppo.normalise)
         )
         action = _explore(task.action, outputs, log_std, noise)
-        taken = action if isinstance(task.action, Discrete) else in_range(task.action, action)
-        after, reward, terminated = task.step(step_key, state, taken)
+        taken = action if isinstance(task.action, Discrete) else scale_to_range(task.action, action)
+        after, reward, terminated = task.step(step_key, before, taken)
         age, total = age + 1, total + reward
         ends = Ends(terminated, age >= task.time_limit)
         over = ends.terminated | ends.truncated
-        seen = Experience(
+        experience = Experience(
             observation=observation,
             action=action,
             outputs=outputs,
@@ -186,30 +239,36 @@ def _collect(
         fresh = (task.reset(reset_key), jnp.int32(0), jnp.zeros(()))
         return jax.tree.map(
             lambda new, old: jnp.where(over, new, old), fresh, (after, age, total)
-        ), seen
+        ), experience
 
-    def draw(key: Key[Array, ""]) -> Any:
+    def draw(
+        key: Key[Array, ""],
+    ) -> tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]]:
         action_key, step_key, reset_key = jax.random.split(key, 3)
         return _noise(task.action, action_key), step_key, reset_key
 
-    def one(episode: Any, key: Key[Array, ""]) -> Any:
+    def one_environment(
+        episode: tuple[State, Int[Array, ""], Float[Array, ""]], key: Key[Array, ""]
+    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
         # All at once: random bits of a few lanes at a time would cost as much as the network.
         drawn = jax.vmap(draw)(jax.random.split(key, ppo.horizon))
         return jax.lax.scan(step, episode, drawn)
 
     keys = jax.random.split(key, ppo.environments)
-    episodes, experience = jax.vmap(one)(tuple(training.episodes), keys)
+    episodes = (state.episodes.state, state.episodes.age, state.episodes.total)
+    episodes, experience = jax.vmap(one_environment)(episodes, keys)
     return Episodes(*episodes), experience
 
 
 def _learn(
-    ppo: PPO, task: Task, training: Training, experience: Experience, key: Key[Array, ""]
-) -> tuple[Weights, Any]:
-    """A few epochs of clipped policy and value steps on one stretch of experience."""
-    look = jax.vmap(jax.vmap(lambda o: normalised(training.seen, o, ppo.normalise)))
+    ppo: PPO, task: Task, state: PPOState, experience: Experience, key: Key[Array, ""]
+) -> tuple[Weights, PyTree]:
+    """Take a few epochs of clipped policy and value steps on one stretch of experience."""
+    normalised = jax.vmap(jax.vmap(lambda o: normalise(state.statistics, o, ppo.normalise)))
     transition = experience.transition
-    observation, next_observation = look(experience.observation), look(transition.next_observation)
-    critic = jax.vmap(jax.vmap(lambda o: network(training.weights.critic, o)[0]))
+    observation = normalised(experience.observation)
+    next_observation = normalised(transition.next_observation)
+    critic = jax.vmap(jax.vmap(lambda o: network(state.weights.critic, o)[0]))
     value = critic(observation)
     estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
     advantage = estimate(
@@ -220,90 +279,85 @@ def _learn(
         ppo.discount,
         ppo.gae_lambda,
     )
-    log_std = training.weights.log_std
+    log_std = state.weights.log_std
     log_probability = jax.vmap(jax.vmap(lambda o, a: _log_probability(task.action, o, log_std, a)))(
         experience.outputs, experience.action
     )
-    batch = (
-        observation,
-        experience.action,
-        log_probability,
-        advantage,
-        advantage + value,
+    batch = Minibatch(
+        observation=observation,
+        action=experience.action,
+        log_probability=log_probability,
+        advantage=advantage,
+        target=advantage + value,
     )
-    batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
-    optimizer = _optimizer(ppo)
-    left = 1.0 - training.done * (1.0 / training.updates) if ppo.anneal else 1.0
-    rate = ppo.learning_rate * left
-
-    def minibatch(carry: Any, part: Any) -> Any:
-        weights, moments = carry
-        gradient = jax.grad(_loss)(weights, ppo, task.action, part)
-        direction, moments = optimizer.update(gradient, moments)
-        weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
-        return (weights, moments), None
-
-    def epoch(carry: Any, key: Key[Array, ""]) -> Any:
-        order = permutation(key, ppo.steps_per_update)
-        parts = jax.tree.map(
-            lambda leaf: leaf[order].reshape(ppo.minibatches, -1, *leaf.shape[1:]), batch
-        )
-        return jax.lax.scan(minibatch, carry, parts)
-
-    start = (training.weights, training.moments)
-    return jax.lax.scan(epoch, start, jax.random.split(key, ppo.epochs))[0]
+    return minibatch_epochs(
+        lambda weights, part: _loss(weights, ppo, task.action, part),
+        (state.weights, state.moments),
+        batch,
+        key,
+        adam(ppo.max_gradient),
+        annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal),
+        ppo.epochs,
+        ppo.minibatches,
+    )
 
 
-def _loss(weights: Weights, ppo: PPO, action: Action, part: Any) -> Float[Array, ""]:
-    observation, taken, old_log_probability, advantage, target = part
-    outputs = jax.vmap(lambda o: network(weights.policy, o))(observation)
-    value = jax.vmap(lambda o: network(weights.critic, o)[0])(observation)
+def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[Array, ""]:
+    outputs = jax.vmap(lambda o: network(weights.policy, o))(part.observation)
+    value = jax.vmap(lambda o: network(weights.critic, o)[0])(part.observation)
     log_probability = jax.vmap(lambda o, a: _log_probability(action, o, weights.log_std, a))(
-        outputs, taken
+        outputs, part.action
     )
+    advantage = part.advantage
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-    ratio = jnp.exp(log_probability - old_log_probability)
+    ratio = jnp.exp(log_probability - part.log_probability)
     clipped = jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip)
     surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))  # eq. 7
-    value_error = jnp.mean(jnp.square(value - target)) / 2
+    value_error = jnp.mean(jnp.square(value - part.target)) / 2
     entropy = jnp.mean(jax.vmap(lambda o: _entropy(action, o, weights.log_std))(outputs))
     return -surrogate + ppo.value_weight * value_error - ppo.entropy * entropy  # eq. 9
 
 
-def _optimizer(ppo: PPO) -> Any:
-    import optax
-
-    return optax.chain(
-        optax.clip_by_global_norm(ppo.max_gradient),  # pyright: ignore[reportArgumentType]
-        optax.scale_by_adam(eps=1e-5),
-    )
-
-
-def _noise(action: Action, key: Key[Array, ""]) -> Array:
-    """What an action is drawn with: the same whatever the network says."""
+def _noise(action: Action, key: Key[Array, ""]) -> Float[Array, " outputs"]:
+    """Draw what an action is made random by: the same whatever the network says."""
     if isinstance(action, Discrete):
         return jax.random.gumbel(key, (action.n,))
     return jax.random.normal(key, (action.size,))
 
 
-def _explore(action: Action, outputs: Array, log_std: Any, noise: Array) -> Array:
-    """A draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
+def _explore(
+    action: Action,
+    outputs: Float[Array, " outputs"],
+    log_std: Float[Array, " outputs"] | None,
+    noise: Float[Array, " outputs"],
+) -> Shaped[Array, "..."]:
+    """Draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
     if isinstance(action, Discrete):
         return jnp.argmax(noise + outputs).astype(jnp.int32)
+    assert log_std is not None
     return outputs + jnp.exp(log_std) * noise
 
 
-def _log_probability(action: Action, outputs: Array, log_std: Any, taken: Array) -> Array:
+def _log_probability(
+    action: Action,
+    outputs: Float[Array, " outputs"],
+    log_std: Float[Array, " outputs"] | None,
+    taken: Shaped[Array, "..."],
+) -> Float[Array, ""]:
     if isinstance(action, Discrete):
         # A choice instead of an index, whose derivative would scatter row by row.
         chosen = jnp.arange(action.n) == taken
         return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0))
+    assert log_std is not None
     standard = (taken - outputs) / jnp.exp(log_std)
     return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2)
 
 
-def _entropy(action: Action, outputs: Array, log_std: Any) -> Array:
+def _entropy(
+    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None
+) -> Float[Array, ""]:
     if isinstance(action, Continuous):
+        assert log_std is not None
         return jnp.sum(log_std + (jnp.log(2 * jnp.pi) + 1) / 2)
     log_probability = jax.nn.log_softmax(outputs)
     return -jnp.sum(jnp.exp(log_probability) * log_probability)

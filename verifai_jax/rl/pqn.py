@@ -1,8 +1,8 @@
 """Parallelised Q network: Q(lambda) over many environments, with no replay and no target network.
 
     pqn = PQN(learning_rate=1e-3, hidden=(32, 32))
-    training = pqn.init(task, key, updates=200)
-    training, progress = pqn.step(task, training)
+    state = pqn.init(task, key, updates=200)
+    state, progress = pqn.step(task, state)
 
 The policy's outputs are the values of the actions (times `reward_scale`).
 
@@ -13,37 +13,43 @@ extended epsilon-greedy exploration (2021), with geometric durations.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.rl.advantage import Ends
-from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
+from verifai_jax.rl.algorithm import Number, Progress, check_values, static_field
 from verifai_jax.rl.experience import (
     Episodes,
     Transition,
     advance,
-    begin,
     observation_size,
     progress,
+    start_episodes,
 )
-from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
+from verifai_jax.rl.observations import (
+    ObservationStatistics,
+    mean_and_scale,
+    normalise,
+    update,
+)
+from verifai_jax.rl.on_policy import minibatch_epochs
+from verifai_jax.rl.optimizer import adam, annealed
 from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers
-from verifai_jax.rl.shuffling import permutation
 from verifai_jax.rl.task.task import Discrete, Task
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PQN:
-    """Hyper-parameters.
+    """Parallelised Q network, for discrete actions, by its hyper-parameters.
 
     - `learning_rate`: of Adam; falls linearly to 0 over the training if `anneal`.
     - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
     - `epsilon_start`, `epsilon_end`: part of the steps that explore; goes linearly from one to the
-      other over the part `exploration` of the training.
+      other over the part `exploration` of the state.
     - `hold`: mean steps for which a random action is kept, at least 1. Long ones find what single
       random steps never do (the hill of mountain car).
     - `reward_scale`: rewards are multiplied by it; values around 1 are learnt best.
@@ -54,6 +60,8 @@ class PQN:
     - `normalise`: observations by their running mean and deviation.
     """
 
+    # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
+    __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Discrete,)
 
     learning_rate: Number = 2e-3
@@ -65,14 +73,14 @@ class PQN:
     hold: Number = 1.0
     reward_scale: Number = 0.1
     max_gradient: Number = 10.0
-    environments: int = shape(16)
-    horizon: int = shape(32)
-    epochs: int = shape(2)
-    minibatches: int = shape(8)
-    hidden: tuple[int, ...] = shape((64, 64))
-    activation: str = shape("tanh")
-    normalise: bool = shape(True)
-    anneal: bool = shape(True)
+    environments: int = static_field(16)
+    horizon: int = static_field(32)
+    epochs: int = static_field(2)
+    minibatches: int = static_field(8)
+    hidden: tuple[int, ...] = static_field((64, 64))
+    activation: str = static_field("tanh")
+    normalise: bool = static_field(True)
+    anneal: bool = static_field(True)
 
     @property
     def steps_per_update(self) -> int:
@@ -99,16 +107,16 @@ class PQN:
         known = " or ".join(ACTIVATIONS)
         check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
 
-    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "Training":
-        """The state before the first of `updates` updates."""
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PQNState":
+        """Make the state before the first of `updates` updates."""
         weights_key, reset_key, key = jax.random.split(key, 3)
-        episodes = begin(task, reset_key, self.environments)
+        episodes = start_episodes(task, reset_key, self.environments)
         size = observation_size(task, episodes)
         layers = new_layers(weights_key, (size, *self.hidden, _count(task)), gain=0.01)
-        return Training(
+        return PQNState(
             layers=layers,
-            moments=_optimizer(self).init(layers),
-            seen=Seen.nothing(size),
+            moments=adam(self.max_gradient).init(layers),
+            statistics=ObservationStatistics.initial(size),
             episodes=episodes,
             held=jnp.full(self.environments, -1, jnp.int32),
             key=key,
@@ -116,30 +124,42 @@ class PQN:
             updates=jnp.int32(updates),
         )
 
-    def step(self, task: Task, state: "Training") -> tuple["Training", Progress]:
-        """Collect `horizon` steps of each environment and learn from them."""
+    def step(self, task: Task, state: "PQNState") -> tuple["PQNState", Progress]:
+        """Collect `horizon` steps of each environment and learn from them.
+
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
         collect_key, learn_key, key = jax.random.split(state.key, 3)
         episodes, held, experience = _collect(self, task, state, collect_key)
         layers, moments = _learn(self, state, experience, learn_key)
-        seen = watch(state.seen, experience.observation) if self.normalise else state.seen
-        after = Training(layers, moments, seen, episodes, held, key, state.done + 1, state.updates)
+        statistics = (
+            update(state.statistics, experience.observation) if self.normalise else state.statistics
+        )
+        after = PQNState(
+            layers, moments, statistics, episodes, held, key, state.done + 1, state.updates
+        )
         return after, progress(experience.transition)
 
-    def policy(self, task: Task, state: "Training") -> Policy:
-        """The policy as learnt so far, without exploration."""
-        mean, scale = normaliser(state.seen) if self.normalise else (None, None)
+    def policy(self, task: Task, state: "PQNState") -> Policy:
+        """Return the policy learnt so far, without exploration."""
+        mean, scale = mean_and_scale(state.statistics) if self.normalise else (None, None)
         return Policy(state.layers, mean, scale, None, task.action, self.activation)
 
 
-class Training(NamedTuple):
-    """Everything that goes from one update to the next.
+class PQNState(NamedTuple):
+    """The state between two updates.
 
+    - `layers`, `moments`: the network that is learnt, and the optimizer's state.
+    - `statistics`: of the observations so far.
+    - `episodes`: the present episode of each environment.
     - `held`: the random action that an environment holds on to; -1 where it is greedy.
+    - `key`: the random key of the next update.
+    - `done`, `updates`: updates so far, and in all.
     """
 
     layers: Layers
-    moments: Any
-    seen: Seen
+    moments: PyTree
+    statistics: ObservationStatistics
     episodes: Episodes
     held: Int[Array, " environments"]
     key: Key[Array, ""]
@@ -148,30 +168,55 @@ class Training(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """What is learnt from, `[horizon, environments]`."""
+    """Steps of the environments, `[horizon, environments]`.
+
+    - `observation`: the policy's input.
+    - `action`: indices.
+    - `transition`: what the actions led to.
+    """
 
     observation: Float[Array, "horizon environments k"]
     action: Int[Array, "horizon environments"]
     transition: Transition
 
 
+class Minibatch(NamedTuple):
+    """Steps to learn from.
+
+    - `observation`: normalised, if the algorithm does so.
+    - `action`: indices.
+    - `target`: for the value of the action.
+    """
+
+    observation: Float[Array, "*rows k"]
+    action: Int[Array, "*rows"]
+    target: Float[Array, "*rows"]
+
+
 def q_lambda_targets(
     reward: Float[Array, "time *lanes"],
     next_value: Float[Array, "time *lanes"],
     ends: Ends,
-    discount: Float[Array, ""] | float,
-    q_lambda: Float[Array, ""] | float,
+    discount: Number,
+    q_lambda: Number,
 ) -> Float[Array, "time *lanes"]:
-    """Targets for the values of the actions taken, lane by lane.
+    """Compute targets for the values of the actions taken, lane by lane.
 
+    **Arguments:**
+
+    - `reward`: of each step.
     - `next_value`: of the best action in the state that the step led to, *before* any reset.
+    - `ends`: the steps that ended an episode, `[time, *lanes]`.
+    - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
 
     Source: Gallici et al. (2024), section 4 (Peng's Q(lambda)); a look ahead ends with its episode.
     """
     discount = discount * (1.0 - ends.terminated)
     longer = q_lambda * (1.0 - (ends.terminated | ends.truncated))
 
-    def backwards(later: Array, step: Any) -> tuple[Array, Array]:
+    def backwards(
+        later: Float[Array, "*lanes"], step: tuple[Float[Array, "*lanes"], ...]
+    ) -> tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]:
         reward, next_value, discount, longer = step
         target = reward + discount * (next_value + longer * (later - next_value))
         return target, target
@@ -181,22 +226,25 @@ def q_lambda_targets(
 
 
 def _collect(
-    pqn: PQN, task: Task, training: Training, key: Key[Array, ""]
+    pqn: PQN, task: Task, state: PQNState, key: Key[Array, ""]
 ) -> tuple[Episodes, Int[Array, " environments"], Experience]:
     choice_key, action_key, step_key = jax.random.split(key, 3)
-    keep, start = _exploring(pqn, training.done, training.updates)
+    keep, start = _exploration_chances(pqn, state.done, state.updates)
     # All random numbers of the update at once: in the loop each draw would cost a pass of its own.
     chances = jax.random.uniform(choice_key, (pqn.horizon, pqn.environments))
     options = jax.random.randint(
         action_key, (pqn.horizon, pqn.environments), 0, _count(task), jnp.int32
     )
 
-    def step(carry: Any, drawn: Any) -> Any:
+    def step(
+        carry: tuple[Episodes, Int[Array, " environments"]],
+        drawn: tuple[Float[Array, " environments"], Int[Array, " environments"], Key[Array, ""]],
+    ) -> tuple[tuple[Episodes, Int[Array, " environments"]], Experience]:
         episodes, held = carry
         chance, option, key = drawn
         observation = jax.vmap(task.observe)(episodes.state)
-        seen = normalised(training.seen, observation, pqn.normalise)
-        greedy = jnp.argmax(network(training.layers, seen, pqn.activation), axis=-1)
+        normalised = normalise(state.statistics, observation, pqn.normalise)
+        greedy = jnp.argmax(network(state.layers, normalised, pqn.activation), axis=-1)
         held = _next_held(held, chance, option, keep, start)
         action = jnp.where(held >= 0, held, greedy.astype(jnp.int32))
         episodes, transition = advance(task, episodes, action, key)
@@ -204,15 +252,15 @@ def _collect(
         return (episodes, held), Experience(observation, action, transition)
 
     keys = jax.random.split(step_key, pqn.horizon)
-    carry = (training.episodes, training.held)
+    carry = (state.episodes, state.held)
     (episodes, held), experience = jax.lax.scan(step, carry, (chances, options, keys))
     return episodes, held, experience
 
 
-def _exploring(
+def _exploration_chances(
     pqn: PQN, done: int | Int[Array, ""], updates: int | Int[Array, ""]
-) -> tuple[Array, Array]:
-    """Chances to go on holding a random action, and to begin with one.
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the chances to go on holding a random action, and to begin with one.
 
     With these the part of steps that explore is epsilon, whatever the hold: the stationary
     distribution of the chain of two states, exploring or not.
@@ -223,21 +271,27 @@ def _exploring(
     return jnp.asarray(keep), epsilon * (1.0 - keep) / jnp.maximum(1.0 - epsilon * keep, 1e-6)
 
 
-def _next_held(held: Array, chance: Array, option: Array, keep: Array, start: Array) -> Array:
-    kept = (held >= 0) & (chance < keep)
-    # Given that it is not kept, `chance` is uniform on [keep, 1).
+def _next_held(
+    held: Int[Array, " environments"],
+    chance: Float[Array, " environments"],
+    option: Int[Array, " environments"],
+    keep: Float[Array, ""],
+    start: Float[Array, ""],
+) -> Int[Array, " environments"]:
+    goes_on = (held >= 0) & (chance < keep)
+    # Given that the action is not held on, `chance` is uniform on [keep, 1).
     again = jnp.where(held >= 0, (chance - keep) / jnp.maximum(1.0 - keep, 1e-6), chance)
-    return jnp.where(kept, held, jnp.where(again < start, option, -1))
+    return jnp.where(goes_on, held, jnp.where(again < start, option, -1))
 
 
 def _learn(
-    pqn: PQN, training: Training, experience: Experience, key: Key[Array, ""]
-) -> tuple[Layers, Any]:
-    """A few passes of regression towards the targets of one stretch of experience."""
+    pqn: PQN, state: PQNState, experience: Experience, key: Key[Array, ""]
+) -> tuple[Layers, PyTree]:
+    """Take a few passes of regression towards the targets of one stretch of experience."""
     transition = experience.transition
-    look = lambda o: normalised(training.seen, o, pqn.normalise)  # noqa: E731
-    observation, next_observation = look(experience.observation), look(transition.next_observation)
-    next_values = network(training.layers, next_observation, pqn.activation)
+    observation = normalise(state.statistics, experience.observation, pqn.normalise)
+    next_observation = normalise(state.statistics, transition.next_observation, pqn.normalise)
+    next_values = network(state.layers, next_observation, pqn.activation)
     target = q_lambda_targets(
         pqn.reward_scale * transition.reward,
         jnp.max(next_values, axis=-1),
@@ -245,47 +299,24 @@ def _learn(
         pqn.discount,
         pqn.q_lambda,
     )
-    batch = (observation, experience.action, target)
-    batch = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
-    optimizer = _optimizer(pqn)
-    left = 1.0 - training.done * (1.0 / training.updates) if pqn.anneal else 1.0
-    rate = pqn.learning_rate * left
-
-    def minibatch(carry: Any, part: Any) -> Any:
-        layers, moments = carry
-        gradient = jax.grad(_loss)(layers, pqn, *part)
-        direction, moments = optimizer.update(gradient, moments)
-        layers = jax.tree.map(lambda w, d: w - rate * d, layers, direction)
-        return (layers, moments), None
-
-    def epoch(carry: Any, key: Key[Array, ""]) -> Any:
-        order = permutation(key, pqn.steps_per_update)
-        parts = jax.tree.map(
-            lambda leaf: leaf[order].reshape(pqn.minibatches, -1, *leaf.shape[1:]), batch
-        )
-        return jax.lax.scan(minibatch, carry, parts)
-
-    start = (training.layers, training.moments)
-    return jax.lax.scan(epoch, start, jax.random.split(key, pqn.epochs))[0]
-
-
-def _loss(
-    layers: Layers, pqn: PQN, observation: Array, action: Array, target: Array
-) -> Float[Array, ""]:
-    values = network(layers, observation, pqn.activation)
-    # A choice instead of an index, whose derivative would scatter row by row.
-    chosen = jnp.arange(values.shape[-1]) == action[:, None]
-    value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)
-    return jnp.mean(jnp.square(value - target)) / 2
-
-
-def _optimizer(pqn: PQN) -> Any:
-    import optax
-
-    return optax.chain(
-        optax.clip_by_global_norm(pqn.max_gradient),  # pyright: ignore[reportArgumentType]
-        optax.scale_by_adam(eps=1e-5),
+    return minibatch_epochs(
+        lambda layers, part: _loss(layers, pqn, part),
+        (state.layers, state.moments),
+        Minibatch(observation, experience.action, target),
+        key,
+        adam(pqn.max_gradient),
+        annealed(pqn.learning_rate, state.done, state.updates, pqn.anneal),
+        pqn.epochs,
+        pqn.minibatches,
     )
+
+
+def _loss(layers: Layers, pqn: PQN, part: Minibatch) -> Float[Array, ""]:
+    values = network(layers, part.observation, pqn.activation)
+    # A choice instead of an index, whose derivative would scatter row by row.
+    chosen = jnp.arange(values.shape[-1]) == part.action[:, None]
+    value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)
+    return jnp.mean(jnp.square(value - part.target)) / 2
 
 
 def _count(task: Task) -> int:

@@ -1,24 +1,27 @@
-"""What happened lately, in an array of fixed shape: a ring of transitions to draw batches from.
+"""Recent transitions in one array of fixed shape: a ring from which batches are drawn.
 
-    buffer = empty(capacity=50_000, size=3, actions=1)
-    buffer = remember(buffer, rows)            # the oldest rows make place
-    batch = draw(buffer, key, 128)
+    buffer = empty_buffer(capacity=50_000, size=3, actions=1)
+    buffer = add(buffer, transitions)          # over the oldest rows
+    batch = sample(buffer, key, 128, actions=1)
 
-One transition is one row of one array, so that remembering is one write and drawing one gather.
-Both work in place inside a compiled loop; no step copies the buffer.
+One transition is one row of one array, so that adding is one write and sampling one gather. Both
+work in place inside a compiled loop; no step copies the buffer.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 
 class ReplayBuffer(NamedTuple):
-    """Rows `[capacity, 2 * size + actions + 2]`, where the next one goes, and how many there are.
+    """A ring of transitions.
 
-    The widths of an observation and an action are not kept: `split` is told them.
+    - `rows`: `[capacity, 2 * size + actions + 2]`. The widths of an observation and an action are
+      not stored: `unpack` is given the second.
+    - `place`: the row that is written next.
+    - `filled`: the number of rows that hold a transition.
     """
 
     rows: Float[Array, "capacity width"]
@@ -26,24 +29,30 @@ class ReplayBuffer(NamedTuple):
     filled: Int[Array, ""]
 
 
-class Remembered(NamedTuple):
-    """Transitions: what was seen, done and earned, what was seen next (before any reset)."""
+class StoredTransitions(NamedTuple):
+    """Transitions of a buffer.
+
+    - `observation`, `action`: the policy's input and output.
+    - `reward`: of the step.
+    - `next_observation`: of the state that the step led to, before any reset.
+    - `terminated`: 1.0 where the episode ended for good, else 0.0.
+    """
 
     observation: Float[Array, "batch size"]
     next_observation: Float[Array, "batch size"]
     action: Float[Array, "batch actions"]
     reward: Float[Array, " batch"]
-    terminated: Float[Array, " batch"]
+    terminated: Float[Array, " batch"] | Bool[Array, " batch"]
 
 
-def empty(capacity: int, size: int, actions: int) -> ReplayBuffer:
-    """For observations of `size` numbers and actions of `actions`."""
+def empty_buffer(capacity: int, size: int, actions: int) -> ReplayBuffer:
+    """Make a buffer for observations of `size` numbers and actions of `actions`."""
     rows = jnp.zeros((capacity, 2 * size + actions + 2))
     return ReplayBuffer(rows, jnp.int32(0), jnp.int32(0))
 
 
-def remember(buffer: ReplayBuffer, new: Remembered) -> ReplayBuffer:
-    """Add transitions, over the oldest. The capacity is a multiple of their number."""
+def add(buffer: ReplayBuffer, new: StoredTransitions) -> ReplayBuffer:
+    """Write transitions over the oldest rows. The capacity is a multiple of their number."""
     columns = (new.observation, new.next_observation, new.action)
     scalars = (new.reward[:, None], new.terminated[:, None])
     rows = jnp.concatenate([part.astype(jnp.float32) for part in (*columns, *scalars)], axis=1)
@@ -54,15 +63,23 @@ def remember(buffer: ReplayBuffer, new: Remembered) -> ReplayBuffer:
     return ReplayBuffer(written, (buffer.place + count) % capacity, filled)
 
 
-def draw(buffer: ReplayBuffer, key: Key[Array, ""], count: int, actions: int) -> Remembered:
-    """Transitions drawn uniformly, with replacement, from a buffer that is not empty."""
-    chosen = jax.random.randint(key, (count,), 0, buffer.filled)
-    return split(buffer.rows[chosen], actions)
+def sample(
+    buffer: ReplayBuffer, key: Key[Array, ""], count: int, actions: int
+) -> StoredTransitions:
+    """Draw transitions uniformly, with replacement, from a buffer that is not empty.
+
+    **Arguments:**
+
+    - `count`: the number of transitions.
+    - `actions`: the numbers in an action.
+    """
+    places = jax.random.randint(key, (count,), 0, buffer.filled)
+    return unpack(buffer.rows[places], actions)
 
 
-def split(rows: Float[Array, "batch width"], actions: int) -> Remembered:
-    """The parts of rows whose actions have this many numbers."""
+def unpack(rows: Float[Array, "batch width"], actions: int) -> StoredTransitions:
+    """Split rows into their parts; an action has `actions` numbers."""
     size = (rows.shape[1] - actions - 2) // 2
-    return Remembered(
+    return StoredTransitions(
         rows[:, :size], rows[:, size : 2 * size], rows[:, 2 * size : -2], rows[:, -2], rows[:, -1]
     )

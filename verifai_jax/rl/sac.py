@@ -1,8 +1,8 @@
 """Soft actor-critic: a random policy for continuous actions that earns much and stays random.
 
     sac = SAC(learning_rate=1e-3, hidden=(32, 32))
-    training = sac.init(task, key, updates=200)
-    training, progress = sac.step(task, training)
+    state = sac.init(task, key, updates=200)
+    state, progress = sac.step(task, state)
 
 The policy that comes out is the mean action through tanh, without the noise.
 
@@ -12,34 +12,43 @@ noise that lasts: Eberhard et al., Pink noise is all you need (2023), here an au
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from verifai_jax.rl.algorithm import Number, Progress, check_values, shape
+from verifai_jax.rl.algorithm import Number, Progress, check_values, static_field
 from verifai_jax.rl.experience import (
     Episodes,
     Transition,
     advance,
-    begin,
     observation_size,
     progress,
+    start_episodes,
 )
-from verifai_jax.rl.observations import Seen, normalised, normaliser, watch
-from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, in_range, network, new_layers
-from verifai_jax.rl.replay_buffer import Remembered, ReplayBuffer, draw, empty, remember
+from verifai_jax.rl.observations import (
+    ObservationStatistics,
+    mean_and_scale,
+    normalise,
+    update,
+)
+from verifai_jax.rl.optimizer import adam, annealed
+from verifai_jax.rl.policy import ACTIVATIONS, Layers, Policy, network, new_layers, scale_to_range
+from verifai_jax.rl.replay_buffer import ReplayBuffer, StoredTransitions, add, empty_buffer, sample
 from verifai_jax.rl.task.task import Continuous, Task
 
-# Beyond these a Gaussian under tanh is a constant, or a coin that shows only the two ends.
 LOG_STD = (-10.0, 2.0)
+"""Bounds of the logarithm of the deviation.
+
+Beyond them a Gaussian under tanh is a constant, or a coin that shows only the two ends.
+"""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SAC:
-    """Hyper-parameters.
+    """Soft actor-critic, for continuous actions, by its hyper-parameters.
 
     - `learning_rate`: of Adam, for the policy, the critics and the temperature; falls linearly to
       0 over the training if `anneal`.
@@ -60,6 +69,8 @@ class SAC:
     - `normalise`: observations by their running mean and deviation.
     """
 
+    # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
+    __no_type_check__ = True
     actions: ClassVar[tuple[type, ...]] = (Continuous,)
 
     learning_rate: Number = 1e-3
@@ -70,16 +81,16 @@ class SAC:
     correlation: Number = 0.0
     warmup: int | Int[Array, ""] = 1_000
     reward_scale: Number = 0.1
-    environments: int = shape(8)
-    horizon: int = shape(32)
-    learnings: int = shape(1)
-    batch: int = shape(128)
-    capacity: int = shape(50_000)
-    hidden: tuple[int, ...] = shape((64, 64))
-    value_hidden: tuple[int, ...] = shape((64, 64))
-    activation: str = shape("relu")
-    normalise: bool = shape(False)
-    anneal: bool = shape(False)
+    environments: int = static_field(8)
+    horizon: int = static_field(32)
+    learnings: int = static_field(1)
+    batch: int = static_field(128)
+    capacity: int = static_field(50_000)
+    hidden: tuple[int, ...] = static_field((64, 64))
+    value_hidden: tuple[int, ...] = static_field((64, 64))
+    activation: str = static_field("relu")
+    normalise: bool = static_field(False)
+    anneal: bool = static_field(False)
 
     @property
     def steps_per_update(self) -> int:
@@ -110,10 +121,10 @@ class SAC:
         known = " or ".join(ACTIVATIONS)
         check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
 
-    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "Training":
-        """The state before the first of `updates` updates."""
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
+        """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, noise_key, key = jax.random.split(key, 5)
-        episodes = begin(task, reset_key, self.environments)
+        episodes = start_episodes(task, reset_key, self.environments)
         size, actions = observation_size(task, episodes), _count(task)
 
         def critic(key: Key[Array, ""]) -> Layers:
@@ -125,28 +136,37 @@ class SAC:
             critics=jax.vmap(critic)(jax.random.split(critic_key, 2)),
             log_temperature=jnp.log(jnp.asarray(self.temperature, jnp.float32)),
         )
-        return Training(
+        return SACState(
             weights=weights,
             slow=weights.critics,
-            moments=_optimizer().init(weights),
-            seen=Seen.nothing(size),
+            moments=adam().init(weights),
+            statistics=ObservationStatistics.initial(size),
             episodes=episodes,
             noise=jax.random.normal(noise_key, (self.environments, actions)),
-            buffer=empty(self.capacity, size, actions),
+            buffer=empty_buffer(self.capacity, size, actions),
             key=key,
             done=jnp.int32(0),
             updates=jnp.int32(updates),
         )
 
-    def step(self, task: Task, state: "Training") -> tuple["Training", Progress]:
-        """`horizon` times a step of each environment, and some steps of learning after it."""
-        act_key, learn_key, key = jax.random.split(state.key, 3)
-        rate = _rate(self, state)
+    def step(self, task: Task, state: "SACState") -> tuple["SACState", Progress]:
+        """Step the environments `horizon` times, with some steps of learning after each step.
 
-        def one(carry: Any, drawn: Any) -> Any:
-            at, (noise, step_key, learn_key) = drawn
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
+        act_key, learn_key, key = jax.random.split(state.key, 3)
+        rate = jnp.asarray(annealed(self.learning_rate, state.done, state.updates, self.anneal))
+
+        def one_step(
+            carry: "SACState",
+            numbered: tuple[
+                Int[Array, ""],
+                tuple[Float[Array, "environments actions"], Key[Array, ""], Key[Array, ""]],
+            ],
+        ) -> tuple["SACState", tuple[Transition, Float[Array, "environments k"]]]:
+            number, (noise, step_key, learn_key) = numbered
             carry, transition, observation = _act(self, task, carry, noise, step_key)
-            taken = (state.done * self.horizon + at + 1) * self.environments
+            taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
                 taken >= self.warmup,
                 lambda: _learn(self, carry, rate, learn_key),
@@ -162,14 +182,15 @@ class SAC:
             jax.random.split(learn_key, self.horizon),
         )
         after, (transition, observation) = jax.lax.scan(
-            one, state, (jnp.arange(self.horizon), drawn)
+            one_step, state, (jnp.arange(self.horizon), drawn)
         )
-        seen = watch(state.seen, observation) if self.normalise else state.seen
-        return after._replace(seen=seen, key=key, done=state.done + 1), progress(transition)
+        statistics = update(state.statistics, observation) if self.normalise else state.statistics
+        after = after._replace(statistics=statistics, key=key, done=state.done + 1)
+        return after, progress(transition)
 
-    def policy(self, task: Task, state: "Training") -> Policy:
-        """The policy as learnt so far, without exploration."""
-        mean, scale = normaliser(state.seen) if self.normalise else (None, None)
+    def policy(self, task: Task, state: "SACState") -> Policy:
+        """Return the policy learnt so far, without exploration."""
+        mean, scale = mean_and_scale(state.statistics) if self.normalise else (None, None)
         *layers, (weight, bias) = state.weights.policy
         actions = _count(task)
         means = (*layers, (weight[:, :actions], bias[:actions]))
@@ -179,27 +200,38 @@ class SAC:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What is learnt: the policy (means, then log deviations), two critics, the temperature.
+    """The numbers that are learnt.
 
-    The leaves of `critics` have a leading axis of 2.
+    - `policy`: layers of the network whose outputs are means, then logarithms of deviations.
+    - `critics`: layers of two critics; their leaves have a leading axis of 2.
+    - `log_temperature`: logarithm of the weight of entropy against reward.
     """
+
+    # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
+    __no_type_check__ = True
 
     policy: Layers
     critics: Layers
     log_temperature: Float[Array, ""]
 
 
-class Training(NamedTuple):
-    """Everything that goes from one update to the next.
+class SACState(NamedTuple):
+    """The state between two updates.
 
+    - `weights`, `moments`: what is learnt, and the optimizer's state.
     - `slow`: the critics that targets are made of.
-    - `noise`: in units of the policy's deviation.
+    - `statistics`: of the observations so far.
+    - `episodes`: the present episode of each environment.
+    - `noise`: of the next actions, in units of the policy's deviation.
+    - `buffer`: the transitions that are remembered.
+    - `key`: the random key of the next update.
+    - `done`, `updates`: updates so far, and in all.
     """
 
     weights: Weights
     slow: Layers
-    moments: Any
-    seen: Seen
+    moments: PyTree
+    statistics: ObservationStatistics
     episodes: Episodes
     noise: Float[Array, "environments actions"]
     buffer: ReplayBuffer
@@ -213,28 +245,32 @@ def squash_log_prob(
     log_std: Float[Array, "*batch actions"],
     noise: Float[Array, "*batch actions"],
 ) -> Float[Array, "*batch"]:
-    """Log density of `tanh(mean + exp(log_std) * noise)`, a vector in the unit cube.
+    """Compute the log density of `tanh(mean + exp(log_std) * noise)`, a vector in the unit cube.
 
     Source: Haarnoja et al. (2018), appendix C, eq. 26; the derivative of tanh at u is
     `1 - tanh(u)^2 = 4 / (e^u + e^-u)^2`, here by its logarithm, which never cancels.
     """
     u = mean + jnp.exp(log_std) * noise
     normal = -jnp.square(noise) / 2 - log_std - jnp.log(2 * jnp.pi) / 2
-    slope = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
-    return jnp.sum(normal - slope, axis=-1)
+    log_derivative = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
+    return jnp.sum(normal - log_derivative, axis=-1)
 
 
 def _act(
-    sac: SAC, task: Task, training: Training, noise: Array, key: Key[Array, ""]
-) -> tuple[Training, Transition, Array]:
-    """One step of each environment, and what came of it into the buffer."""
-    observation = jax.vmap(task.observe)(training.episodes.state)
-    look = normalised(training.seen, observation, sac.normalise)
-    mean, log_std = _gaussian(sac, training.weights.policy, look)
-    unit = jnp.tanh(mean + jnp.exp(log_std) * training.noise)
+    sac: SAC,
+    task: Task,
+    state: SACState,
+    noise: Float[Array, "environments actions"],
+    key: Key[Array, ""],
+) -> tuple[SACState, Transition, Float[Array, "environments k"]]:
+    """Take one step of each environment, and write the transitions into the buffer."""
+    observation = jax.vmap(task.observe)(state.episodes.state)
+    normalised = normalise(state.statistics, observation, sac.normalise)
+    mean, log_std = _gaussian(sac, state.weights.policy, normalised)
+    unit = jnp.tanh(mean + jnp.exp(log_std) * state.noise)
     assert isinstance(task.action, Continuous)
-    episodes, transition = advance(task, training.episodes, in_range(task.action, unit), key)
-    new = Remembered(
+    episodes, transition = advance(task, state.episodes, scale_to_range(task.action, unit), key)
+    new = StoredTransitions(
         observation,
         transition.next_observation,
         unit,
@@ -243,47 +279,50 @@ def _act(
     )
     # A new episode begins with noise of its own.
     rho = jnp.where(transition.over, 0.0, sac.correlation)[:, None]
-    after = training._replace(
+    after = state._replace(
         episodes=episodes,
-        buffer=remember(training.buffer, new),
-        noise=rho * training.noise + jnp.sqrt(1 - rho**2) * noise,
+        buffer=add(state.buffer, new),
+        noise=rho * state.noise + jnp.sqrt(1 - rho**2) * noise,
     )
     return after, transition, observation
 
 
-def _learn(sac: SAC, training: Training, rate: Float[Array, ""], key: Key[Array, ""]) -> Training:
-    """`learnings` steps of Adam, each on a batch of its own."""
-    actions = training.noise.shape[1]
+def _learn(sac: SAC, state: SACState, rate: Float[Array, ""], key: Key[Array, ""]) -> SACState:
+    """Take `learnings` steps of Adam, each on a batch of its own."""
+    actions = state.noise.shape[1]
+    optimizer = adam()
 
-    def one(carry: Any, key: Key[Array, ""]) -> Any:
+    def one_step(
+        carry: tuple[Weights, Layers, PyTree], key: Key[Array, ""]
+    ) -> tuple[tuple[Weights, Layers, PyTree], None]:
         weights, slow, moments = carry
         batch_key, noise_key = jax.random.split(key)
-        batch = draw(training.buffer, batch_key, sac.batch, actions)
+        batch = sample(state.buffer, batch_key, sac.batch, actions)
         batch = batch._replace(
-            observation=normalised(training.seen, batch.observation, sac.normalise),
-            next_observation=normalised(training.seen, batch.next_observation, sac.normalise),
+            observation=normalise(state.statistics, batch.observation, sac.normalise),
+            next_observation=normalise(state.statistics, batch.next_observation, sac.normalise),
         )
         noise = jax.random.normal(noise_key, (2, sac.batch, actions))
         gradient = jax.grad(_loss)(weights, sac, slow, batch, noise)
-        direction, moments = _optimizer().update(gradient, moments)
+        direction, moments = optimizer.update(gradient, moments)
         weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
         slow = jax.tree.map(lambda s, f: s + sac.target_rate * (f - s), slow, weights.critics)
         return (weights, slow, moments), None
 
-    carry = (training.weights, training.slow, training.moments)
+    carry = (state.weights, state.slow, state.moments)
     keys = jax.random.split(key, sac.learnings)
-    (weights, slow, moments), _ = jax.lax.scan(one, carry, keys)
-    return training._replace(weights=weights, slow=slow, moments=moments)
+    (weights, slow, moments), _ = jax.lax.scan(one_step, carry, keys)
+    return state._replace(weights=weights, slow=slow, moments=moments)
 
 
 def _loss(
     weights: Weights,
     sac: SAC,
     slow: Layers,
-    batch: Remembered,
+    batch: StoredTransitions,
     noise: Float[Array, "2 batch actions"],
 ) -> Float[Array, ""]:
-    """The sum of three losses, each with a gradient for its own part of the weights only."""
+    """Add up three losses, each with a gradient for its own part of the weights only."""
     fixed = jax.lax.stop_gradient(weights)
     temperature = jnp.exp(fixed.log_temperature)
 
@@ -291,8 +330,8 @@ def _loss(
     next_action = jnp.tanh(mean + jnp.exp(log_std) * noise[0])
     next_value = jnp.min(_values(sac, slow, batch.next_observation, next_action), axis=0)
     next_value = next_value - temperature * squash_log_prob(mean, log_std, noise[0])  # eq. 3
-    goes_on = sac.discount * (1.0 - batch.terminated)
-    target = jax.lax.stop_gradient(sac.reward_scale * batch.reward + goes_on * next_value)
+    discount = sac.discount * (1.0 - batch.terminated)
+    target = jax.lax.stop_gradient(sac.reward_scale * batch.reward + discount * next_value)
     value = _values(sac, weights.critics, batch.observation, batch.action)
     value_error = jnp.sum(jnp.mean(jnp.square(value - target), axis=1)) / 2  # eq. 5
 
@@ -300,34 +339,28 @@ def _loss(
     action = jnp.tanh(mean + jnp.exp(log_std) * noise[1])
     log_probability = squash_log_prob(mean, log_std, noise[1])
     worth = jnp.min(_values(sac, fixed.critics, batch.observation, action), axis=0)
-    surprise = jnp.mean(temperature * log_probability - worth)  # eq. 9
+    policy_loss = jnp.mean(temperature * log_probability - worth)  # eq. 9
 
     wanted = sac.target_entropy * noise.shape[2]
     excess = jax.lax.stop_gradient(jnp.mean(-log_probability) - wanted)
-    return value_error + surprise + weights.log_temperature * excess  # eq. 18, of the logarithm
+    return value_error + policy_loss + weights.log_temperature * excess  # eq. 18, of the logarithm
 
 
-def _gaussian(sac: SAC, layers: Layers, look: Array) -> tuple[Array, Array]:
-    mean, log_std = jnp.split(network(layers, look, sac.activation), 2, axis=-1)
+def _gaussian(
+    sac: SAC, layers: Layers, observation: Float[Array, "batch k"]
+) -> tuple[Float[Array, "batch actions"], Float[Array, "batch actions"]]:
+    mean, log_std = jnp.split(network(layers, observation, sac.activation), 2, axis=-1)
     return mean, jnp.clip(log_std, *LOG_STD)
 
 
 def _values(
-    sac: SAC, critics: Layers, look: Float[Array, "batch k"], action: Float[Array, "batch actions"]
+    sac: SAC,
+    critics: Layers,
+    observation: Float[Array, "batch k"],
+    action: Float[Array, "batch actions"],
 ) -> Float[Array, "2 batch"]:
-    both = jnp.concatenate([look, action], axis=-1)
+    both = jnp.concatenate([observation, action], axis=-1)
     return jax.vmap(lambda layers: network(layers, both, sac.activation)[:, 0])(critics)
-
-
-def _rate(sac: SAC, training: Training) -> Float[Array, ""]:
-    left = 1.0 - training.done * (1.0 / training.updates) if sac.anneal else 1.0
-    return jnp.asarray(sac.learning_rate * left)
-
-
-def _optimizer() -> Any:
-    import optax
-
-    return optax.scale_by_adam(eps=1e-5)
 
 
 def _count(task: Task) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from verifai_jax._version import __version__
 from verifai_jax.certification.attack import usable_search
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.rl.policy_evaluation import EPISODES, each_return
+from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.search import Search
 from verifai_jax.sweeps.cache import Store
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, OutOfTime, Watch
@@ -239,7 +239,7 @@ class _Sweeping:
                     self.returns[lesson, rung] = float(work["return"])
         policies = [self._policy(place) for place in missing]
         task = self.study.trainer.measured_on
-        for some, values in each_return(task, policies, episodes=self.options["episodes"]):
+        for some, values in batched_mean_returns(task, policies, episodes=self.options["episodes"]):
             work = {}
             for i, value in zip(some, values, strict=True):
                 self.returns[missing[i]] = float(value)

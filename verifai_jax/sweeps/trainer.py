@@ -30,10 +30,10 @@ from verifai_jax.features import (
 from verifai_jax.features.domain import Domain
 from verifai_jax.rl import algorithms
 from verifai_jax.rl.algorithm import Algorithm
+from verifai_jax.rl.batched_training import Configuration
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.ppo import PPO
 from verifai_jax.rl.task.task import Task
-from verifai_jax.rl.trainings import Configuration
 
 ALGORITHM, STEPS, WIDTH = "algorithm", "steps", "width"
 _PROBES = 64
@@ -216,7 +216,7 @@ class Trainer:
         if isinstance(self.task.action, algorithm.actions):
             return
         fitting = [n for n, a in self.by_name.items() if isinstance(self.task.action, a.actions)]
-        fitting += [n for n in algorithms.fitting(self.task.action) if n not in fitting]
+        fitting += [n for n in algorithms.algorithms_for(self.task.action) if n not in fitting]
         kinds = " or ".join(kind.__name__.lower() for kind in algorithm.actions)
         raise StudyError(
             f"algorithm {name!r}: {type(algorithm).__name__} learns {kinds} actions; "

@@ -19,8 +19,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from verifai_jax.rl.batched_training import BatchedTraining, Configuration, policy_structure
 from verifai_jax.rl.policy import Policy
-from verifai_jax.rl.trainings import Configuration, Trainings, form_of
 from verifai_jax.sweeps.cache import Store, StoreError, Work
 from verifai_jax.sweeps.clock import OutOfTime, Watch
 from verifai_jax.sweeps.record import Curve
@@ -76,7 +76,7 @@ class Lessons:
         self._reached: dict[tuple[int, int], Reached] = {}
         self._forms: dict[Hashable, Any] = {}
         self._trained: set[Hashable] = set()
-        self._homes: dict[int, tuple[Trainings, int]] = {}
+        self._homes: dict[int, tuple[BatchedTraining, int]] = {}
 
     def add(self, values: Mapping[str, Any], seed: int) -> int:
         """Ask for a training; one that cannot be is an error of its own, the others go on."""
@@ -108,7 +108,7 @@ class Lessons:
         """What is equal for trainings whose policies have one form and share a program."""
         configuration = self.lessons[number].configuration
         assert configuration is not None
-        return form_of(configuration)
+        return policy_structure(configuration)
 
     def reach(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
         """Take these trainings to a snapshot, or to their last if they have fewer.
@@ -132,7 +132,7 @@ class Lessons:
             # Of one length, so that devices finish together.
             group.sort(key=lambda n: (self.lessons[n].snapshots[-1], n))
             home = self._homes[group[0]][0]
-            size = len(home.devices) * home.together
+            size = len(home.devices) * home.per_device
             for start in range(0, len(group), size):
                 self._portion(group[start : start + size], rung, further)
 
@@ -141,14 +141,14 @@ class Lessons:
         for number in numbers:
             if number in self._homes:
                 home, place = self._homes[number]
-                home.forget(place)
+                home.discard(place)
 
     def _prepare(self) -> None:
         """Give the trainings of a new round a home, in which they stay until they are done."""
         fresh = [n for n in range(len(self.lessons)) if n not in self._homes]
         found = [(n, c) for n in fresh if (c := self.lessons[n].configuration) is not None]
         if found:
-            home = Trainings([configuration for _, configuration in found])
+            home = BatchedTraining([configuration for _, configuration in found])
             self._homes.update({n: (home, place) for place, (n, _) in enumerate(found)})
 
     def _portion(self, numbers: list[int], rung: int, further: bool) -> None:

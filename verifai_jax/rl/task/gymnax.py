@@ -1,4 +1,4 @@
-"""A gymnax environment to train on.
+"""Gymnax environments as tasks to train on.
 
     train(gymnax_task("CartPole-v1"), PPO())
     train(gymnax_task("Reacher-misc", time_limit=50), PPO())
@@ -11,89 +11,109 @@ does not end them, as `Task` asks.
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.rl.task.stepping import Fit, Shown, choice, fitted, kept, vector
+from verifai_jax.rl.task.stepping import (
+    ActionAdapter,
+    ObservedState,
+    box_actions,
+    discrete_actions,
+    flat_observation,
+    match_types,
+)
 from verifai_jax.rl.task.task import Action
 from verifai_jax.systems.environments._gymnax import Gymnax, gymnax
 from verifai_jax.systems.pytree_checks import outline
+
+if TYPE_CHECKING:
+    from gymnax.environments.environment import Environment
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class GymnaxTask:
-    """A task; made by `gymnax_task`. The numbers in `params` may be traced."""
+    """A task of a gymnax environment, made by `gymnax_task`.
 
-    params: Any
-    env: Any = dataclasses.field(metadata={"static": True})
-    fit: Fit = dataclasses.field(metadata={"static": True})
+    - `params`: the environment's parameters, whose numbers JAX may trace.
+    - `env`: the environment.
+    - `adapter`: from the policy's actions to the environment's.
+    - `time_limit`: steps after which an episode is cut off.
+    """
+
+    params: PyTree
+    env: "Environment" = dataclasses.field(metadata={"static": True})
+    adapter: ActionAdapter = dataclasses.field(metadata={"static": True})
     time_limit: int = dataclasses.field(metadata={"static": True})
 
     @property
     def action(self) -> Action:
         """The kind of action."""
-        return self.fit.action
+        return self.adapter.action
 
-    def reset(self, key: Key[Array, ""]) -> Shown:
-        """The environment's own start."""
+    def reset(self, key: Key[Array, ""]) -> ObservedState:
+        """Draw the environment's own start."""
         observation, state = self.env.reset_env(key, self.params)
-        start = Shown(state, vector(observation, self.env.name))
-        action = jax.ShapeDtypeStruct(self.fit.shape, self.fit.dtype)
+        start = ObservedState(state, flat_observation(observation, self.env.name))
+        action = jax.ShapeDtypeStruct(self.adapter.shape, self.adapter.dtype)
         following = jax.eval_shape(
-            lambda start, action: self._stepped(key, start, action)[0], start, action
+            lambda start, action: self._step(key, start, action)[0], start, action
         )
-        return kept(start, following, self.env.name)
+        return match_types(start, following, self.env.name)
 
     def step(
-        self, key: Key[Array, ""], state: Shown, action: Array
-    ) -> tuple[Shown, Float[Array, ""], Bool[Array, ""]]:
-        """The environment's own step, over only where its episode ends for good."""
-        after, reward, over = self._stepped(key, state, self.fit(action))
-        after = kept(after, state, self.env.name)
+        self, key: Key[Array, ""], state: ObservedState, action: Shaped[Array, "..."]
+    ) -> tuple[ObservedState, Float[Array, ""], Bool[Array, ""]]:
+        """Take the environment's own step, `terminated` only where its episode ends for good."""
+        after, reward, over = self._step(key, state, self.adapter(action))
+        after = match_types(after, state, self.env.name)
         return after, jnp.asarray(reward, jnp.float32).reshape(()), over
 
-    def observe(self, state: Shown) -> Float[Array, " k"]:
-        """The environment's observation, flat."""
+    def observe(self, state: ObservedState) -> Float[Array, " k"]:
+        """Return the environment's observation as a vector `[k]`."""
         return state.observation
 
-    def _stepped(self, key: Any, state: Shown, action: Any) -> tuple[Shown, Any, Any]:
+    def _step(
+        self, key: Key[Array, ""], state: ObservedState, action: Shaped[Array, "..."]
+    ) -> tuple[ObservedState, ArrayLike, Bool[Array, ""]]:
         env, params = self.env, self.params
         observation, after, reward, over, _ = env.step_env(key, state.state, action, params)
-        if _may_merge(env, params):
-            # One whose step reports its time limit as an end does not with a limit out of reach.
-            # What the limit may change besides stays: the other results are those above.
+        if _may_end_at_its_limit(env, params):
+            # A step that reports the time limit as an end cannot do so where the limit is out of
+            # reach. Only `over` is taken from it: the limit may change other results too.
             limit = jnp.asarray(params.max_steps_in_episode)
             far = np.iinfo(np.int32).max if jnp.issubdtype(limit.dtype, jnp.integer) else jnp.inf
             endless = params.replace(max_steps_in_episode=jnp.asarray(far, limit.dtype))
             over = env.step_env(key, state.state, action, endless)[3]
-        shown = Shown(after, vector(observation, env.name))
-        return shown, reward, jnp.asarray(over, bool).reshape(())
+        observed = ObservedState(after, flat_observation(observation, env.name))
+        return observed, reward, jnp.asarray(over, bool).reshape(())
 
 
 @suggests_options
-def gymnax_task(env: Any, *, params: Any = None, time_limit: int | None = None) -> GymnaxTask:
-    """A `Task` of an environment of gymnax.
+def gymnax_task(
+    env: "str | Environment", *, params: PyTree = None, time_limit: int | None = None
+) -> GymnaxTask:
+    """Make a `Task` of an environment of gymnax.
 
     **Arguments:**
 
     - `env`: the id of a registered environment, or an `Environment` of your own.
-    - `params`: its parameters; its own when left out.
+    - `params`: the environment's parameters; its default ones when left out.
     - `time_limit`: in steps; the environment's `max_steps_in_episode` when left out.
 
-    Actions are the environment's: a choice, or a box. A box whose entries have different bounds
-    takes actions from -1 to 1 for each. Observations are made one vector of float32.
+    **Returns:** a task with the environment's actions: a choice, or a box. A box whose entries have
+    different bounds takes actions from -1 to 1 for each. Observations are one vector of float32.
 
     **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
-    an unknown environment; `ValueError` for one in a wrapper, no time limit, and actions or
-    observations of another kind.
+    an unknown environment; `ValueError` for an environment in a wrapper, a missing time limit, and
+    actions or observations of another kind.
     """
-    made = _known(env) if isinstance(env, str) else _made(env, params)
+    made = _by_name(env) if isinstance(env, str) else _checked(env, params)
     if params is not None and isinstance(env, str) and not isinstance(params, type(made.params)):
         raise ValueError(
             f"params must be those of {env}, a {type(made.params).__name__} of its own; "
@@ -106,28 +126,31 @@ def gymnax_task(env: Any, *, params: Any = None, time_limit: int | None = None) 
             f"{made.env.name} needs a time limit of at least one step: "
             f"give time_limit=...; got {limit}"
         )
-    task = GymnaxTask(params, made.env, _fit(made.env, params), int(limit))
+    task = GymnaxTask(params, made.env, _action_adapter(made.env, params), int(limit))
     jax.eval_shape(task.reset, jax.random.key(0))
     return task
 
 
-def _made(env: Any, params: Any = None) -> Gymnax:
-    # All that it refuses in an environment is refused here too; nothing is simulated with it.
+def _checked(env: "str | Environment", params: PyTree = None) -> Gymnax:
+    # Whatever `gymnax` refuses in an environment is refused here too; the system simulates nothing.
     return gymnax(env, lambda observation: observation, steps=1, params=params)
 
 
-_known = functools.cache(_made)  # One object for one id: what is compiled for it is found.
+_by_name = functools.cache(_checked)
+"""One object for one id, so that programs compiled for it are found again."""
 
 
-def _fit(env: Any, params: Any) -> Fit:
+def _action_adapter(env: "Environment", params: PyTree) -> ActionAdapter:
     space = env.action_space(params)
     if hasattr(space, "n"):
-        return choice(space.n, getattr(space, "shape", ()), space.dtype)
+        return discrete_actions(space.n, getattr(space, "shape", ()), space.dtype)
     if hasattr(space, "low") and hasattr(space, "high"):
-        return fitted(space.low, space.high, tuple(space.shape), space.dtype, env.name)
-    raise ValueError(f"{env.name} takes {space!r}; a task takes one of several, or a box")
+        return box_actions(space.low, space.high, tuple(space.shape), space.dtype, env.name)
+    raise ValueError(
+        f"the actions of {env.name} are {space!r}; a task takes a choice of several, or a box"
+    )
 
 
-def _may_merge(env: Any, params: Any) -> bool:
-    own = type(env).__module__.split(".")[0] == "gymnax"
-    return not own and hasattr(params, "max_steps_in_episode") and hasattr(params, "replace")
+def _may_end_at_its_limit(env: "Environment", params: PyTree) -> bool:
+    of_gymnax = type(env).__module__.split(".")[0] == "gymnax"
+    return not of_gymnax and hasattr(params, "max_steps_in_episode") and hasattr(params, "replace")

@@ -1,4 +1,4 @@
-"""A MuJoCo model to train on, stepped by MJX.
+"""MuJoCo models as tasks to train on, stepped by MJX.
 
     task = mjx_task(
         "reacher.xml",
@@ -12,23 +12,49 @@
 The trained policy is then tested by `mjx` or `mujoco` with the same model.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, require, suggests_options
+from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous
 from verifai_jax.systems.mujoco.model import load
 from verifai_jax.systems.pytree_checks import outline
 
+MjModel: TypeAlias = Any
+"""A compiled model of MuJoCo (`mujoco.MjModel`), which is imported only where it is used."""
+MjxData: TypeAlias = Any
+"""Data of MJX (`mujoco.mjx.Data`), which is imported only where it is used."""
+MjxModel: TypeAlias = Any
+"""A model of MJX (`mujoco.mjx.Model`), which is imported only where it is used."""
+Reward = Callable[[MjxData, Array, MjxData], ArrayLike]
+"""`(before, action, after) -> number`"""
+Observe = Callable[[MjxData], ArrayLike]
+"""`data -> [k]`"""
+Initial = Callable[[Key[Array, ""], Array, Array], tuple[ArrayLike, ArrayLike]]
+"""`(key, qpos, qvel) -> (qpos, qvel)`"""
+Terminate = Callable[[MjxData], ArrayLike]
+"""`data -> bool`"""
+Control = Callable[[Array], ArrayLike]
+"""`action -> [nu]`"""
+Vary = Callable[[Key[Array, ""], MjxModel], Mapping[str, ArrayLike]]
+"""`(key, model) -> {field: array}`"""
 
-class Body(NamedTuple):
-    """A state: joints, activations, where the solver begins, and what this episode's model has."""
+
+class MjxState(NamedTuple):
+    """The state of an episode.
+
+    - `qpos`, `qvel`, `act`: joints and activations, as in MuJoCo.
+    - `warmstart`: accelerations from which the constraint solver begins.
+    - `varied`: fields of the model that are this episode's own, by name.
+    """
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
@@ -39,23 +65,26 @@ class Body(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MjxTask:
-    """A task; made by `mjx_task`, which says what its parts are."""
+    """A task of a MuJoCo model, made by `mjx_task`, which describes its parts.
 
-    compiled: Any
+    - `compiled`: the model.
+    - `substeps`: steps of the model in one step of the task.
+    """
+
+    compiled: MjModel
     action: Action
     time_limit: int
     substeps: int
-    reward: Callable[..., Any]
-    observe_data: Callable[..., Any]
-    initial: Callable[..., Any]
-    terminate: Callable[..., Any]
-    control: Callable[..., Any]
-    vary: Callable[..., Any]
-    made: dict[str, Any] = field(default_factory=dict, repr=False)
+    reward: Reward
+    observe_data: Observe
+    initial: Initial
+    terminate: Terminate
+    control: Control
+    vary: Vary
 
-    def reset(self, key: Key[Array, ""]) -> Body:
-        """At the model's own start, or as `initial` and `vary` say."""
-        model, blank = self._mjx()
+    def reset(self, key: Key[Array, ""]) -> MjxState:
+        """Start as the model does, changed by `initial` and `vary`."""
+        model, blank = self._mjx
         start_key, vary_key = jax.random.split(key)
         qpos, qvel = self.initial(start_key, blank.qpos, blank.qvel)
         varied = {
@@ -63,77 +92,80 @@ class MjxTask:
             for name, value in self.vary(vary_key, model).items()
         }
         qpos, qvel = jnp.asarray(qpos, blank.qpos.dtype), jnp.asarray(qvel, blank.qvel.dtype)
-        return Body(qpos, qvel, blank.act, jnp.zeros_like(blank.qacc_warmstart), varied)
+        return MjxState(qpos, qvel, blank.act, jnp.zeros_like(blank.qacc_warmstart), varied)
 
     def step(
-        self, key: Key[Array, ""], state: Body, action: Array
-    ) -> tuple[Body, Float[Array, ""], Bool[Array, ""]]:
-        """One control period. A state that is not finite ends the episode before it, unrewarded."""
+        self, key: Key[Array, ""], state: MjxState, action: Shaped[Array, "..."]
+    ) -> tuple[MjxState, Float[Array, ""], Bool[Array, ""]]:
+        """Take one control period.
+
+        Where the next state is not finite the episode ends in the state before, without a reward.
+        """
         mjx = require("mujoco.mjx", extra="mujoco")
         model, before = self._at(state)
         data = before.replace(ctrl=jnp.asarray(self.control(action)).reshape(before.ctrl.shape))
         data = jax.lax.fori_loop(0, self.substeps, lambda _, d: mjx.step(model, d), data)
-        after = Body(data.qpos, data.qvel, data.act, data.qacc_warmstart, state.varied)
+        after = MjxState(data.qpos, data.qvel, data.act, data.qacc_warmstart, state.varied)
         finite = jnp.array(True)
         for leaf in (after.qpos, after.qvel, after.act):
             finite &= jnp.all(jnp.isfinite(leaf))
         # A NaN would not stay in one episode: it would poison what is learnt from all of them.
         after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state)
-        seen = self._at(after)[1]
-        reward = jnp.asarray(self.reward(before, action, seen), jnp.float32).reshape(())
-        over = jnp.asarray(self.terminate(seen), bool).reshape(())
+        following = self._at(after)[1]
+        reward = jnp.asarray(self.reward(before, action, following), jnp.float32).reshape(())
+        over = jnp.asarray(self.terminate(following), bool).reshape(())
         return after, jnp.where(finite, reward, 0.0), over | ~finite
 
-    def observe(self, state: Body) -> Float[Array, " k"]:
-        """What the policy sees."""
+    def observe(self, state: MjxState) -> Float[Array, " k"]:
+        """Return what the policy observes, `[k]`."""
         return jnp.ravel(jnp.asarray(self.observe_data(self._at(state)[1]), jnp.float32))
 
-    def _at(self, state: Body) -> tuple[Any, Any]:
-        """The model of an episode, and data at a state: joints and where bodies and sites are."""
+    def _at(self, state: MjxState) -> tuple[MjxModel, MjxData]:
+        """Return the model of an episode, and data with positions of bodies and sites."""
         mjx = require("mujoco.mjx", extra="mujoco")
-        model, blank = self._mjx()
+        model, blank = self._mjx
         if state.varied:
             model = model.tree_replace(state.varied)
         data = blank.replace(
             qpos=state.qpos, qvel=state.qvel, act=state.act, qacc_warmstart=state.warmstart
         )
-        # What nobody looks at is not computed once it is compiled.
+        # The compiler removes the parts that reward, observation and end do not use.
         return model, mjx.kinematics(model, data)
 
-    def _mjx(self) -> tuple[Any, Any]:
-        if not self.made:
-            mjx = require("mujoco.mjx", extra="mujoco")
-            # Constants of every program that is traced, so never traced themselves.
-            with jax.ensure_compile_time_eval():
-                self.made["model"] = mjx.put_model(self.compiled, impl="jax")
-                self.made["data"] = mjx.make_data(self.compiled, impl="jax")
-        return self.made["model"], self.made["data"]
+    @cached_property
+    def _mjx(self) -> tuple[MjxModel, MjxData]:
+        mjx = require("mujoco.mjx", extra="mujoco")
+        # Constants of every program that is traced, so never traced themselves.
+        with jax.ensure_compile_time_eval():
+            model = mjx.put_model(self.compiled, impl="jax")
+            return model, mjx.make_data(self.compiled, impl="jax")
 
 
 @suggests_options
 def mjx_task(
-    model: Any,
+    model: object,
     *,
     control_period: float,
     time_limit: int,
-    reward: Callable[..., Any],
-    observe: Callable[..., Any] | None = None,
-    initial: Callable[..., Any] | None = None,
-    terminate: Callable[..., Any] | None = None,
+    reward: Reward,
+    observe: Observe | None = None,
+    initial: Initial | None = None,
+    terminate: Terminate | None = None,
     action: Action | None = None,
-    control: Callable[..., Any] | None = None,
-    vary: Callable[..., Any] | None = None,
+    control: Control | None = None,
+    vary: Vary | None = None,
 ) -> MjxTask:
-    """A `Task` of a MuJoCo model.
+    """Make a `Task` of a MuJoCo model.
 
     **Arguments:**
 
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
     - `control_period`: seconds of a step, a multiple of the model's timestep.
-    - `time_limit`: in steps, after which an episode is cut off.
-    - `reward(before, action, after) -> number`: of one step. `before` and `after` are MJX data
-      with joints, activations, and positions of bodies, geoms and sites; no sensors or forces.
-    - `observe(data) -> [k]`: what a policy sees; `qpos` and `qvel` when left out.
+    - `time_limit`: steps after which an episode is cut off.
+    - `reward(before, action, after) -> number`: the reward of one step. `before` and `after` are
+      MJX data with joints, activations, and positions of bodies, geoms and sites; no sensors or
+      forces.
+    - `observe(data) -> [k]`: what the policy observes; `qpos` and `qvel` when left out.
     - `initial(key, qpos, qvel) -> (qpos, qvel)`: the start; the model's own when left out.
     - `terminate(data) -> bool`: ends an episode for good.
     - `action`: the kind of action; one from -1 to 1 for each actuator when left out.
@@ -142,8 +174,11 @@ def mjx_task(
     - `vary(key, model) -> {field: array}`: fields of the MJX model that differ from one episode to
       the next, `{"body_mass": ...}`. Constants that MuJoCo derives from them stay as they are.
 
+    **Returns:** a task; its states are `MjxState`.
+
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
-    does not compile or that MJX cannot do, times that do not fit, and functions that do not.
+    does not compile or that MJX does not support, times that do not fit the model's timestep, and
+    functions whose results have the wrong shape.
     """
     compiled = load(model).compiled
     timestep = float(compiled.opt.timestep)
@@ -156,16 +191,16 @@ def mjx_task(
     check_count("time_limit", time_limit)
     if compiled.nu == 0:
         raise ValueError("the model has no actuator for an action to act on")
-    chosen = Continuous(-1.0, 1.0, int(compiled.nu)) if action is None else action
+    kind = Continuous(-1.0, 1.0, int(compiled.nu)) if action is None else action
     if control is None:
-        if not isinstance(chosen, Continuous) or chosen.size != compiled.nu:
+        if not isinstance(kind, Continuous) or kind.size != compiled.nu:
             raise ValueError(
-                f"{chosen} needs control=..., a function to the signals of {compiled.nu} actuators"
+                f"{kind} needs control=..., a function to the signals of {compiled.nu} actuators"
             )
-        control = _spread(compiled) if action is None else _itself
+        control = _over_control_range(compiled) if action is None else _identity
     task = MjxTask(
         compiled=compiled,
-        action=chosen,
+        action=kind,
         time_limit=time_limit,
         substeps=substeps,
         reward=reward,
@@ -181,9 +216,9 @@ def mjx_task(
 
 def _check(task: MjxTask) -> None:
     try:
-        model, _ = task._mjx()
+        model, _ = task._mjx
     except NotImplementedError as error:
-        raise ValueError(f"MJX cannot do this model: {error}") from error
+        raise ValueError(f"MJX does not support this model: {error}") from error
     key = jax.eval_shape(lambda: jax.random.key(0))
     fields = [name for name in vars(model) if hasattr(getattr(model, name), "dtype")]
     check_names(
@@ -196,20 +231,17 @@ def _check(task: MjxTask) -> None:
                 f"initial must return (qpos, qvel), {name} of shape {list(wanted)}; "
                 f"got {outline(getattr(start, name))}"
             )
-    shape, kind = ((), jnp.int32)
-    if isinstance(task.action, Continuous):
-        shape, kind = ((task.action.size,), jnp.float32)
-    action = jax.ShapeDtypeStruct(shape, kind)
+    action = abstract_action(task.action)
     jax.eval_shape(task.step, key, start, action)
     jax.eval_shape(task.observe, start)
 
 
-def _itself(action: Array) -> Array:
+def _identity(action: Array) -> Array:
     return action
 
 
-def _spread(compiled: Any) -> Callable[[Array], Array]:
+def _over_control_range(compiled: MjModel) -> Control:
     if not compiled.actuator_ctrllimited.all():
-        return _itself
+        return _identity
     low, high = compiled.actuator_ctrlrange.T
     return lambda action: jnp.asarray((high + low) / 2) + jnp.asarray((high - low) / 2) * action

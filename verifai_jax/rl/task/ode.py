@@ -1,4 +1,4 @@
-"""Train on an `ode` that is then tested: its dynamics, with the control as the action.
+"""Systems made by `ode` as tasks to train on: their dynamics, with the control as the action.
 
 loop = ode(dynamics, initial, dt=0.02, duration=4.0, terminate=fallen)
 task = ode_task(loop, Continuous(-10.0, 10.0), reward=lambda time, state, force, after: 1.0)
@@ -7,60 +7,76 @@ tested = replace(loop, controller=lambda time, state, features: trained.policy.a
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.ode._ode import Ode
-from verifai_jax.systems.ode.integrators import integrator
+from verifai_jax.systems.ode.integrators import Time, integrator
 from verifai_jax.systems.pytree_checks import as_floating, outline
 
+Tree = TypeVar("Tree")
+Reward = Callable[[Array, PyTree, PyTree, PyTree], ArrayLike]
+"""`(time, state, control, after) -> number`"""
+Control = Callable[[Array], PyTree]
+"""`action -> control`"""
+Observe = Callable[[PyTree], ArrayLike]
+"""`state -> [k]`"""
+DrawFeatures = Callable[[Key[Array, ""]], PyTree]
+"""`key -> features`"""
 
-class Moment(NamedTuple):
-    """Where an episode stands: seconds since its start, the state, and its features."""
+
+class OdeState(NamedTuple):
+    """The state of an episode.
+
+    - `time`: seconds since its start.
+    - `state`: the state of the dynamics, any pytree of arrays.
+    - `features`: the features of this episode.
+    """
 
     time: Float[Array, ""]
-    state: Any
-    features: Any
+    state: PyTree
+    features: PyTree
 
 
 @dataclass(frozen=True, eq=False)
 class OdeTask:
-    """A task; made by `ode_task`, which says what its parts are."""
+    """A task of a system made by `ode`; made by `ode_task`, which describes its parts."""
 
     loop: Ode
     action: Action
     time_limit: int
-    reward: Callable[..., Any]
-    control: Callable[..., Any]
-    observe_state: Callable[..., Any]
-    features: Callable[..., Any]
+    reward: Reward
+    control: Control
+    observe_state: Observe
+    features: DrawFeatures
 
-    def reset(self, key: Key[Array, ""]) -> Moment:
-        """The loop's own start, under features of this episode."""
+    def reset(self, key: Key[Array, ""]) -> OdeState:
+        """Start as the loop does, under features drawn for this episode."""
         features_key, start_key = jax.random.split(key)
         features = jax.tree.map(jnp.asarray, self.features(features_key))
         state = as_floating(self.loop.initial(features, start_key), "initial")
-        return Moment(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
+        return OdeState(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
 
     def step(
-        self, key: Key[Array, ""], state: Moment, action: Array
-    ) -> tuple[Moment, Float[Array, ""], Bool[Array, ""]]:
-        """One period of the control, cut short where the loop ends."""
+        self, key: Key[Array, ""], state: OdeState, action: Shaped[Array, "..."]
+    ) -> tuple[OdeState, Float[Array, ""], Bool[Array, ""]]:
+        """Take one period of the control, cut short where the loop ends."""
         loop, start = self.loop, state
         features, control = start.features, self.control(action)
         advance = integrator(loop.method)
         dt = loop.dt / loop.substeps
 
-        def slope(time: Any, state: Any) -> Any:
+        def derivative(time: Time, state: PyTree) -> PyTree:
             return loop.dynamics(time, state, control, features)
 
-        def ended(state: Any) -> Bool[Array, ""]:
+        def ended(state: PyTree) -> Bool[Array, ""]:
             over = False if loop.terminate is None else loop.terminate(state, features)
             return jnp.asarray(over, bool)
 
@@ -68,15 +84,15 @@ class OdeTask:
         for _ in range(loop.steps_per_control):
             after, later = now, time
             for _ in range(loop.substeps):
-                after, later = advance(slope, later, after, dt), later + dt
+                after, later = advance(derivative, later, after, dt), later + dt
             # Each sample of a trace may be its last.
             time, now = _where(over, (time, now), (time + loop.dt, after))
             over = over | ended(now)
         reward = jnp.asarray(self.reward(start.time, start.state, control, now), jnp.float32)
-        return Moment(time, now, start.features), reward.reshape(()), over
+        return OdeState(time, now, start.features), reward.reshape(()), over
 
-    def observe(self, state: Moment) -> Float[Array, " k"]:
-        """What the policy sees."""
+    def observe(self, state: OdeState) -> Float[Array, " k"]:
+        """Return what the policy observes, `[k]`."""
         return jnp.ravel(jnp.asarray(self.observe_state(state.state), jnp.float32))
 
 
@@ -85,25 +101,30 @@ def ode_task(
     loop: Ode,
     action: Action,
     *,
-    reward: Callable[..., Any],
-    control: Callable[..., Any] | None = None,
-    observe: Callable[..., Any] | None = None,
-    features: Mapping[str, Any] | Callable[..., Any] | None = None,
+    reward: Reward,
+    control: Control | None = None,
+    observe: Observe | None = None,
+    features: Mapping[str, ArrayLike] | DrawFeatures | None = None,
     time_limit: int | None = None,
 ) -> OdeTask:
-    """A `Task` of an `ode`: its start, dynamics, step, control period and end; not its controller.
+    """Make a `Task` of an `ode`: its start, dynamics, step, control period and end.
+
+    The loop's own controller is not used.
 
     **Arguments:**
 
+    - `loop`: a system made by `ode`.
     - `action`: the kind of action.
-    - `reward(time, state, control, after) -> number`: of one control period that begins in `state`
-      at `time` and leads to `after`.
+    - `reward(time, state, control, after) -> number`: the reward of one control period that begins
+      in `state` at `time` seconds and leads to `after`.
     - `control(action) -> control`: what the dynamics are given. When left out: a continuous action
       itself, one number as a scalar. Discrete actions need it.
-    - `observe(state) -> [k]`: what a policy sees; all numbers of the state when left out.
+    - `observe(state) -> [k]`: what the policy observes; all numbers of the state when left out.
     - `features`: what dynamics and start are given, or a function `key -> features` that draws
       them for each episode (domain randomisation). None at all when left out.
     - `time_limit`: in control periods; the loop's duration when left out.
+
+    **Returns:** a task; its states are `OdeState`.
 
     **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`, and
     functions that do not fit together.
@@ -119,35 +140,31 @@ def ode_task(
             raise ValueError(
                 f"{action} needs control=..., a function from the index to what the dynamics take"
             )
-        control = _itself
+        control = _action_itself
     limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit
     check_count("time_limit", limit)
-    given = features if callable(features) else _constant(dict(features or {}))
-    task = OdeTask(loop, action, limit, reward, control, observe or _numbers, given)
+    draw = features if callable(features) else _constant(dict(features or {}))
+    task = OdeTask(loop, action, limit, reward, control, observe or _all_numbers, draw)
     key = jax.eval_shape(lambda: jax.random.key(0))
     start = jax.eval_shape(task.reset, key)
-    discrete = isinstance(action, Discrete)
-    shape = jax.ShapeDtypeStruct(
-        () if discrete else (action.size,), jnp.int32 if discrete else jnp.float32
-    )
-    after, _, _ = jax.eval_shape(task.step, key, start, shape)
+    after, _, _ = jax.eval_shape(task.step, key, start, abstract_action(action))
     if jax.tree.structure(after) != jax.tree.structure(start):
-        raise ValueError(f"dynamics must return the slope of {outline(start)}")
+        raise ValueError(f"dynamics must return the derivative of {outline(start)}")
     jax.eval_shape(task.observe, start)
     return task
 
 
-def _itself(action: Array) -> Array:
+def _action_itself(action: Float[Array, " size"]) -> Float[Array, "..."]:
     return action[0] if action.shape == (1,) else action
 
 
-def _numbers(state: Any) -> Array:
+def _all_numbers(state: PyTree) -> Shaped[Array, " k"]:
     return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(state)])
 
 
-def _constant(features: dict[str, Any]) -> Callable[..., Any]:
+def _constant(features: dict[str, ArrayLike]) -> DrawFeatures:
     return lambda key: features
 
 
-def _where(condition: Bool[Array, ""], yes: Any, no: Any) -> Any:
+def _where(condition: Bool[Array, ""], yes: Tree, no: Tree) -> Tree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,32 +1,35 @@
-"""What tasks made of other libraries' environments share: states of one form, flat observations.
+"""States, observations and actions of other libraries' environments in the form of a task.
 
-state = kept(state, jax.eval_shape(step, state))      # in the types that it will have
-vector(observation, "CartPole-v1")                    # float32[k]
-fit = fitted(low, high, shape, dtype, "Pendulum-v1")  # the kind of action, and the way back
+state = match_types(state, jax.eval_shape(step, state), "CartPole-v1")
+flat_observation(observation, "CartPole-v1")               # float32[k]
+adapter = box_actions(low, high, shape, dtype, "Pendulum-v1")
+adapter.action, adapter(action)                            # what the policy, the environment takes
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, DTypeLike, Float, PyTree, Shaped
 
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.pytree_checks import outline
 
 
-class Shown(NamedTuple):
-    """A state of an environment, and what it shows of it: some draw at random what they show."""
+class ObservedState(NamedTuple):
+    """A state of an environment with its observation, which some environments draw at random."""
 
-    state: Any
+    state: PyTree
     observation: Float[Array, " k"]
 
 
-class Fit(NamedTuple):
+class ActionAdapter(NamedTuple):
     """The kind of action that a policy takes, and how an environment wants it: hashable.
 
-    - `low`, `high`: of each entry, where they differ and the policy acts from -1 to 1.
+    - `action`: the kind of action of the policy.
+    - `shape`, `dtype`: of the environment's action.
+    - `low`, `high`: bounds of each entry, where they differ and the policy acts from -1 to 1.
     """
 
     action: Action
@@ -35,21 +38,30 @@ class Fit(NamedTuple):
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
 
-    def __call__(self, action: Array) -> Array:
-        """The environment's own action."""
+    def __call__(self, action: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
+        """Return the environment's own action."""
         if self.low:
             low, high = jnp.array(self.low), jnp.array(self.high)
             action = (high + low) / 2 + (high - low) / 2 * action
         return jnp.asarray(action).reshape(self.shape).astype(self.dtype)
 
 
-def choice(n: int, shape: tuple[int, ...], dtype: Any) -> Fit:
-    """One of `n`."""
-    return Fit(Discrete(int(n)), tuple(shape), str(np.dtype(dtype)))
+def abstract_action(action: Action) -> jax.ShapeDtypeStruct:
+    """Return shape and dtype of an action as `Task.step` takes it."""
+    if isinstance(action, Discrete):
+        return jax.ShapeDtypeStruct((), jnp.int32)
+    return jax.ShapeDtypeStruct((action.size,), jnp.float32)
 
 
-def fitted(low: Any, high: Any, shape: tuple[int, ...], dtype: Any, name: str) -> Fit:
-    """A box of actions. Where its entries have different bounds the policy acts from -1 to 1.
+def discrete_actions(n: int, shape: tuple[int, ...], dtype: DTypeLike) -> ActionAdapter:
+    """Adapt one of `n` choices."""
+    return ActionAdapter(Discrete(int(n)), tuple(shape), str(np.dtype(dtype)))
+
+
+def box_actions(
+    low: ArrayLike, high: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike, name: str
+) -> ActionAdapter:
+    """Adapt a box of actions. Where its entries have different bounds the policy acts in [-1, 1].
 
     **Raises:** `ValueError` for a box without bounds.
     """
@@ -57,41 +69,52 @@ def fitted(low: Any, high: Any, shape: tuple[int, ...], dtype: Any, name: str) -
         np.broadcast_to(np.asarray(b, np.float64), shape).reshape(-1) for b in (low, high)
     )
     if not (np.all(np.isfinite(lows)) and np.all(np.isfinite(highs))):
-        raise ValueError(f"{name} has actions without bounds, {low} to {high}; a task needs some")
+        raise ValueError(
+            f"the actions of {name} have no finite bounds, {low} to {high}; a task needs them"
+        )
     kind, size = str(np.dtype(dtype)), max(1, lows.size)
     if np.all(lows == lows[0]) and np.all(highs == highs[0]):
-        return Fit(Continuous(float(lows[0]), float(highs[0]), size), tuple(shape), kind)
+        action = Continuous(float(lows[0]), float(highs[0]), size)
+        return ActionAdapter(action, tuple(shape), kind)
     bounds = (tuple(map(float, lows)), tuple(map(float, highs)))
-    return Fit(Continuous(-1.0, 1.0, size), tuple(shape), kind, *bounds)
+    return ActionAdapter(Continuous(-1.0, 1.0, size), tuple(shape), kind, *bounds)
 
 
-def vector(observation: Any, name: str) -> Float[Array, " k"]:
-    """An observation as one vector of float32.
+def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
+    """Return an observation as one vector of float32.
 
     **Raises:** `ValueError` for one that is no array of numbers.
     """
     if not hasattr(observation, "shape") or not hasattr(observation, "dtype"):
         raise ValueError(
-            f"a policy sees one array of numbers; {name} shows {outline(observation)}: "
-            "give it an environment that shows one array"
+            f"a policy is given one array of numbers; an observation of {name} is "
+            f"{outline(observation)}: use an environment whose observation is one array"
         )
-    return jnp.ravel(observation).astype(jnp.float32)
+    return jnp.ravel(jnp.asarray(observation)).astype(jnp.float32)
 
 
-def kept(state: Any, following: Any, name: str) -> Any:
-    """A state in the types that it has from step to step: a count may begin as an integer.
+def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
+    """Return a state in the dtypes that it has from step to step: a count may begin as an integer.
 
-    **Raises:** `ValueError` for a step that leads to a state of another form.
+    **Arguments:**
+
+    - `state`: a state of the environment.
+    - `following`: the state after a step, or its shapes and dtypes.
+    - `name`: the environment's, for the error message.
+
+    **Raises:** `ValueError` for a step that leads to a state of another structure.
     """
     if jax.tree.structure(state) != jax.tree.structure(following):
         raise ValueError(
-            f"{name}: a step must return a state in the form that the start has: "
+            f"{name}: a step must return a state of the same structure as the start: "
             f"{outline(state)}; got {outline(following)}"
         )
-    return jax.tree.map(_promoted, state, following)
+    return jax.tree.map(_promote, state, following)
 
 
-def _promoted(leaf: Any, other: Any) -> Array:
-    if jnp.issubdtype(leaf.dtype if hasattr(leaf, "dtype") else type(leaf), jax.dtypes.prng_key):
+def _promote(
+    leaf: jax.Array | np.ndarray | float, other: jax.Array | jax.ShapeDtypeStruct
+) -> Array:
+    if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return leaf
     return jnp.asarray(leaf, jnp.promote_types(jnp.result_type(leaf), other.dtype))

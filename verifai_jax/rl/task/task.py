@@ -1,4 +1,4 @@
-"""What an environment must offer to be trained on: a task, and the kinds of action.
+"""The contract of an environment to train on, and the kinds of action.
 
     class Reach:
         action = Continuous(low=-1.0, high=1.0)
@@ -11,14 +11,20 @@ There is nothing to inherit from: whatever has these members is a task.
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
+
+State: TypeAlias = PyTree
+"""The state of one environment: any pytree of arrays, of the same structure at every step."""
 
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of `n` actions, an integer from 0 on."""
+    """One of `n` actions, an integer from 0 on.
+
+    **Raises:** `ValueError` for fewer than two choices.
+    """
 
     n: int
 
@@ -29,7 +35,10 @@ class Discrete:
 
 @dataclass(frozen=True)
 class Continuous:
-    """A vector `[size]`, each entry between `low` and `high`."""
+    """A vector `[size]` of actions, each entry between `low` and `high`.
+
+    **Raises:** `ValueError` unless `low < high` and `size >= 1`.
+    """
 
     low: float
     high: float
@@ -48,10 +57,17 @@ Action = Discrete | Continuous
 
 @runtime_checkable
 class Task(Protocol):
-    """An episodic task, pure and traceable by JAX, for one environment at a time.
+    """An episodic task: pure functions that JAX can trace, for one environment at a time.
 
-    `time_limit` is in steps; reaching it cuts an episode off without ending it: the state goes on
-    to have a value. `terminated` ends it: nothing comes after. The object must be hashable.
+    - `action`: the kind of action that `step` takes.
+    - `time_limit`: steps after which an episode is cut off. That does not end it: the state goes on
+      to have a value. Only `terminated`, which `step` returns, ends an episode for good.
+    - `reset(key) -> state`: a first state, drawn with the random key.
+    - `step(key, state, action) -> (state, reward, terminated)`: one step of the environment.
+    - `observe(state) -> [k]`: the numbers that the policy is given.
+
+    The object is a static argument of compiled programs, so it must be hashable; or it is a pytree,
+    whose numbers are then arguments of the program, so that other values compile nothing.
     """
 
     @property
@@ -64,16 +80,33 @@ class Task(Protocol):
         """Steps after which an episode is cut off."""
         ...
 
-    def reset(self, key: Key[Array, ""]) -> Any:
-        """A first state."""
+    def reset(self, key: Key[Array, ""]) -> State:
+        """Draw a first state.
+
+        **Arguments:**
+
+        - `key`: a random key, of this episode's start alone.
+
+        **Returns:** a state with the structure, shapes and dtypes that `step` returns.
+        """
         ...
 
     def step(
-        self, key: Key[Array, ""], state: Any, action: Any
-    ) -> tuple[Any, Float[Array, ""], Bool[Array, ""]]:
-        """The next state, the reward, and whether the episode is over for good."""
+        self, key: Key[Array, ""], state: State, action: Shaped[Array, "..."]
+    ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
+        """Take one step.
+
+        **Arguments:**
+
+        - `key`: a random key, of this step alone.
+        - `state`: as `reset` or `step` returned it.
+        - `action`: an int32 scalar of a `Discrete` task, a float32 vector `[size]` of a
+          `Continuous` one.
+
+        **Returns:** the next state; the reward; whether the episode is over for good.
+        """
         ...
 
-    def observe(self, state: Any) -> Float[Array, " k"]:
-        """What the policy sees of a state."""
+    def observe(self, state: State) -> Float[Array, " k"]:
+        """Return the observation `[k]` of a state, which is what the policy is given."""
         ...
