@@ -16,7 +16,7 @@ from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.plotting import animate
 from verifai_jax.plotting import mujoco_scene as scene
-from verifai_jax.plotting.run_pictures import draw_replay
+from verifai_jax.plotting.run_pictures import write_replay_pictures
 from verifai_jax.systems.mujoco.system import mujoco
 
 # A red ball above the ground, seen from the side; 2 m of height are 60 pixels.
@@ -162,7 +162,7 @@ def test_a_run_ends_where_it_was_terminated():
 
 def test_pictures_of_a_replay(seen, gl, tmp_path, monkeypatch):
     monkeypatch.setattr(scene, "SIZE", SIZE)
-    names = [path.name for path in draw_replay(seen, tmp_path, "worst")]
+    names = [path.name for path in write_replay_pictures(seen, tmp_path, "worst")]
     assert names == ["worst.png", "worst-strip.png", "worst.gif"]
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
 
@@ -175,7 +175,7 @@ def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch
     with pytest.raises(scene.NoRenderer, match=r"MUJOCO_GL=egl.*libEGL.*MUJOCO_GL=osmesa"):
         animate(seen, tmp_path / "no.gif")
     with caplog.at_level(logging.WARNING):
-        paths = draw_replay(seen, tmp_path, "worst")
+        paths = write_replay_pictures(seen, tmp_path, "worst")
     assert [path.name for path in paths] == ["worst.png"]
     (message,) = caplog.messages
     assert "\n" not in message

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 import verifai_jax as vj
-from verifai_jax.plotting import draw_run, plot_features, plot_replay
+from verifai_jax.plotting import plot_features, plot_replay, write_run_pictures
 from verifai_jax.plotting.replay import decisive_instant
 from verifai_jax.plotting.scatter import distinguishing_features
 
@@ -31,7 +31,7 @@ SPACES = {
 def test_every_run_can_be_drawn(space, spec, tmp_path):
     problem = vj.Problem("p", SPACES[space], system, spec)
     run = vj.falsify(problem, "uniform", 24, batch=24)
-    paths = draw_run(run, tmp_path)
+    paths = write_run_pictures(run, tmp_path)
     assert {p.name for p in paths} >= {"features.png", "robustness.png"}
     assert ("worst.png" in {p.name for p in paths}) == (space != "never finite")
     for path in paths:

@@ -140,9 +140,9 @@ def _print(run: "Run", pictures: bool) -> None:
     assert run.folder is not None
     click.echo(f"  table        {run.folder / 'table.parquet'}")
     if pictures and run.simulations:
-        from verifai_jax.plotting import draw_run
+        from verifai_jax.plotting import write_run_pictures
 
-        for path in draw_run(run, run.folder):
+        for path in write_run_pictures(run, run.folder):
             click.echo(f"  picture      {path}")
     if run.simulations and len(run.table.failed) < run.simulations:
         click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")

@@ -27,7 +27,7 @@ def replay(
     pictures: bool,
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
-    from verifai_jax.plotting import draw_replay
+    from verifai_jax.plotting import write_replay_pictures
 
     run = load_run(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
@@ -47,5 +47,5 @@ def replay(
     verdict = "violated" if again.violated else "satisfied"
     click.echo(f"  status {again.status.name.lower()}; {verdict}")
     if pictures:
-        for path in draw_replay(again, into or folder):
+        for path in write_replay_pictures(again, into or folder):
             click.echo(f"  picture      {path}")

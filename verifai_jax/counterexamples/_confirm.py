@@ -66,7 +66,7 @@ class Confirmation:
 
     @property
     def confirmed(self) -> bool:
-        """Whether the counterexample failed in every replay."""
+        """True where the counterexample failed in every replay."""
         return self.verdict == "confirmed"
 
     def __str__(self) -> str:

@@ -2,7 +2,9 @@
 
 from verifai_jax.plotting.animation import animate as animate
 from verifai_jax.plotting.replay import plot_replay as plot_replay
-from verifai_jax.plotting.robustness_history import plot_budget as plot_budget
-from verifai_jax.plotting.run_pictures import draw_replay as draw_replay
-from verifai_jax.plotting.run_pictures import draw_run as draw_run
+from verifai_jax.plotting.robustness_history import (
+    plot_robustness_history as plot_robustness_history,
+)
+from verifai_jax.plotting.run_pictures import write_replay_pictures as write_replay_pictures
+from verifai_jax.plotting.run_pictures import write_run_pictures as write_run_pictures
 from verifai_jax.plotting.scatter import plot_features as plot_features

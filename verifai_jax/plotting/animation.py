@@ -1,25 +1,32 @@
 """A simulation as an animated GIF: MuJoCo's picture of it, or what the problem draws itself."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import UInt8
 
+from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.mujoco_scene import can_draw, film, record
 from verifai_jax.plotting.style import new_figure
 
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.replay import Replay
-
 FRAMES_PER_SECOND = 25
 MOST_FRAMES = 150
+"""Frames at most; a longer simulation is played faster."""
 
 
-def animate(replay: "Replay", path: str | Path) -> Path:
-    """Write the simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
+def animate(replay: Replay, path: str | Path) -> Path:
+    """Write a simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
     system that is a MuJoCo model.
+
+    **Arguments:**
+
+    - `replay`: what `run.replay` returned.
+    - `path`: of the file; folders are made.
+
+    **Returns:** the path.
 
     **Raises:** `ValueError` for any other problem without `draw`; `mujoco_scene.NoRenderer` where
     MuJoCo cannot draw.
@@ -50,7 +57,9 @@ def animate(replay: "Replay", path: str | Path) -> Path:
     return path
 
 
-def _frame(replay: "Replay", draw: Any, sample: int) -> np.ndarray:
+def _frame(
+    replay: Replay, draw: Callable[..., None], sample: int
+) -> UInt8[np.ndarray, "height width 3"]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure = new_figure(figsize=(5.2, 3.0))

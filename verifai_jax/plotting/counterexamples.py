@@ -5,41 +5,48 @@ plot_shrunk(shrink(run), "small.png")               # what departs from nominal,
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.waveform import is_waveform
+from verifai_jax.counterexamples._explain import Explained, Influence
+from verifai_jax.counterexamples._shrink import Shrunk
 from verifai_jax.counterexamples.description import format_apart, format_number
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.formula import Arithmetic, Atom, Number, Predicate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
-if TYPE_CHECKING:
-    from verifai_jax.counterexamples._explain import Explained, Influence
-    from verifai_jax.counterexamples._shrink import Shrunk
-
 QUIET = "#8d99ae"
 MOST_BARS = 12
+"""Features drawn as bars."""
 MOST_SIGNALS = 3
+"""Input signals drawn."""
 
 
-def plot_explanation(explained: "Explained", path: str | Path | None = None) -> Any:
-    """The deciding signal with its bound and instant, signals that were fed in, and the features.
+def plot_explanation(explained: Explained, path: str | Path | None = None) -> Figure:
+    """Draw the deciding signal with its bound and instant, input signals, and the features.
 
-    Returns the figure.
+    **Arguments:**
+
+    - `explained`: what `explain` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
     """
     features = explained.replay.features
-    fed = [i for i in explained.influences if is_waveform(features.get(i.name))][:MOST_SIGNALS]
-    figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(fed)))
-    left, right = figure.subfigures(1, 2, width_ratios=(1.6, 1))
-    heights = [2.2] + [1.0] * len(fed)
+    inputs = [i for i in explained.influences if is_waveform(features.get(i.name))][:MOST_SIGNALS]
+    figure = new_figure(figsize=(10.5, 3.4 + 1.3 * len(inputs)))
+    halves: Any = figure.subfigures(1, 2, width_ratios=(1.6, 1))
+    left, right = halves
+    heights = [2.2] + [1.0] * len(inputs)
     panels = left.subplots(
-        1 + len(fed), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
+        1 + len(inputs), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights}
     ).ravel()
     draw_decision(panels[0], explained.why)
-    for axes, influence in zip(panels[1:], fed, strict=True):
-        _draw_fed(axes, influence, explained)
+    for axes, influence in zip(panels[1:], inputs, strict=True):
+        _draw_input(axes, influence, explained)
     panels[-1].set_xlabel("time [s]")
     _draw_bars(right.subplots(), explained)
     figure.suptitle(
@@ -49,8 +56,8 @@ def plot_explanation(explained: "Explained", path: str | Path | None = None) -> 
     return show_or_save(figure, path)
 
 
-def draw_decision(axes: Any, why: Explanation) -> None:
-    """The deciding predicate's left side over time, its bound, where it is broken, and when."""
+def draw_decision(axes: Axes, why: Explanation) -> None:
+    """Draw the deciding predicate's left side over time, its bound, and the decisive instant."""
     trace, predicate = why.trace, why.predicate
     clock = np.asarray(trace.clock())
     expression: Any = predicate.left if isinstance(predicate, Predicate) else None
@@ -111,8 +118,8 @@ def draw_decision(axes: Any, why: Explanation) -> None:
     tidy(axes)
 
 
-def _draw_fed(axes: Any, influence: "Influence", explained: "Explained") -> None:
-    """A signal that was fed in, its nominal value, and which parts of it matter."""
+def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
+    """Draw an input signal, its nominal value, and the parts of it that matter."""
     wave = explained.replay.features[influence.name]
     clock = np.asarray(explained.replay.trace.clock())
     length = wave.duration or float(clock[-1])
@@ -144,8 +151,8 @@ def _draw_fed(axes: Any, influence: "Influence", explained: "Explained") -> None
     tidy(axes)
 
 
-def _draw_bars(axes: Any, explained: "Explained") -> None:
-    """What the robustness becomes with each feature back at nominal; or slopes, if not known."""
+def _draw_bars(axes: Axes, explained: Explained) -> None:
+    """Draw the robustness with each feature back at nominal; or gradients, if not known."""
     shown = explained.influences[:MOST_BARS]
     names = [i.name for i in shown]
     where = np.arange(len(shown))
@@ -179,8 +186,16 @@ def _draw_bars(axes: Any, explained: "Explained") -> None:
     axes.grid(visible=False, axis="y")
 
 
-def plot_shrunk(shrunk: "Shrunk", path: str | Path | None = None) -> Any:
-    """What departs from nominal, in its range, beside the signal that breaks; the figure."""
+def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
+    """Draw the coordinates that depart from nominal, beside the signal that breaks the property.
+
+    **Arguments:**
+
+    - `shrunk`: what `shrink` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
     replay = shrunk.replay()
     names = list(shrunk.changed) or ["nothing departs"]
     shown = names[:24]

@@ -1,29 +1,35 @@
-"""Coverage as a picture: how often each cell of each feature was tried, and the pair with holes."""
+"""Coverage as a picture: the share of cells with samples, and the pair of features with holes."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.analysis._coverage import Coverage
+from verifai_jax.core.figure import Figure
+from verifai_jax.plotting.panels import draw_samples, two_features
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
-if TYPE_CHECKING:
-    from verifai_jax.analysis._coverage import Coverage
-
 MOST_SHOWN = 12
+"""Features drawn, the least covered first."""
 
 
-def plot_coverage(found: "Coverage", path: str | Path | None = None) -> Any:
-    """Draw the share of cells occupied, and samples with the largest hole; returns the figure."""
-    from verifai_jax.plotting.panels import draw_samples, two_features
+def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
+    """Draw the share of cells occupied, and samples with the largest hole.
 
-    samples = found.samples
-    worst = found.table.sort_values("occupied", kind="stable")
+    **Arguments:**
+
+    - `coverage`: what `analysis.coverage` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
+    samples = coverage.samples
+    worst = coverage.table.sort_values("occupied", kind="stable")
     figure = new_figure(figsize=(9.6, 4.2))
     left, right = figure.subplots(1, 2)
     shown = worst.head(MOST_SHOWN)
     place = np.arange(len(shown))
-    several = len(found.table) > 1
+    several = len(coverage.table) > 1
     for k, (column, label, color) in enumerate(
         [("occupied", "its cells", SAFE), ("pairs", "pairs of cells with others", "#8d99ae")]
     ):
@@ -44,9 +50,13 @@ def plot_coverage(found: "Coverage", path: str | Path | None = None) -> Any:
     ordered = [column.name for column in samples.ordered]
     across, up = two_features(samples, [name for name in worst.index if name in ordered])
     draw_samples(right, samples, across, up, size=6)
-    if found.hole is not None and across in found.hole and (up in found.hole or across == up):
-        y = found.hole[up] if across != up else float(np.nanmean(right.get_ylim()))
-        right.plot(found.hole[across], y, "X", color=FAILING, markeredgecolor="white", ms=12)
+    if (
+        coverage.hole is not None
+        and across in coverage.hole
+        and (up in coverage.hole or across == up)
+    ):
+        y = coverage.hole[up] if across != up else float(np.nanmean(right.get_ylim()))
+        right.plot(coverage.hole[across], y, "X", color=FAILING, markeredgecolor="white", ms=12)
         right.set_title("cross: middle of the largest hole", fontsize=8)
-    figure.suptitle(str(found).splitlines()[0][:160], fontsize=9, wrap=True)
+    figure.suptitle(str(coverage).splitlines()[0][:160], fontsize=9, wrap=True)
     return show_or_save(figure, path)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -25,21 +25,25 @@ from jaxtyping import Float, UInt8
 from verifai_jax.core.errors import require, unknown_name
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.waveform import bound
+from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.replay import decisive_instant
 from verifai_jax.systems.mujoco.system import MuJoCo
-
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.replay import Replay
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
 FRAMES_PER_SECOND = 20
 MOST_FRAMES = 120
-SIZE = (480, 320)  # width and height of a frame in pixels
+"""Frames at most; a longer motion is played faster."""
+SIZE = (480, 320)
+"""Width and height of a frame in pixels."""
 COLORS = 128
+"""Colours of a GIF."""
 AMBIENT = 0.35
-HEADER = 24  # pixels above a frame for its caption
-BACKGROUND = np.array([232, 237, 242], np.uint8)  # where a model has no sky
+"""Ambient light at least, from 0 to 1."""
+HEADER = 24
+"""Pixels above a frame for its caption."""
+BACKGROUND = np.array([232, 237, 242], np.uint8)
+"""Colour where a model has no sky."""
 ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
 
 
@@ -66,13 +70,13 @@ class Motion:
     decisive: int | None = None
 
 
-def can_draw(system: Any) -> bool:
-    """Whether a system is a MuJoCo model, which can be drawn by itself."""
+def can_draw(system: object) -> bool:
+    """Return whether a system is a MuJoCo model, which can be drawn by itself."""
     return isinstance(system, MuJoCo)
 
 
-def record(replay: "Replay") -> Motion:
-    """Simulate once more what was replayed, on the same engine, and keep the positions.
+def record(replay: Replay) -> Motion:
+    """Simulate a replay once more, on the same engine, and keep the positions.
 
     **Raises:** `ValueError` for a system that is no MuJoCo model.
     """
@@ -119,7 +123,7 @@ RECORDERS: Slot[None, tuple[Callable[..., Any], Callable[..., Any]]] = Slot("rec
 
 
 def _recorder(system: Any) -> tuple[Any, Any]:
-    """The same system with its positions as the only signal; what features set, compiled."""
+    """Return the system with its positions as the only signal, and what features set, compiled."""
     loop = system.loop
 
     def positions(time: Any, state: Any, control: Any, features: Any) -> dict[str, Any]:
@@ -133,10 +137,19 @@ def _recorder(system: Any) -> tuple[Any, Any]:
     return recorder if recorder.black_box else jax.jit(recorder), jax.jit(placed)
 
 
-def film(motion: Motion, path: str | Path, size: tuple[int, int] = SIZE, **camera: Any) -> Path:
+def film(
+    motion: Motion, path: str | Path, size: tuple[int, int] = SIZE, **camera: str | None
+) -> Path:
     """Write an animated GIF, in real time where it fits into `MOST_FRAMES` frames.
 
+    **Arguments:**
+
+    - `motion`: what `record` returned.
+    - `path`: of the file; folders are made.
+    - `size`: width and height in pixels.
     - `camera`: as for `frames`.
+
+    **Returns:** the path.
 
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
@@ -174,11 +187,21 @@ def strip(
     path: str | Path,
     count: int = 6,
     size: tuple[int, int] = (280, 300),
-    **camera: Any,
+    **camera: str | None,
 ) -> Path:
     """Write a PNG of `count` instants side by side, from the start to the end.
 
     Those of a failure close in on the sample that decided it.
+
+    **Arguments:**
+
+    - `motion`: what `record` returned.
+    - `path`: of the file; folders are made.
+    - `count`: instants.
+    - `size`: width and height of each in pixels.
+    - `camera`: as for `frames`.
+
+    **Returns:** the path.
 
     **Raises:** as `film`.
     """
@@ -206,11 +229,17 @@ def frames(
     *,
     camera: str | None = None,
 ) -> list[Frame]:
-    """Draw the motion at these samples.
+    """Draw the motion at some samples.
 
+    **Arguments:**
+
+    - `motion`: what `record` returned.
+    - `samples`: their numbers.
     - `size`: width and height in pixels.
     - `camera`: the name of one of the model's; its first one when left out, or, in a model that
       has none, one that follows its heaviest moving body from the side.
+
+    **Returns:** a picture `[height, width, 3]` of each.
 
     **Raises:** `NoRenderer`; `UnknownNameError`.
     """
@@ -241,8 +270,8 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     mujoco = require("mujoco", extra="mujoco")
     width, height = size
     # The off-screen buffer is as large as the model says, or the window.
-    asked = model.vis.global_
-    asked.offwidth, asked.offheight = max(asked.offwidth, width), max(asked.offheight, height)
+    buffer = model.vis.global_
+    buffer.offwidth, buffer.offheight = max(buffer.offwidth, width), max(buffer.offheight, height)
     # A model that nobody has looked at yet has little light in it.
     model.vis.headlight.ambient[:] = np.maximum(model.vis.headlight.ambient, AMBIENT)
     context = None
@@ -253,7 +282,7 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     except Exception as error:  # The loaders of EGL, OSMesa and GLX raise what they like.
         if context is not None:
             context.free()
-        raise NoRenderer(explained(error)) from error
+        raise NoRenderer(explain_failure(error)) from error
     try:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, pen)
         scene = mujoco.MjvScene(model, 2000 + 2 * model.ngeom)
@@ -284,7 +313,7 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
 
 
 def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """An arrow for each body that is pushed, its tip where the body begins.
+    """Return an arrow for each body that is pushed, its tip where the body begins.
 
     The greatest force of the motion is drawn a fifth of the model's extent long.
     """
@@ -304,7 +333,7 @@ def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np
 
 
 def _gl() -> Any:
-    """The class of OpenGL contexts to draw with.
+    """Return the class of OpenGL contexts to draw with.
 
     MuJoCo chooses one when it is imported, for a screen unless `MUJOCO_GL` says otherwise. By now
     it is imported, so where there is no screen its EGL is taken directly.
@@ -318,8 +347,8 @@ def _gl() -> Any:
     return found
 
 
-def explained(error: Exception) -> str:
-    """Why there is no picture, and what to do about it; one line."""
+def explain_failure(error: Exception) -> str:
+    """Explain in one line why there is no picture, and what to do about it."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     return (
         f"MuJoCo cannot draw here (MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}): {said}; without "
@@ -348,7 +377,7 @@ def _view(mujoco: Any, model: Any, name: str | None) -> Any:
 
 
 def _labelled(image: Frame, motion: Motion, sample: int, caption: str) -> Frame:
-    """The caption and the time above a frame; a red edge from the decisive sample on."""
+    """Write caption and time above a frame; a red edge from the decisive sample on."""
     from PIL import Image, ImageDraw, ImageFont
 
     header = np.full((HEADER, *image.shape[1:]), BACKGROUND, np.uint8)

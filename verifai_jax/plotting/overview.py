@@ -1,49 +1,57 @@
 """The overview of a run as one picture."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.analysis.overview import Analysis
+from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import format_percent
 from verifai_jax.plotting.bars import draw_bars
 from verifai_jax.plotting.panels import draw_rule, draw_samples, places, two_features
 from verifai_jax.plotting.style import BOUND, new_figure, show_or_save
-
-if TYPE_CHECKING:
-    from verifai_jax.analysis.overview import Analysis
 
 MOST_BARS = 10
 MOST_MARKED = 6
 MOST_RULES = 2
 
 
-def plot_overview(found: "Analysis", path: str | Path | None = None) -> Any:
-    """Draw failures over the two most important features, and the importances as bars."""
-    samples = found.samples
-    title = found.parts[0].words.splitlines()[0]
+def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
+    """Draw failures over the two most important features, and the importances as bars.
+
+    **Arguments:**
+
+    - `analysis`: what `analysis.analyze` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
+    samples = analysis.samples
+    title = analysis.parts[0].words.splitlines()[0]
     if samples is None:
         figure = new_figure(figsize=(6, 1.2))
-        figure.text(0.5, 0.5, f"{found.name}: {title}"[:120], ha="center", va="center", fontsize=9)
+        figure.text(
+            0.5, 0.5, f"{analysis.name}: {title}"[:120], ha="center", va="center", fontsize=9
+        )
         return show_or_save(figure, path)
-    weighed, rules = found["importance"], found["rules"]
-    bars = 0 if weighed is None else min(len(weighed.table), MOST_BARS)
+    importance, rules = analysis["importance"], analysis["rules"]
+    bars = 0 if importance is None else min(len(importance.table), MOST_BARS)
     figure = new_figure(figsize=(10.4 if bars else 6.2, 4.8))
     widths = [1.5, 1] if bars else [1]
     panels = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
     axes = panels[0]
     used = [c.feature for rule in rules.rules for c in rule.conditions] if rules else []
-    preferred = weighed.ranked[:2] if weighed is not None else used
+    preferred = importance.ranked[:2] if importance is not None else used
     across, up = two_features(samples, preferred)
     draw_samples(axes, samples, across, up)
     for number, rule in enumerate(rules.rules[:MOST_RULES] if rules else (), 1):
         draw_rule(axes, samples, rule, across, up, f"rule {number}")
-    _mark_representatives(axes, found, across, up)
-    if weighed is not None:
-        columns = {target: _NAMES[target] for target in weighed.scores}
-        draw_bars(panels[1], weighed.table.head(MOST_BARS), columns)
+    _mark_representatives(axes, analysis, across, up)
+    if importance is not None:
+        columns = {target: _NAMES[target] for target in importance.scores}
+        draw_bars(panels[1], importance.table.head(MOST_BARS), columns)
         panels[1].set_xlabel("loss of a model's score without the feature")
-    lines = [f"{found.name}: {title}"]
+    lines = [f"{analysis.name}: {title}"]
     if rules is not None and rules.rules:
         first = rules.rules[0]
         lines.append(f"rule 1: {first.words} ({format_percent(first.coverage)} of the failures)")
@@ -54,11 +62,11 @@ def plot_overview(found: "Analysis", path: str | Path | None = None) -> Any:
 _NAMES = {"failing": "failing", "rho": "robustness"}
 
 
-def _mark_representatives(axes: Any, found: "Analysis", across: str, up: str) -> None:
+def _mark_representatives(axes: Axes, analysis: Analysis, across: str, up: str) -> None:
     """Number the rows that stand for the clusters of failures."""
-    samples = found.samples
+    samples = analysis.samples
     assert samples is not None
-    rows = found.representatives[:MOST_MARKED]
+    rows = analysis.representatives[:MOST_MARKED]
     x, y = places(samples, across, up)
     for number, row in enumerate(rows):
         place = int(np.flatnonzero(samples.rows == row)[0])

@@ -1,46 +1,55 @@
 """Samples over two features, and the boxes that rules make there."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.analysis._rules import Rule, Rules
 from verifai_jax.analysis.data.columns import Column
 from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
-if TYPE_CHECKING:
-    from verifai_jax.analysis._rules import Rule, Rules
-
 DOTS = 3000
+"""Rows drawn of each verdict."""
 JITTER = 0.25
+"""Spread of unordered values around their place."""
 MOST_LABELS = 12
+"""Choices that an axis names."""
 
 
-def plot_rules(found: "Rules", path: str | Path | None = None) -> Any:
-    """Draw samples over the features that the rules use most, with the rules' boxes."""
-    samples = found.samples
-    used = [c.feature for rule in found.rules for c in rule.conditions]
+def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
+    """Draw samples over the features that the rules use most, with the rules' boxes.
+
+    **Arguments:**
+
+    - `rules`: what `analysis.rules` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
+    """
+    samples = rules.samples
+    used = [c.feature for rule in rules.rules for c in rule.conditions]
     across, up = two_features(samples, used)
     figure = new_figure(figsize=(6.4, 4.9))
     axes = figure.subplots()
     draw_samples(axes, samples, across, up)
-    for number, rule in enumerate(found.rules, 1):
+    for number, rule in enumerate(rules.rules, 1):
         draw_rule(axes, samples, rule, across, up, str(number))
-    lines = [f"{i}  {rule}" for i, rule in enumerate(found.rules[:3], 1)]
+    lines = [f"{i}  {rule}" for i, rule in enumerate(rules.rules[:3], 1)]
     title = "\n".join(_wrapped(line) for line in lines) or f"{samples.name}: no rule"
     figure.suptitle(title, fontsize=8, x=0.02, ha="left")
     return show_or_save(figure, path)
 
 
 def two_features(samples: Samples, preferred: list[str]) -> tuple[str, str]:
-    """The first two different ones of `preferred` and then of all features; one twice if alone."""
+    """Return the first two of `preferred` and then of all features; a single one twice."""
     names = list(dict.fromkeys([*preferred, *samples.names]))
     return names[0], names[1] if len(names) > 1 else names[0]
 
 
-def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float = 9) -> None:
+def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float = 9) -> None:
     """Draw safe rows (green) and then failing ones (red) over two features, 3000 each at most.
 
     Unordered values are spread a little around their place.
@@ -70,7 +79,7 @@ def draw_samples(axes: Any, samples: Samples, across: str, up: str, size: float 
 def places(
     samples: Samples, across: str, up: str
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Where the rows are drawn; over a single feature the robustness is the other axis."""
+    """Return where the rows are drawn; over a single feature the robustness is the other axis."""
     columns = {column.name: column for column in samples.columns}
     x = _positions(samples, columns[across], seed=0)
     if up != across:
@@ -79,7 +88,7 @@ def places(
 
 
 def draw_rule(
-    axes: Any, samples: Samples, rule: "Rule", across: str, up: str, label: str = ""
+    axes: Axes, samples: Samples, rule: Rule, across: str, up: str, label: str = ""
 ) -> None:
     """Draw the boxes of a rule over two features, dashed where it has conditions on others."""
     from matplotlib.patches import Rectangle
@@ -114,9 +123,9 @@ def draw_rule(
 
 
 def _spans(
-    samples: Samples, rule: "Rule", name: str, limits: tuple[float, float]
+    samples: Samples, rule: Rule, name: str, limits: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Intervals of an axis that a rule allows, inside its limits."""
+    """Return the intervals of an axis that a rule allows, inside its limits."""
     inset = 0.006 * (limits[1] - limits[0])
     low, high = limits[0] + inset, limits[1] - inset
     for j, column in enumerate(samples.ordered):

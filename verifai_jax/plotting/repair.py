@@ -1,6 +1,7 @@
 """The worst robustness that each attack of a repair found."""
 
 from pathlib import Path
+from typing import Any
 
 from verifai_jax.core.figure import Figure
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -25,6 +26,7 @@ def plot_repair(repair: Repair, path: str | Path | None = None) -> Figure:
     axes.scatter(range(1, len(worst) + 1), worst, color=colours, zorder=3)
     axes.axhline(repair.margin, color=BOUND, linewidth=0.8, linestyle="--")
     axes.set(xlabel="round", ylabel="worst robustness found", title=repair.name)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    locator: Any = axes.xaxis.get_major_locator()
+    locator.set_params(integer=True)
     tidy(axes)
     return show_or_save(figure, path)

@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.replay import Replay
@@ -14,12 +16,18 @@ from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Si
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 MOST_PANELS = 6
+"""Signals drawn at most, unless more are monitored."""
 
 
-def plot_replay(replay: Replay, path: str | Path | None = None) -> Any:
+def plot_replay(replay: Replay, path: str | Path | None = None) -> Figure:
     """Draw the signals over time, the monitored first, with bounds, violations and the instant.
 
-    Returns the figure.
+    **Arguments:**
+
+    - `replay`: what `run.replay` returned.
+    - `path`: of a picture to write; none when left out.
+
+    **Returns:** the figure.
     """
     trace = replay.trace
     name = replay.worst
@@ -57,7 +65,7 @@ def plot_replay(replay: Replay, path: str | Path | None = None) -> Any:
 
 
 def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple[str, int] | None:
-    """The signal and sample that decide the verdict; None where the verdict has no such.
+    """Return the signal and the sample that decide the verdict; None where there are none.
 
     A predicate over several signals is marked on the first.
     """
@@ -72,8 +80,8 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
 
 
 def _bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
-    """Predicates that compare this signal, or its absolute value, with a number."""
-    found = []
+    """Return predicates that compare this signal, or its absolute value, with a number."""
+    bounds = []
     for part in dict.fromkeys(formula.subformulas()):
         if isinstance(part, Predicate) and isinstance(part.right, Number):
             limit = part.right.value
@@ -85,14 +93,14 @@ def _bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]
             if isinstance(inner, Component):
                 inner = inner.vector
             if inner == Signal(signal):
-                found.append((part, limits))
-    return found
+                bounds.append((part, limits))
+    return bounds
 
 
 def _draw_bounds(
-    axes: Any,
-    clock: np.ndarray,
-    values: np.ndarray,
+    axes: Axes,
+    clock: Float[np.ndarray, " t"],
+    values: Float[np.ndarray, "t *vector"],
     predicate: Predicate,
     limits: list[float],
     trace: Trace,
@@ -126,7 +134,7 @@ def _draw_bounds(
     )
 
 
-def _mark(axes: Any, trace: Trace, signal: str, sample: int) -> None:
+def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
     time = float(np.asarray(trace.clock())[sample])
     value = np.asarray(trace.signals[signal])[sample]
     if np.ndim(value):

@@ -1,32 +1,39 @@
-"""How a search went: the robustness of each simulation in the order they were made."""
+"""The course of a search: the robustness of each simulation, in order."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from verifai_jax.core.figure import Axes, Figure
+from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
-if TYPE_CHECKING:
-    from verifai_jax.falsification.run import Run
-
-DOTS = 4000  # More dots than this are thinned out; the lines are exact.
+DOTS = 4000
+"""Simulations drawn as dots at most; the lines are exact."""
 
 
-def plot_budget(
-    run: "Run | dict[str, Run]", path: str | Path | None = None, axes: Any = None
-) -> Any:
+def plot_robustness_history(
+    run: Run | Mapping[str, Run], path: str | Path | None = None, axes: Axes | None = None
+) -> Figure:
     """Draw robustness over simulations with the running minimum; several runs share the axes.
 
-    - `run`: a run, or runs by the label that the legend gives them.
+    **Arguments:**
 
-    Returns the figure.
+    - `run`: a run, or runs by the label that the legend gives them.
+    - `path`: of a picture to write; none when left out.
+    - `axes`: to draw into; those of a new figure when left out.
+
+    **Returns:** the figure.
     """
-    runs = run if isinstance(run, dict) else {"": run}
-    figure = axes.figure if axes is not None else new_figure(figsize=(7.5, 4))
-    axes = figure.subplots() if axes is None else axes
+    runs = {"": run} if isinstance(run, Run) else run
+    given: Any = axes
+    figure = new_figure(figsize=(7.5, 4)) if given is None else given.figure
+    panel = figure.subplots() if given is None else given
     if len(runs) == 1:
-        _one(axes, next(iter(runs.values())))
+        _one(panel, next(iter(runs.values())))
     else:
         for label, each in runs.items():
             rho = _robustness(each)
@@ -34,19 +41,19 @@ def plot_budget(
             failing = _failing(each)
             first = f"first failure: {failing[0] + 1:,}" if len(failing) else "no failure"
             best = np.fmin.accumulate(rho)
-            (line,) = axes.plot(number, best, label=f"{label}  ({first})", linewidth=1.8)
+            (line,) = panel.plot(number, best, label=f"{label}  ({first})", linewidth=1.8)
             if len(failing):
-                axes.plot(failing[0] + 1, rho[failing[0]], "o", color=line.get_color())
-        axes.set_xscale("log")
-        axes.legend(frameon=False)
-    axes.axhline(0, color=BOUND, linewidth=1, linestyle="--")
-    axes.set_xlabel("simulations")
-    axes.set_ylabel("robustness (negative: violated)")
-    tidy(axes)
+                panel.plot(failing[0] + 1, rho[failing[0]], "o", color=line.get_color())
+        panel.set_xscale("log")
+        panel.legend(frameon=False)
+    panel.axhline(0, color=BOUND, linewidth=1, linestyle="--")
+    panel.set_xlabel("simulations")
+    panel.set_ylabel("robustness (negative: violated)")
+    tidy(panel)
     return show_or_save(figure, path)
 
 
-def _one(axes: Any, run: "Run") -> None:
+def _one(axes: Axes, run: Run) -> None:
     rho = _robustness(run)
     number = np.arange(1, len(rho) + 1)
     shown = np.unique(np.linspace(0, len(rho) - 1, DOTS).astype(int))
@@ -61,7 +68,7 @@ def _one(axes: Any, run: "Run") -> None:
     axes.legend(frameon=False, loc="upper right")
 
 
-def _mark_first(axes: Any, rho: np.ndarray, failing: np.ndarray) -> None:
+def _mark_first(axes: Axes, rho: Float[np.ndarray, " n"], failing: Int[np.ndarray, " k"]) -> None:
     if len(failing):
         first = failing[0]
         axes.annotate(
@@ -76,10 +83,10 @@ def _mark_first(axes: Any, rho: np.ndarray, failing: np.ndarray) -> None:
         )
 
 
-def _robustness(run: "Run") -> np.ndarray:
+def _robustness(run: Run) -> Float[np.ndarray, " n"]:
     return run.table.all["rho"].to_numpy(float)
 
 
-def _failing(run: "Run") -> np.ndarray:
-    """Row numbers of the counterexamples."""
+def _failing(run: Run) -> Int[np.ndarray, " k"]:
+    """Return the row numbers of the counterexamples."""
     return run.table.counterexamples.index.to_numpy()

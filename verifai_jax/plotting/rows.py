@@ -4,10 +4,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
 
 from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.core.figure import Axes
 
 DOTS = 3000
+"""Rows drawn at most."""
 # The first eight are told apart by colour-blind readers (Okabe and Ito, 2008).
 PALETTE = (
     "#0072b2",
@@ -23,7 +27,7 @@ _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 
 def two_columns(samples: Samples) -> tuple[str, str]:
-    """The two columns over which to draw: ordered ones that vary most relative to their range."""
+    """Return the two columns to draw over: ordered ones that vary most relative to their range."""
     spread = samples.matrix().std(axis=0)
     ordered = [samples.ordered[j].name for j in np.argsort(-spread, kind="stable")]
     names = [*ordered, *(column.name for column in samples.unordered)]
@@ -31,14 +35,14 @@ def two_columns(samples: Samples) -> tuple[str, str]:
 
 
 def pair(samples: Samples, names: Sequence[str]) -> tuple[str, str]:
-    """The first two of the columns; of a single one with the robustness, if there is any."""
+    """Return the first two of the columns; a single one with the robustness, if there is any."""
     if len(names) > 1:
         return names[0], names[1]
     return names[0], "rho" if np.isfinite(samples.rho).any() else names[0]
 
 
-def positions(samples: Samples, name: str, frame: Any) -> np.ndarray:
-    """Where rows are drawn along a column; a choice by its place, an absent entry nowhere."""
+def positions(samples: Samples, name: str, frame: pd.DataFrame) -> Float[np.ndarray, " n"]:
+    """Return where rows are drawn along a column; NaN for an absent entry."""
     place = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
     if place is None or samples.columns[place].ordered:
         return frame[name].to_numpy(np.float64)
@@ -50,14 +54,14 @@ def positions(samples: Samples, name: str, frame: Any) -> np.ndarray:
 
 
 def draw_rows(
-    axes: Any,
+    axes: Axes,
     samples: Samples,
-    rows: np.ndarray,
+    rows: Int[np.ndarray, " k"],
     color: str,
     label: str,
     names: Sequence[str] | None = None,
-) -> np.ndarray:
-    """Draw all samples faintly and `rows` (numbers) as rings; returns their places `[k, 2]`."""
+) -> Float[np.ndarray, "drawn 2"]:
+    """Draw all samples faintly and `rows` (numbers) as rings; return where these are drawn."""
     across, up = names or two_columns(samples)
     everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]
     chosen = samples.at(rows[:DOTS])
@@ -77,7 +81,7 @@ def draw_rows(
     return places
 
 
-def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
+def name_axes(axes: Axes, samples: Samples, across: str, up: str) -> None:
     """Label the two axes; choices by their names."""
     columns = {column.name: column for column in samples.columns}
     for name, axis in ((across, axes.xaxis), (up, axes.yaxis)):
@@ -86,4 +90,5 @@ def name_axes(axes: Any, samples: Samples, across: str, up: str) -> None:
             choices = columns[name].choices
             axis.set_ticks(np.arange(len(choices)), [str(choice)[:20] for choice in choices])
         else:
-            axis.get_major_locator().set_params(nbins=5)
+            locator: Any = axis.get_major_locator()
+            locator.set_params(nbins=5)

@@ -2,39 +2,53 @@
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from verifai_jax.evaluation.replay import Replay
+from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.animation import animate
 from verifai_jax.plotting.mujoco_scene import NoRenderer, can_draw, film, record, strip
 from verifai_jax.plotting.replay import plot_replay
-from verifai_jax.plotting.robustness_history import plot_budget
+from verifai_jax.plotting.robustness_history import plot_robustness_history
 from verifai_jax.plotting.scatter import plot_features
 
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.replay import Replay
-    from verifai_jax.falsification.run import Run
 
-
-def draw_run(run: "Run", folder: str | Path) -> list[Path]:
-    """Draw all pictures of a run into `folder`; returns their paths.
+def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
+    """Write all pictures of a run into a folder.
 
     The worst simulation is drawn when the run has its problem and a row with a verdict.
+
+    **Arguments:**
+
+    - `run`: what `falsify` returned.
+    - `folder`: to write into; it is made where there is none.
+
+    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / "features.png", folder / "robustness.png"]
     plot_features(run, paths[0])
-    plot_budget(run, paths[1])
+    plot_robustness_history(run, paths[1])
     if run.problem is not None and len(run.table.failed) < run.simulations:
-        paths += draw_replay(run.replay(run.best), folder, "worst")
+        paths += write_replay_pictures(run.replay(run.best), folder, "worst")
     return paths
 
 
-def draw_replay(replay: "Replay", folder: str | Path, name: str | None = None) -> list[Path]:
-    """Draw one simulation into `folder`, animated too where its problem can; returns the paths.
+def write_replay_pictures(
+    replay: Replay, folder: str | Path, name: str | None = None
+) -> list[Path]:
+    """Write the pictures of one simulation into a folder, animated too where its problem can.
 
     A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo cannot draw,
     one line is logged that says what to do, and its pictures are left out.
+
+    **Arguments:**
+
+    - `replay`: what `run.replay` returned.
+    - `folder`: to write into; it is made where there is none.
+    - `name`: of the files, without an ending; by default that of the row.
+
+    **Returns:** the paths of the pictures.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,10 +2,13 @@
 
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.figure import Figure
+from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.style import (
     FAILING,
     SAFE,
@@ -15,32 +18,33 @@ from verifai_jax.plotting.style import (
     tidy,
 )
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from verifai_jax.falsification.run import Run
-
 DOTS = 3000
+"""Rows drawn of each verdict."""
 
 
 def plot_features(
-    run: "Run",
+    run: Run,
     path: str | Path | None = None,
     features: list[str] | None = None,
     most: int = 4,
-) -> Any:
+) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
 
-    - `features`: which; by default the `most` that tell failing from safe samples best.
+    **Arguments:**
 
-    Returns the figure. **Raises:** `ValueError` for a feature that is not in the table.
+    - `run`: what `falsify` returned.
+    - `path`: of a picture to write; none when left out.
+    - `features`: names; by default the `most` that distinguish failing from safe samples best.
+    - `most`: features at most, where they are not named.
+
+    **Returns:** the figure.
+
+    **Raises:** `UnknownNameError` for a feature that is not in the table.
     """
     table = run.table.all
     if features is None:
         features = distinguishing_features(run)[:most]
     else:
-        from verifai_jax.core.errors import check_names
-
         check_names("feature", features, run.table.features)
     if not features:
         figure = new_figure(figsize=(4, 1))
@@ -79,16 +83,16 @@ def plot_features(
         axes.set_visible(False)
     failing, safe = len(run.table.counterexamples), len(run.table.safe)
     rate = run.failure_rate
-    told = f"search {run.search.split('(')[0]}" if rate is None else f"failure rate {rate}"
+    source = f"search {run.search.split('(')[0]}" if rate is None else f"failure rate {rate}"
     figure.suptitle(
-        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples\n{told}",
+        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples\n{source}",
         fontsize=10,
     )
     return show_or_save(figure, path)
 
 
-def distinguishing_features(run: "Run") -> list[str]:
-    """Feature columns, those first whose distributions differ most between failing and safe rows.
+def distinguishing_features(run: Run) -> list[str]:
+    """Return feature columns, first those that differ most between failing and safe rows.
 
     The difference is the Kolmogorov-Smirnov distance; without failing rows, the correlation of
     ranks with the robustness.
@@ -121,7 +125,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.max(np.abs(below_a - below_b)))
 
 
-def _positions(table: "pd.DataFrame", part: "pd.DataFrame", name: str) -> Any:
+def _positions(table: pd.DataFrame, part: pd.DataFrame, name: str) -> np.ndarray:
     if np.issubdtype(table[name].to_numpy().dtype, np.number):
         return part[name].to_numpy(float)
     return part[name].astype(str).to_numpy()

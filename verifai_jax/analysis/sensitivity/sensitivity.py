@@ -32,7 +32,7 @@ MOST_SHOWN = 20
 
 @dataclass(frozen=True, eq=False)
 class Sensitivity:
-    """What a sensitivity analysis found.
+    """Result of a sensitivity analysis.
 
     **Fields:** `method`; `problem`: its name; `table`: one row a unit coordinate, the most
     influential first, with `low` and `high` ends of 95 % bootstrap intervals; `simulations` made;
