@@ -16,7 +16,14 @@ from jaxtyping import install_import_hook
 
 matplotlib.use("Agg")
 
-CHECKED_ROOMS: list[str] = ["estimation"]
+CHECKED_ROOMS: list[str] = [
+    "estimation",
+    "systems.base",
+    "systems.blackbox",
+    "systems.checkpointing",
+    "systems.ode",
+    "systems.remote",
+]
 """Rooms whose annotations, shapes included, are checked at run time in tests."""
 
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")

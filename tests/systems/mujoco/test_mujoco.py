@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from envs import cartpole as analytic
 from verifai_jax.core.errors import UnknownNameError
@@ -308,7 +309,7 @@ def test_a_model_that_mjx_cannot_do_is_left_to_native():
     ],
 )
 def test_bindings_to_nothing_are_refused(bind, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         loop(bind={"a": bind})
 
 
@@ -341,7 +342,7 @@ def test_bindings_to_nothing_are_refused(bind, message):
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, message):
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with unchecked(), pytest.raises((ValueError, FileNotFoundError), match=message):
         loop(**options)
 
 
@@ -387,7 +388,7 @@ def test_misspelt_options_name_the_nearest():
 )
 def test_features_and_functions_that_do_not_fit_are_refused(options, features, message):
     system = loop(**{"bind": {"m": "body/pole/mass"}, **options})
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         system.check(features)
 
 

@@ -392,7 +392,7 @@ def _differentiable(
         return bool(values) and not any(used[len(values) : 2 * len(values)])
 
     @jax.custom_jvp
-    def same(*values: Sequence[Array]) -> Any:
+    def same(*values: Array) -> Any:
         return values
 
     @same.defjvp

@@ -354,7 +354,7 @@ def has_waveforms(features: Features) -> bool:
 
 
 def step_count(
-    steps: int | None, duration: float | None, dt: float, otherwise: int | None = None
+    steps: int | None, duration: float | None, dt: float, otherwise: float | None = None
 ) -> int:
     """Return the number of steps of an episode; refuse anything but a positive one."""
     if steps is not None and duration is not None:
@@ -365,11 +365,10 @@ def step_count(
             raise ValueError(
                 f"duration must be a positive multiple of dt; got (duration={duration}, dt={dt:g})"
             )
-    if steps is None:
-        steps = otherwise
-    if steps is None:
+    chosen = otherwise if steps is None else steps
+    if chosen is None:
         raise ValueError("give steps or duration; got neither")
-    return check_count("steps", steps)
+    return check_count("steps", chosen)
 
 
 def sampling_period(seconds: object) -> float:
