@@ -18,6 +18,7 @@ matplotlib.use("Agg")
 
 CHECKED_ROOMS: list[str] = [
     "estimation",
+    "sweeps",
     "systems.base",
     "systems.blackbox",
     "systems.checkpointing",

@@ -60,10 +60,10 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
     whole = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "whole")
     stopped = _Stopping(after=7)
-    monkeypatch.setattr(driver, "Store", stopped)
+    monkeypatch.setattr(driver, "Cache", stopped)
     part = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "part")
     assert "NOT FINISHED" in part
-    assert "go on        verifai-jax sweep --resume part" in part
+    assert "resume       verifai-jax sweep --resume part" in part
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "sweeps")
@@ -83,23 +83,23 @@ def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
 
 
 class _Stopping:
-    """A store that is interrupted once so much is done."""
+    """A cache that is interrupted once so much is done."""
 
     def __init__(self, after):
         self.after = after
 
     def __call__(self, path):
-        from verifai_jax.sweeps.cache import Store
+        from verifai_jax.sweeps.cache import Cache
 
-        store, put = Store(path), Store.put
+        cache, put = Cache(path), Cache.put
 
         def stopped(work):
-            put(store, work)
-            if store.made >= self.after:
+            put(cache, work)
+            if cache.computed >= self.after:
                 raise KeyboardInterrupt
 
-        store.put = stopped
-        return store
+        cache.put = stopped
+        return cache
 
 
 def test_errors_in_one_line(call, tmp_path):
@@ -112,7 +112,7 @@ def test_errors_in_one_line(call, tmp_path):
         (("specs/drift.py:safe", "--halving", 0.5), "reduction must be greater than 1; got 0.5"),
         (("specs/drift.py:safe", "--only", "raet"), "did you mean 'rate'"),
         (("specs/drift.py:safe", "--only", "rate"), "noise has none"),
-        (("--resume", "nowhere"), "Error: no sweep to go on with in nowhere"),
+        (("--resume", "nowhere"), "Error: no sweep to resume in nowhere"),
         (("specs/drift.py:safe", "--samples", 0), "samples must be an integer"),
     ):
         output = call(*arguments, code=1)
@@ -147,7 +147,7 @@ def test_only_some_vary(call):
 def test_another_sweep_in_the_same_folder_is_refused(call):
     call("specs/drift.py:safe", *SMALL, "--folder", "kept")
     output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=1)
-    assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the store 0" in output
+    assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the cache 0" in output
 
 
 def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):

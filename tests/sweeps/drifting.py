@@ -16,7 +16,7 @@ import verifai_jax as vj
 from verifai_jax.rl import Continuous, Discrete, Policy, Progress
 from verifai_jax.rl.algorithm import check_values, static_field
 from verifai_jax.statistics.binomial import clopper_pearson
-from verifai_jax.sweeps.safety import Judged, Judgement
+from verifai_jax.sweeps.safety import PolicySafety, SafetyReport
 from verifai_jax.sweeps.study import Study
 from verifai_jax.sweeps.trainer import Trainer
 
@@ -149,9 +149,9 @@ def quick_certificates(
         verdict = "safe@0.01" if rate.high < p else "unsafe" if rate.low > p else "undecided"
         worst = {"x0": float(work["x0"][place])}
         found.append(
-            Judged(
+            PolicySafety(
                 failures, samples, rate.estimate, rate.low, rate.high,
                 float(work["worst"][place]), worst, verdict,
             )
         )  # fmt: skip
-    return Judgement(None, found)
+    return SafetyReport(None, found)

@@ -6,6 +6,8 @@ import numpy as np
 import verifai_jax as vj
 from verifai_jax.rl import Discrete, Policy
 from verifai_jax.sweeps.record import Curve, SweepRecord
+from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.trainer import Trainer
 
 SPACE = vj.FeatureSpace(
     {
@@ -18,8 +20,25 @@ SPACE = vj.FeatureSpace(
 P = 0.01
 
 
-class ToyStudy:
+class ToyTrainer(Trainer):
+    """A trainer whose algorithms have all hyper-parameters."""
+
+    by_name = {"ppo": None, "sac": None}  # noqa: RUF012
+
+    def __init__(self):
+        pass
+
+    def used_hyperparameters(self, values):
+        return tuple(values)
+
+
+class ToyStudy(Study):
     """As much of a study as a result needs."""
+
+    def __init__(self):
+        pass
+
+    trainer = ToyTrainer()
 
     name = "toy"
     space = SPACE

@@ -6,7 +6,7 @@ import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
 import verifai_jax as vj
-from verifai_jax.sweeps.fanova import Boxes, boxes_of, variance_shares
+from verifai_jax.sweeps.fanova import Boxes, leaf_boxes, variance_shares
 from verifai_jax.sweeps.importance import hyperparameter_importance
 from verifai_jax.sweeps.trends import trends
 
@@ -22,7 +22,7 @@ SPACE = vj.FeatureSpace(
 
 
 def made(configurations, failing, returns, seed=0, snapshots=(1000,)):
-    """A table of configurations drawn from `SPACE`, judged by functions of the unit coordinates."""
+    """A table of configurations drawn from `SPACE`, safety by functions of the unit coordinates."""
     rng = np.random.default_rng(seed)
     rows = []
     for number in range(configurations):
@@ -65,10 +65,10 @@ def test_what_was_planted_is_found(planted):
     failing = planted.table["failure_rate"].sort_values(ascending=False)
     assert list(failing.index[:2]) == ["learning_rate", "algorithm"]
     assert failing.iloc[2:].abs().max() < 0.05
-    assert planted.ranked[0] == "learning_rate"
+    assert planted.ranking[0] == "learning_rate"
     assert planted.table["nominal_return"].idxmax() == "discount"
-    assert planted.trusted("failure_rate")
-    assert planted.trusted("nominal_return")
+    assert planted.is_reliable("failure_rate")
+    assert planted.is_reliable("nominal_return")
     # 0.8^2 / 4 against 0.2^2 * 2 / 9: the learning rate has 95 % of the variance.
     assert planted.table.loc["learning_rate", "failure_rate_total"] == pytest.approx(0.95, abs=0.08)
     assert planted.table.loc["discount", "nominal_return_first"] > 0.9
@@ -113,9 +113,9 @@ def test_noise_is_not_explained():
     noise = np.random.default_rng(5)
     table = made(40, lambda u, steps: noise.random(), lambda u, steps: 500.0)
     found = hyperparameter_importance(table, list(SPACE.domains), SPACE)
-    assert not found.trusted("failure_rate")
+    assert not found.is_reliable("failure_rate")
     assert "failing: a model of these 40 configurations does not predict others" in str(found)
-    assert "alone none goes with it more than by chance" in str(found)
+    assert "no single one correlates with it beyond chance" in str(found)
     assert "return: it is 500 for every policy" in str(found)
 
 
@@ -126,7 +126,7 @@ def test_a_trend_shows_where_no_model_can_be_learned():
     assert found.scores["failure_rate"] < 0.4
     found.scores["failure_rate"] = 0.0
     assert found.table.loc["discount", "failure_rate_trend"] > found.chance["failure_rate"]
-    assert "where beyond chance: discount (+0." in str(found)
+    assert "rank correlations beyond chance: discount (+0." in str(found)
     assert found.table.loc["learning_rate", "nominal_return_trend"] == pytest.approx(-1.0)
     assert np.isnan(found.table.loc["algorithm", "nominal_return_trend"])
 
@@ -200,7 +200,7 @@ def test_shares_are_those_of_a_sum_over_all_cells():
     x = rng.random((60, 3))
     y = np.sin(4 * x[:, 0]) * x[:, 1] + 0.5 * (x[:, 2] > 0.5)
     forest = ExtraTreesRegressor(n_estimators=3, max_leaf_nodes=12, random_state=0).fit(x, y)
-    shares = variance_shares(boxes_of(forest, [None] * 3))
+    shares = variance_shares(leaf_boxes(forest, [None] * 3))
     first, total, variance = on_grid(forest, 3)
     # scikit-learn rounds the inputs to float32, which moves no cell's middle across a cut.
     assert shares.first == pytest.approx(first, abs=1e-9)
@@ -227,5 +227,5 @@ def test_a_constant_has_no_shares():
 def test_cuts_between_cells_move_to_their_edges():
     x = np.array([[0.1]] * 5 + [[0.6]] * 5)  # Middles of cells [0, 0.2] and [0.2, 1].
     forest = ExtraTreesRegressor(n_estimators=1, random_state=0).fit(x, x[:, 0] > 0.5)
-    boxes = boxes_of(forest, [np.array([0.0, 0.2, 1.0])])
+    boxes = leaf_boxes(forest, [np.array([0.0, 0.2, 1.0])])
     assert variance_shares(boxes).variance == pytest.approx(0.2 * 0.8)

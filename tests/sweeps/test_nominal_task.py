@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from checked_types import unchecked
 from drifting import Drift, Point, closed_loop
 
 from envs.cartpole import CartPoleTask
@@ -30,5 +31,8 @@ def test_the_nominal_task_is_measured_on():
 def test_it_has_the_same_actions_and_observations():
     with pytest.raises(StudyError, match="nominal must have the actions and observations of task"):
         Trainer(Point(), Drift(), nominal=CartPoleTask())
-    with pytest.raises(StudyError, match=r"nominal must have action, time_limit, .* int lacks"):
+    with (
+        unchecked(),
+        pytest.raises(StudyError, match=r"nominal must have action, time_limit, .* int lacks"),
+    ):
         Trainer(Point(), Drift(), nominal=3)  # pyright: ignore[reportArgumentType]

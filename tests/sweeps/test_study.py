@@ -2,14 +2,16 @@
 
 import numpy as np
 import pytest
+from checked_types import unchecked
 from drifting import Drift, Picks, Point, closed_loop, drifting
 
 import verifai_jax as vj
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.features import Constant, FeatureSpace
 from verifai_jax.rl import PPO
+from verifai_jax.sweeps.hyperparameters import values_at
 from verifai_jax.sweeps.study import Study
-from verifai_jax.sweeps.trainer import StudyError, Trainer, labelled
+from verifai_jax.sweeps.trainer import StudyError, Trainer
 
 TWO = {"drift": Drift(), "ppo": PPO(hidden=(8, 8))}
 
@@ -31,7 +33,7 @@ def test_values_become_a_training():
     assert (made.steps, made.seed) == (320, 7)
     assert type(made.task.reward_scale) is float
     assert trainer.configuration({"algorithm": "drift", "rate": 0.5}).steps == 640
-    assert set(trainer.uses({"algorithm": "drift", "rate": 1.0, "clip": 0.1})) == {
+    assert set(trainer.used_hyperparameters({"algorithm": "drift", "rate": 1.0, "clip": 0.1})) == {
         "algorithm",
         "rate",
     }
@@ -49,14 +51,14 @@ def test_points_become_plain_values():
         }
     )
     points = np.array([[0.1, 0.1, 0.1, 0.1, 0.25], [0.9, 0.9, 0.9, 0.9, 0.1]])
-    first, second = labelled(space, points)
+    first, second = values_at(space, points)
     assert first == {
         "algorithm": "drift", "rate": 0.1, "normalise": True, "environments": 2, "noise": 0.25,
         "steps": 64,
     }  # fmt: skip
     assert second["noise"] == float(np.float32(0.1))
     assert [type(first[name]) for name in first] == [str, float, bool, int, float, int]
-    many = labelled(space, np.tile(points, (40, 1)))
+    many = values_at(space, np.tile(points, (40, 1)))
     assert len(many) == 80
     assert many[2:4] == [first, second]
 
@@ -145,7 +147,7 @@ def test_parts_of_a_wrong_kind():
         (lambda: Trainer(3, PPO()), "int lacks action"),
         (lambda: Trainer(Point(), PPO(), steps=0), "steps must be at least 1"),
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             wrong()
 
 

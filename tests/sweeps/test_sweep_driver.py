@@ -5,6 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from checked_types import unchecked
 from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
@@ -12,12 +13,12 @@ from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import evaluate, train
 from verifai_jax.rl._evaluate import mean_returns
 from verifai_jax.sweeps import _sweep as driver
-from verifai_jax.sweeps import training_runs as lessons
+from verifai_jax.sweeps import training_runs
 from verifai_jax.sweeps._sweep import sweep
-from verifai_jax.sweeps.cache import Store, StoreError
+from verifai_jax.sweeps.cache import Cache, CacheError
 from verifai_jax.sweeps.halving import Halving
 from verifai_jax.sweeps.optuna import OptunaSampler
-from verifai_jax.sweeps.proposers import WORST, CubeAsker, badness
+from verifai_jax.sweeps.proposers import WORST, SearchProposer, objective
 from verifai_jax.sweeps.record import AFTER, BEFORE
 from verifai_jax.sweeps.trainer import StudyError
 
@@ -181,14 +182,14 @@ def test_configurations_are_distinct():
     assert not found.table[["rate", "noise"]].duplicated().any()
 
 
-class Stopped(Store):
+class Stopped(Cache):
     """Interrupted as soon as so many pieces of work are finished."""
 
     after = 10**9
 
     def put(self, work):
         super().put(work)
-        if self.made >= self.after:
+        if self.computed >= self.after:
             raise KeyboardInterrupt
 
 
@@ -203,43 +204,43 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_path):
     study, how = drifting(), {"samples": 64, **CASES[case]}
-    through = sweep(study, store=tmp_path / "through", **how)
-    with Store(tmp_path / "through") as kept:
+    through = sweep(study, folder=tmp_path / "through", **how)
+    with Cache(tmp_path / "through") as kept:
         pieces = len(kept.names())
-    monkeypatch.setattr(driver, "Store", Stopped)
+    monkeypatch.setattr(driver, "Cache", Stopped)
     for after in (1, pieces // 2, pieces - 2):
         monkeypatch.setattr(Stopped, "after", after)
-        some = sweep(study, store=tmp_path / str(after), **how)
+        some = sweep(study, folder=tmp_path / str(after), **how)
         assert not some.record.complete
         assert len(some.table) <= len(through.table)
         monkeypatch.setattr(Stopped, "after", 10**9)
-        again = sweep(study, store=tmp_path / str(after), **how)
+        again = sweep(study, folder=tmp_path / str(after), **how)
         assert again.record.complete
         same_tables(again, through)
     # Nothing is trained again: all is remembered, with the seconds that it took.
-    monkeypatch.setattr(lessons.BatchedTraining, "advance", None)
-    same_tables(sweep(study, store=tmp_path / "through", **how), through, but=())
+    monkeypatch.setattr(training_runs.BatchedTraining, "advance", None)
+    same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())
 
 
 def test_a_store_of_another_sweep_says_what_differs(tmp_path):
-    sweep(drifting(), configurations=2, samples=8, store=tmp_path)
+    sweep(drifting(), configurations=2, samples=8, folder=tmp_path)
     for other, how, told in (
-        (drifting(), {"samples": 16}, "options.samples is 16, in the store 8"),
-        (drifting(), {"search": "sobol"}, "options.search.name is sobol, in the store halton"),
-        (drifting(steps=256), {}, "steps is 256, in the store 128"),
+        (drifting(), {"samples": 16}, "options.samples is 16, in the cache 8"),
+        (drifting(), {"search": "sobol"}, "options.search.name is sobol, in the cache halton"),
+        (drifting(steps=256), {}, "steps is 256, in the cache 128"),
         (
             drifting(algorithms=Drift(noise=0.5)), {},
-            "algorithms.drift.noise is 0.5, in the store 0.01",
+            "algorithms.drift.noise is 0.5, in the cache 0.01",
         ),
         (
             drifting({"rate": vj.Box(0.1, 0.3)}), {},
-            r"space.rate is Box\(0.1, 0.3\), in the store LogUniform\(0.01, 1\)",
+            r"space.rate is Box\(0.1, 0.3\), in the cache LogUniform\(0.01, 1\)",
         ),
     ):  # fmt: skip
-        with pytest.raises(StoreError, match=f"holds a different sweep: {told}"):
-            sweep(other, **{"configurations": 2, "samples": 8, **how}, store=tmp_path)
+        with pytest.raises(CacheError, match=f"holds a different sweep: {told}"):
+            sweep(other, **{"configurations": 2, "samples": 8, **how}, folder=tmp_path)
     # More of the same is the same sweep.
-    more = sweep(drifting(), configurations=3, samples=8, store=tmp_path)
+    more = sweep(drifting(), configurations=3, samples=8, folder=tmp_path)
     same_tables(more, sweep(drifting(), configurations=3, samples=8))
 
 
@@ -266,13 +267,13 @@ def test_halving_keeps_the_best_by_return():
 def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
     told = []
 
-    tell = CubeAsker.tell
+    observe = SearchProposer.observe
 
-    def record(self, badness):
-        told.extend(badness)
-        return tell(self, badness)
+    def record(self, objectives):
+        told.extend(objectives)
+        return observe(self, objectives)
 
-    monkeypatch.setattr(CubeAsker, "tell", record)
+    monkeypatch.setattr(SearchProposer, "observe", record)
     space = {"rate": vj.Box(0.01, 0.45), "limit": vj.Categorical(0.5, 100.0)}
     found = sweep(drifting(space), search="mutation", configurations=8, batch=4, samples=64)
     last = found.table[found.table["steps"] == 128]
@@ -288,19 +289,19 @@ def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
     assert max(finite) < WORST
 
 
-def test_badness_is_failures_first_then_robustness_then_return():
+def test_the_objective_is_failures_first_then_robustness_then_return():
     ordered = [
-        badness(0.0, 0.5, 9.0, (0.0, 10.0)),
-        badness(0.0, 0.5, 1.0, (0.0, 10.0)),
-        badness(0.0, 0.1, 9.0, (0.0, 10.0)),
-        badness(0.0, -2.0, 9.0, (0.0, 10.0)),
-        badness(0.2, -2.0, 9.0, (0.0, 10.0)),
-        badness(1.0, -1e30, 0.0, (0.0, 10.0)),
+        objective(0.0, 0.5, 9.0, (0.0, 10.0)),
+        objective(0.0, 0.5, 1.0, (0.0, 10.0)),
+        objective(0.0, 0.1, 9.0, (0.0, 10.0)),
+        objective(0.0, -2.0, 9.0, (0.0, 10.0)),
+        objective(0.2, -2.0, 9.0, (0.0, 10.0)),
+        objective(1.0, -1e30, 0.0, (0.0, 10.0)),
     ]
     assert ordered == sorted(ordered)
     assert len(set(ordered)) == 6
     assert ordered[-1] < WORST
-    assert badness(float("nan"), 0.0, 0.0, (0.0, 1.0)) is None
+    assert objective(float("nan"), 0.0, 0.0, (0.0, 1.0)) is None
 
 
 def test_optuna_proposes_and_is_told(tmp_path):
@@ -313,13 +314,13 @@ def test_optuna_proposes_and_is_told(tmp_path):
     }
     study = drifting(space, snapshots=())
     how = {"configurations": 14, "batch": 3, "samples": 16}
-    one = sweep(study, search="optuna:tpe", store=tmp_path, **how)
+    one = sweep(study, search="optuna:tpe", folder=tmp_path, **how)
     assert len(one.table) == 14
     assert one.table["limit"].isin(range(50, 61)).all()
     assert set(one.table["reward_scale"]) == {1.0, 2.0}
     assert one.table["rate"].between(0.01, 1.0).all()
     assert one.table["noise"].between(0.0, 0.1).all()
-    same_tables(sweep(study, search=OptunaSampler("tpe"), store=tmp_path, **how), one, but=())
+    same_tables(sweep(study, search=OptunaSampler("tpe"), folder=tmp_path, **how), one, but=())
     same_tables(sweep(study, search=OptunaSampler("tpe"), **how), one)
     with pytest.raises(UnknownNameError, match="unknown sampler of Optuna 'tp'; did you mean"):
         sweep(study, search="optuna:tp")
@@ -362,7 +363,7 @@ def test_a_budget_is_for_all_policies():
 
 
 def test_options_are_refused_first(monkeypatch):
-    monkeypatch.setattr(driver, "Lessons", None)
+    monkeypatch.setattr(driver, "TrainingRuns", None)
     for how, error, told in (
         ({"configurations": 0}, ValueError, "configurations must be an integer of at least 1"),
         ({"confidence": 1.0}, ValueError, "confidence must lie between 0 and 1"),
@@ -376,9 +377,9 @@ def test_options_are_refused_first(monkeypatch):
         ({"attack": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
         ({"attack": "gradient"}, ValueError, "follows gradients"),
     ):
-        with pytest.raises(error, match=told):
+        with unchecked(), pytest.raises(error, match=told):
             sweep(drifting(), **how)
-    with pytest.raises(TypeError, match="sweep needs a Study"):
+    with unchecked(), pytest.raises(TypeError, match="sweep needs a Study"):
         sweep(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(StudyError, match="the study has none before the end at 128 steps"):
         sweep(drifting(snapshots=()), halving=Halving())

@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from planted_sweep import SPACE, ToyStudy, curve_to, planted_rows, record_of
+from checked_types import unchecked
+from planted_sweep import SPACE, ToyStudy, ToyTrainer, curve_to, planted_rows, record_of
 
 import verifai_jax as vj
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import load_policy
 from verifai_jax.statistics.pareto import fronts
 from verifai_jax.sweeps.record import AFTER, BEFORE
-from verifai_jax.sweeps.result import Sweep
-from verifai_jax.sweeps.storage import SweepFileError, load_sweep
-from verifai_jax.sweeps.summary import lead, values_of
+from verifai_jax.sweeps.result import Sweep, load_sweep
+from verifai_jax.sweeps.storage import FORMAT, SweepFileError
+from verifai_jax.sweeps.summary import format_hyperparameters
 
 NOT_TRAINED = {
     "nominal_return": np.nan,
@@ -126,38 +127,38 @@ def test_a_seed_that_did_not_train_leaves_a_configuration_undecided():
 
 def test_the_lead_counts_the_safe_among_those_with_full_return(small, large):
     # Means 99, 99.6, 50 and 99.9: with a span of 49.9 full is 99.4 and more.
-    assert lead(small) == (
+    assert small.headline == (
         "5 configurations; 2 reach full return (at least 99.4), and 0 of those 2 are certified "
         "safe (failure probability below 1 %)"
     )
     groups = large.configurations
     full = groups.loc[groups["nominal_return"] >= 500 - 0.01 * np.ptp(groups["nominal_return"])]
     safe = int((full["verdict"] == "safe@0.01").sum())
-    assert f"{len(full)} reach full return" in lead(large)
-    assert f"{safe} of those {len(full)} are certified safe" in lead(large)
+    assert f"{len(full)} reach full return" in large.headline
+    assert f"{safe} of those {len(full)} are certified safe" in large.headline
     one = Sweep(record_of([ROWS[0]]), ToyStudy())
-    assert "1 reaches full return (at least 100), and it is certified safe" in lead(one)
+    assert "1 reaches full return (at least 100), and it is certified safe" in one.headline
 
 
-class ToyTrainer:
-    """PPO has no `discount`; a hyper-parameter that an algorithm lacks is not used by it."""
+class Particular(ToyTrainer):
+    """PPO has no `discount`; an algorithm does not use a hyper-parameter that it lacks."""
 
-    by_name = ("ppo", "sac")
-
-    @staticmethod
-    def uses(values):
+    def used_hyperparameters(self, values):
         return tuple(n for n in values if values["algorithm"] != "ppo" or n != "discount")
 
 
+def changed_study(**changes):
+    """A study like the toy, with other attributes."""
+    return type("Changed", (ToyStudy,), changes)()
+
+
 def test_what_an_algorithm_lacks_is_not_told_of_it(tmp_path):
-    study = ToyStudy()
-    study.trainer = ToyTrainer()
-    sweep = Sweep(record_of(planted_rows(40)), study)
+    sweep = Sweep(record_of(planted_rows(40)), changed_study(trainer=Particular()))
     assert sweep.used["ppo"] == ("learning_rate", "width", "algorithm")
     ppo = sweep.table.index[sweep.table["algorithm"] == "ppo"][0]
     sac = sweep.table.index[sweep.table["algorithm"] == "sac"][0]
-    assert "discount" not in values_of(sweep, sweep.table.loc[ppo])
-    assert "discount" in values_of(sweep, sweep.table.loc[sac])
+    assert "discount" not in format_hyperparameters(sweep.findings, dict(sweep.table.loc[ppo]))
+    assert "discount" in format_hyperparameters(sweep.findings, dict(sweep.table.loc[sac]))
     assert load_sweep(sweep.save(tmp_path)).used == sweep.used
 
 
@@ -213,7 +214,10 @@ def test_rows_that_are_not_there_say_so(small):
         small.policy(11)
     with pytest.raises(ValueError, match="row 10 has no policy: error: clip must be positive"):
         small.problem(10)
-    with pytest.raises(TypeError, match="a row is named by its number in the table; got '3'"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match="a row is named by its number in the table; got '3'"),
+    ):
         small.policy("3")
 
 
@@ -318,11 +322,11 @@ def test_loaded_without_its_study_everything_but_simulations_works(small, tmp_pa
     assert loaded.best.name == 0
     assert int(loaded.policy(2).act(jnp.array([0.8]))) == 1
     assert len(loaded.counterexamples(2)) == 1
-    with pytest.raises(ValueError, match=r"without its study.*load_sweep\(path, study\)"):
+    with pytest.raises(ValueError, match=r"without its study.*load_sweep\(folder, study\)"):
         loaded.problem(2)
     named = replace(small.record, options={**small.record.options, "target": "specs/toy.py:toy"})
     loaded = load_sweep(Sweep(named).save(tmp_path))
-    with pytest.raises(ValueError, match=r"give it: load_sweep\(path, 'specs/toy.py:toy'\)"):
+    with pytest.raises(ValueError, match=r"give it: load_sweep\(folder, 'specs/toy.py:toy'\)"):
         loaded.problem(2)
     with pytest.raises(ValueError, match=r"no file specs/toy.py"):
         load_sweep(tmp_path, "specs/toy.py:toy")
@@ -332,17 +336,18 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no sweep in .*sweep.json is missing"):
         load_sweep(tmp_path)
     folder = small.save(tmp_path / "mine")
-    other = ToyStudy()
-    other.name = "tony"
+    other = changed_study(name="tony")
     with pytest.raises(SweepFileError, match="its name is 'toy', the given one's 'tony'"):
         load_sweep(folder, other)
-    other = ToyStudy()
-    other.space = vj.FeatureSpace({"clip": vj.Box(0, 1)})
+    other = changed_study(space=vj.FeatureSpace({"clip": vj.Box(0, 1)}))
     with pytest.raises(SweepFileError, match=r"its hyper-parameters is .*'clip'"):
         load_sweep(folder, other)
     data = json.loads((folder / "sweep.json").read_text())
     (folder / "sweep.json").write_text(json.dumps({**data, "format": 7}))
-    with pytest.raises(SweepFileError, match="has format 7; this version reads 1"):
+    with pytest.raises(SweepFileError, match=rf"has format 7, .* format {FORMAT}; read it with"):
+        load_sweep(folder)
+    (folder / "sweep.json").write_text(json.dumps({**data, "format": FORMAT - 1}))
+    with pytest.raises(SweepFileError, match=f"has format {FORMAT - 1}"):
         load_sweep(folder)
     (folder / "sweep.json").write_text("{")
     with pytest.raises(SweepFileError, match=r"sweep.json is damaged"):
@@ -356,17 +361,17 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
 def test_the_picture_is_written(small, tmp_path):
     figure = small.plot(tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
-    # Too few configurations for a panel of what matters.
-    assert [axes.get_title() for axes in figure.axes] == ["Return is not safety", "How they learnt"]
-    labels = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert "safe (3)" in labels
-    assert "safe, earlier snapshot (1)" in labels
-    assert "wanted: below 1 %" in labels
+    # Too few configurations for a panel of importance.
+    assert [axes.get_title() for axes in figure.axes] == ["Return is not safety", "Learning curves"]
+    values_of_features = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert "safe (3)" in values_of_features
+    assert "safe, earlier snapshot (1)" in values_of_features
+    assert "wanted: below 1 %" in values_of_features
 
 
 def test_a_large_sweep_shows_what_matters(large):
     figure = large.plot()
-    assert figure.axes[2].get_title() == "What matters"
+    assert figure.axes[2].get_title() == "Importance"
     assert {text.get_text() for text in figure.axes[2].get_yticklabels()} >= {"learning_rate"}
 
 

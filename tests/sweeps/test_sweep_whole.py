@@ -24,7 +24,7 @@ def test_a_whole_sweep(tmp_path):
         snapshots=(64,),
         curve="eventually return >= 15",
     )
-    found = vj.sweep(study, configurations=5, samples=64, store=tmp_path)
+    found = vj.sweep(study, configurations=5, samples=64, folder=tmp_path)
     again = vj.sweep(study, configurations=5, samples=64)
     assert found.table.drop(columns="training_seconds").equals(
         again.table.drop(columns="training_seconds")

@@ -1,9 +1,13 @@
-"""A sweep as a picture: return against safety, learning curves, and what matters."""
+"""The picture of a sweep: return against safety, learning curves, importance."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from verifai_jax.core.text import format_percent, shorten
 from verifai_jax.plotting.style import (
@@ -16,46 +20,79 @@ from verifai_jax.plotting.style import (
     tidy,
 )
 from verifai_jax.sweeps.importance import HyperparameterImportance
-from verifai_jax.sweeps.ranking import chosen_first, is_safe, last_snapshots, least_full_return
-from verifai_jax.sweeps.summary import failures, lead
+from verifai_jax.sweeps.ranking import (
+    full_return_threshold,
+    is_safe,
+    last_snapshots,
+    preference_order,
+)
+from verifai_jax.sweeps.result import Sweep
+from verifai_jax.sweeps.summary import format_failures
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.sweeps.result import Sweep
-
 LOOKS = {"safe": (SAFE, "o"), "undecided": (WITHOUT_VERDICT, "D"), "unsafe": (FAILING, "X")}
 """Colour and marker of each verdict."""
 RETURN = "#31688e"
+"""Colour of the return."""
 BARS = {"failure_rate": (FAILING, "failing", ""), "nominal_return": (RETURN, "return", "//")}
-"""Colour, name and hatching of what depends on hyper-parameters."""
+"""Colour, name and hatching of the targets of an importance."""
 MOST_BARS = 8
+"""Hyper-parameters in a panel, at most."""
 
 
-def plot_sweep(sweep: "Sweep", path: str | Path | None = None) -> Any:
-    """Draw the three panels; the second and third only where there is something to show."""
-    curves = _worth_drawing(sweep)
+def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
+    """Draw safety, learning curves and importance; the last two where there is any to show.
+
+    **Arguments:**
+
+    - `sweep`: the result of a sweep.
+    - `path`: file that the picture is written to, if given.
+
+    **Returns:** the figure.
+    """
+    curves = _curve_rows(sweep)
     importance = sweep.importance()
     bars = bool(importance.scores)
     widths = [1.5] + [1.0] * bool(curves) + [0.95] * bars
     figure = new_figure(figsize=(4.2 * sum(widths) - 0.8 * (len(widths) == 3), 4.9))
     panels = list(np.ravel(figure.subplots(1, len(widths), width_ratios=widths)))
-    draw_safety(panels.pop(0), sweep)
+    _draw_safety(panels.pop(0), sweep)
     if curves:
-        draw_curves(panels.pop(0), sweep, curves)
+        _draw_curves(panels.pop(0), sweep, curves)
     if bars:
-        trusted = any(importance.trusted(target) for target in importance.scores)
-        (draw_importance if trusted else draw_trends)(panels.pop(0), importance)
-    title = f"{shorten(sweep.name, 40)}: {lead(sweep)}"
+        _draw_importance(panels.pop(0), importance)
+    title = f"{shorten(sweep.name, 40)}: {sweep.headline}"
     if len(title) > 10 * figure.get_figwidth():
         title = title.replace("; ", "\n", 1)
     figure.suptitle(title, fontsize=11)
     return show_or_save(figure, path)
 
 
-def draw_safety(axes: Any, sweep: "Sweep") -> None:
-    """Each policy by its nominal return and its failure probability, with the interval."""
-    table = sweep.table.iloc[chosen_first(sweep.table)]
+def plot_importance(importance: HyperparameterImportance, path: str | Path | None = None) -> Figure:
+    """Draw the shares of the variance, or the trends where no model is reliable.
+
+    **Arguments:**
+
+    - `importance`: of hyper-parameters.
+    - `path`: file that the picture is written to, if given.
+
+    **Returns:** the figure.
+    """
+    figure = new_figure(figsize=(6.4, 1.6 + 0.42 * len(importance.table)))
+    _draw_importance(figure.subplots(), importance)
+    return show_or_save(figure, path)
+
+
+def _draw_importance(axes: Axes, importance: HyperparameterImportance) -> None:
+    reliable = any(importance.is_reliable(target) for target in importance.scores)
+    (_draw_shares if reliable else _draw_trends)(axes, importance)
+
+
+def _draw_safety(axes: Axes, sweep: Sweep) -> None:
+    """Draw each policy by its nominal return and its failure probability, with the interval."""
+    table = sweep.table.iloc[preference_order(sweep.table)]
     table = table.loc[np.isfinite(table["nominal_return"].to_numpy(np.float64))]
     if not len(table):
         axes.text(0.5, 0.5, "no policy was certified", ha="center", transform=axes.transAxes)
@@ -112,7 +149,7 @@ def draw_safety(axes: Any, sweep: "Sweep") -> None:
     _legend_below(axes, 3)
 
 
-def _draw_intervals(axes: Any, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
+def _draw_intervals(axes: Axes, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
     rate = rows["failure_rate"]
     axes.errorbar(
         rows["nominal_return"],
@@ -126,8 +163,8 @@ def _draw_intervals(axes: Any, rows: "pd.DataFrame", colour: str, alpha: float) 
     )
 
 
-def _legend_below(axes: Any, columns: int) -> None:
-    """Where it hides nothing."""
+def _legend_below(axes: Axes, columns: int) -> None:
+    """Put the legend below the panel, where it hides nothing."""
     axes.legend(
         frameon=False,
         fontsize=8,
@@ -140,14 +177,14 @@ def _legend_below(axes: Any, columns: int) -> None:
 
 
 def _least_shown(table: "pd.DataFrame", wanted: float | None) -> float:
-    """The power of ten below which the axis is linear: the least rate of any lies above it."""
+    """Return the power of ten below which the axis is linear, less than every positive rate."""
     rates = table["failure_rate"].to_numpy(np.float64)
     least = min([*rates[rates > 0], 0.01 if wanted is None else wanted])
     return float(10.0 ** np.floor(np.log10(least)))
 
 
 def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
-    """The rows, points that would hide each other at no failure shifted a little to the side."""
+    """Shift points that would hide each other a little to the side."""
     shown = table.copy()
     shown["nominal_return"] = shown["nominal_return"].astype(float)
     span = float(np.ptp(shown["nominal_return"])) or 1.0
@@ -156,40 +193,41 @@ def _spread(table: "pd.DataFrame", least: float) -> "pd.DataFrame":
         np.round(np.log10(np.maximum(shown["failure_rate"].to_numpy(float), least / 3)) * 8),
         strict=True,
     ))  # fmt: skip
-    seen: dict[Any, int] = {}
+    counts: dict[tuple[float, float], int] = {}
     for i, place in zip(shown.index, cell, strict=True):
-        turn = seen.get(place, 0)
-        seen[place] = turn + 1
+        turn = counts.get(place, 0)
+        counts[place] = turn + 1
         side = (turn + 1) // 2 * (-1 if turn % 2 else 1)
         shown.loc[i, "nominal_return"] += np.clip(side, -4, 4) * span / 200
     return shown
 
 
-def _worth_drawing(sweep: "Sweep") -> list[int]:
-    """The best row, and a policy with a high return that is unsafe, if there is one."""
+def _curve_rows(sweep: Sweep) -> list[int]:
+    """Choose the best row, and a policy with a high return that is unsafe, if there is one."""
     table = sweep.table
-    if not len(order := chosen_first(table)):
+    if not len(order := preference_order(table)):
         return []
     rows = [int(table.index[order[0]])]
     others = last_snapshots(table)
-    others = others.loc[~_same_training(others, table.loc[rows[0]])]
+    others = others.loc[~_same_training(others, table.loc[rows[0]].to_dict())]
     unsafe = others.loc[others["verdict"] == "unsafe"]
-    unsafe = unsafe.loc[unsafe["nominal_return"] >= least_full_return(table)]
+    unsafe = unsafe.loc[unsafe["nominal_return"] >= full_return_threshold(table)]
     if len(unsafe):
         rows.append(int(unsafe["failure_rate"].idxmax()))  # pyright: ignore[reportArgumentType]
-    return [row for row in rows if np.isfinite(sweep._points(row)[1]).any()]
+    return [row for row in rows if np.isfinite(sweep.curve_points(row)[1]).any()]
 
 
-def _same_training(table: "pd.DataFrame", row: Any) -> Any:
-    """Which rows are snapshots of the training that a row is of."""
-    return (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+def _same_training(table: "pd.DataFrame", row: Mapping[str, Any]) -> Bool[np.ndarray, " rows"]:
+    """Return True for the snapshots of the training of a row."""
+    same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+    return np.asarray(same)
 
 
-def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
-    """The learning curves of some rows over environment steps; the whole training of each."""
+def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
+    """Draw the learning curves of the whole trainings of some rows, over environment steps."""
     last = last_snapshots(sweep.table)
     for row in rows:
-        entry: Any = sweep.table.loc[row]
+        entry: Any = sweep.table.loc[row].to_dict()
         verdict = str(entry["verdict"])
         colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
         end = int(last.index[_same_training(last, entry)][0])
@@ -219,21 +257,22 @@ def draw_curves(axes: Any, sweep: "Sweep", rows: list[int]) -> None:
             )
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")
-    axes.set_title("How they learnt", fontsize=10)
+    axes.set_title("Learning curves", fontsize=10)
     tidy(axes)
     _legend_below(axes, 1)
 
 
-def _failures(row: Any) -> str:
+def _failures(row: Mapping[str, Any]) -> str:
     if row["simulations"] > 0:
-        return failures(row)
+        return format_failures(row)
     return f"fails in {format_percent(row['failure_rate'])}"
 
 
-def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
-    """The share of the variance of failing and of the return that each hyper-parameter explains."""
-    targets = [target for target in found.scores if found.trusted(target)] or list(found.scores)
-    shown = found.table.head(MOST_BARS)
+def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
+    """Draw the share of the variance that each hyper-parameter explains."""
+    targets = [target for target in importance.scores if importance.is_reliable(target)]
+    targets = targets or list(importance.scores)
+    shown = importance.table.head(MOST_BARS)
     height, place = 0.76 / len(targets), np.arange(len(shown))
     for k, target in enumerate(targets):
         colour, what, hatch = BARS[target]
@@ -246,7 +285,7 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
             hatch=hatch,
             edgecolor="white",
             linewidth=0,
-            label=f"{what} (model: R² {found.scores[target]:.2f})",
+            label=f"{what} (model: R² {importance.scores[target]:.2f})",
         )
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
@@ -255,29 +294,29 @@ def draw_importance(axes: Any, found: HyperparameterImportance) -> None:
             at + 0.45 * height,
             color=BOUND,
             linewidth=1.6,
-            label="without interactions" if k == len(targets) - 1 else None,
+            label="without interactions" if k == len(targets) - 1 else "",
         )
     axes.set_yticks(place, [shorten(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
     axes.set_xlabel("share of the variance, with interactions")
-    axes.set_title("What matters", fontsize=10)
+    axes.set_title("Importance", fontsize=10)
     tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 1)
 
 
-def draw_trends(axes: Any, found: HyperparameterImportance) -> None:
-    """Rank correlations of single hyper-parameters, and how great they get by chance."""
-    names = [f"{target}_trend" for target in found.scores]
-    shown = found.table.loc[found.table[names].notna().any(axis=1)]
+def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
+    """Draw rank correlations of single hyper-parameters, and their range by chance."""
+    names = [f"{target}_trend" for target in importance.scores]
+    shown = importance.table.loc[importance.table[names].notna().any(axis=1)]
     order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
     shown = shown.loc[order[:MOST_BARS]]
     height, place = 0.76 / len(names), np.arange(len(shown))
-    chance = max(found.chance.values())
+    chance = max(importance.chance.values())
     axes.axvspan(-chance, chance, color=WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance")
-    for k, target in enumerate(found.scores):
+    for k, target in enumerate(importance.scores):
         colour, what, hatch = BARS[target]
         axes.barh(
             place + (k - (len(names) - 1) / 2) * height,
@@ -294,7 +333,7 @@ def draw_trends(axes: Any, found: HyperparameterImportance) -> None:
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")
-    axes.set_title("What goes along (no model predicts)", fontsize=10)
+    axes.set_title("Correlations (no model predicts)", fontsize=10)
     tidy(axes)
     axes.grid(visible=False, axis="y")
     _legend_below(axes, 3)

@@ -1,11 +1,11 @@
-"""Train many configurations and rank what they learn by its safety.
+"""Sweeps: train many configurations and rank the policies by their certified safety.
 
-    found = sweep(study, search="halton", configurations=32)
-    found = sweep(study, search="bayes", configurations=64, store="sweeps/mine")   # resumable
+    result = sweep(study, search="halton", configurations=32)
+    result = sweep(study, search="bayes", configurations=64, folder="sweeps/mine")  # resumable
 
-A sweep is a deterministic function of pieces of work that are remembered one by one: a training up
-to a snapshot, the return of a policy, a part of a certification. Killed at any moment and called
-again with the same store, it finds what was finished, computes the rest, and gives the same table.
+A sweep is a deterministic function of computations that are cached one by one: a training up to a
+snapshot, the return of a policy, a part of a certification. Killed at any moment and called again
+with the same folder, it reads the finished ones, computes the rest, and gives the same table.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,32 +17,38 @@ import numpy as np
 
 from verifai_jax._version import __version__
 from verifai_jax.certification.attack import usable_search
+from verifai_jax.certification.result import Certificates
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
+from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.cache import Store
-from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, OutOfTime, Watch
-from verifai_jax.sweeps.fingerprint import describe
+from verifai_jax.sweeps.cache import Arrays, Cache
+from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
+from verifai_jax.sweeps.fingerprint import digest, fingerprint
 from verifai_jax.sweeps.halving import SAFETY, Halving
-from verifai_jax.sweeps.proposers import WORST, Asker, Values, asker_for, badness
+from verifai_jax.sweeps.hyperparameters import Hyperparameters
+from verifai_jax.sweeps.optuna import OptunaSampler
+from verifai_jax.sweeps.proposers import WORST, Proposer, make_proposer, objective
 from verifai_jax.sweeps.record import NONFINITE, STOPPED, TRAINED, SweepRecord
 from verifai_jax.sweeps.result import Sweep
-from verifai_jax.sweeps.rows import Row, tabulated
-from verifai_jax.sweeps.safety import QUICK, Judged, Judgement, certify_policies
+from verifai_jax.sweeps.rows import Row, tabulate
+from verifai_jax.sweeps.safety import SCREENING, PolicySafety, SafetyReport, certify_policies
 from verifai_jax.sweeps.study import Study
-from verifai_jax.sweeps.training_runs import Lessons, Reached, digest
-from verifai_jax.sweeps.validation import check_asked
+from verifai_jax.sweeps.training_runs import TrainingRuns
+from verifai_jax.sweeps.validation import check_options
 
-_BARREN = 64
-"""Rounds of a search without a new configuration, after which there are no more."""
+_MOST_BARREN = 64
+"""Rounds of a search without a new configuration before proposals end."""
 _FOR_TRAINING = 2 / 3
 """Share of `max_seconds` after which no training begins, so that there is time to certify."""
+_LAST = 10**9
+"""Number of a snapshot beyond the last one of every training."""
 
 
 @suggests_options
 def sweep(
     study: Study,
-    search: Any = "halton",
+    search: str | Search | OptunaSampler = "halton",
     configurations: int = 32,
     *,
     seed: int = 0,
@@ -54,42 +60,49 @@ def sweep(
     halving: Halving | None = None,
     batch: int | None = None,
     episodes: int = EPISODES,
-    store: str | Path | None = None,
+    folder: str | Path | None = None,
     max_seconds: float | None = None,
-    progress: bool | None = True,
+    progress: bool | None = None,
     note: Mapping[str, Any] | None = None,
 ) -> Sweep:
-    """Train configurations of a study's hyper-parameters and certify the policies they learn.
+    """Train configurations of a study's hyper-parameters and certify their policies.
 
     A row of the result is a policy: a configuration, trained with one seed, at one snapshot. The
-    same seed gives the same table on one machine. Interrupted (Ctrl-C), it returns what it has.
+    same seed gives the same table on one machine.
 
     **Arguments:**
 
-    - `study`: what to sweep.
+    - `study`: hyper-parameters, trainer and specification.
     - `search`: over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
-      `OptunaSampler`. One that learns goes in rounds and is told how often the policies fail, then
-      how nearly, then what they earn.
-    - `configurations`: how many, at most; each is trained once for each of the study's seeds.
+      `OptunaSampler`. One that learns proposes in rounds and minimises the failure rate, then the
+      worst robustness, then the return.
+    - `configurations`: number of configurations at most; each is trained once for each of the
+      study's seeds.
     - `seed`: of the search and of the samples; training seeds are the study's.
-    - `samples`, `confidence`, `budget`: of the certification: samples of each policy at least,
-      confidence of all verdicts together, and samples in all; see `certify`.
+    - `samples`: samples of each policy in its certification, at least.
+    - `confidence`: of all verdicts together, between 0 and 1.
+    - `budget`: samples of the certification in all; see `certify`.
     - `attack`, `attack_simulations`: the search that tries to make each policy fail first, and its
       simulations of each policy; the failures that it finds enter no rate.
-    - `halving`: stop all but the best at each snapshot.
+    - `halving`: stop all but the best configurations at each snapshot.
     - `batch`: configurations in a round of a search that learns.
-    - `episodes`: over which the nominal return is a mean.
-    - `store`: a folder or a `.sqlite` file that remembers finished work; with the store of the same
-      sweep it goes on.
-    - `max_seconds`: after two thirds of which no training begins, and after which nothing does.
-    - `progress`: False draws no bars.
-    - `note`: plain data that the store keeps beside the work.
+    - `episodes`: episodes whose mean is the nominal return.
+    - `folder`: a folder, or a `.sqlite` file, that caches finished work; the folder of an
+      interrupted sweep resumes it.
+    - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
+    - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
+      notebook.
+    - `note`: plain data that is stored in the folder beside the work.
 
-    **Raises:** before anything trains, what `Study.check` does; `ValueError` for options out of
-    range and for a search that needs gradients; `UnknownNameError` for an unknown search or option;
-    `StoreError` for a store that is damaged, foreign, or of another sweep.
+    **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
+    of time) returns its finished part; `record.complete` is False.
+
+    **Raises:** before anything trains, `StudyError` and `UnknownNameError` as `Study.check`;
+    `ValueError` for options out of range and for a search that needs gradients; `UnknownNameError`
+    for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another
+    format, or of another sweep.
     """
-    check_asked(
+    check_options(
         study,
         configurations=configurations,
         seed=seed,
@@ -104,9 +117,11 @@ def sweep(
     )
     study.check()
     usable_search(study.untrained_problem(), attack)
-    asker = asker_for(search, study.space, configurations=configurations, seed=seed, batch=batch)
-    options = {
-        "search": asker.described(),
+    proposer = make_proposer(
+        search, study.space, configurations=configurations, seed=seed, batch=batch
+    )
+    options: dict[str, Any] = {
+        "search": proposer.to_json(),
         "seed": seed,
         "samples": samples,
         "confidence": confidence,
@@ -116,317 +131,334 @@ def sweep(
         "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
         "episodes": episodes,
     }
-    if asker.learns:
-        # What it proposes depends on both.
-        options |= {"configurations": configurations, "batch": asker.batch}
-    with Store(store) as memory, Watch(study.name, max_seconds, progress) as watch:
-        memory.belongs(describe(study, options))
+    if proposer.learns:
+        # Its proposals depend on both.
+        options |= {"configurations": configurations, "batch": proposer.batch}
+    with Cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
+        cache.claim(fingerprint(study, options))
         if note is not None:
-            memory.note("command", dict(note))
+            cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
-        sweeping = _Sweeping(study, options, memory, watch, halving, attack)
-        return Sweep(sweeping.run(asker), study)
+        running = _RunningSweep(study, options, cache, clock, halving, attack)
+        return Sweep(running.run(proposer), study)
 
 
 @dataclass(eq=False)
 class _Configuration:
-    """One set of hyper-parameters: its trainings, and at which snapshot halving stopped it."""
+    """One configuration: values, training runs, and the snapshot at which halving stopped it."""
 
-    values: Values
-    lessons: tuple[int, ...]
+    values: Hyperparameters
+    runs: tuple[int, ...]
     stopped: int | None = None
 
 
 @dataclass(eq=False)
-class _Sweeping:
-    """A sweep on its way."""
+class _RunningSweep:
+    """The state of a sweep: its configurations, training runs, returns and safety.
+
+    A place is a training run and one of its snapshots, both by number.
+    """
 
     study: Study
     options: dict[str, Any]
-    store: Store
-    watch: Watch
+    cache: Cache
+    clock: Clock
     halving: Halving | None
     attack: str | Search
-    lessons: Lessons = field(init=False)
-    found: list[_Configuration] = field(default_factory=list)
-    known: dict[str, int] = field(default_factory=dict)
+    runs: TrainingRuns = field(init=False)
+    configurations: list[_Configuration] = field(default_factory=list)
+    numbers: dict[str, int] = field(default_factory=dict)
     returns: dict[tuple[int, int], float] = field(default_factory=dict)
-    earned: tuple[float, float] | None = None
-    judged: dict[tuple[int, int], Judged] = field(default_factory=dict)
+    return_range: tuple[float, float] | None = None
+    safety: dict[tuple[int, int], PolicySafety] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.lessons = Lessons(self.study, self.store, self.watch)
+        self.runs = TrainingRuns(self.study, self.cache, self.clock)
 
-    def run(self, asker: Asker) -> SweepRecord:
-        """All stages, or as many as there is time for."""
+    def run(self, proposer: Proposer) -> SweepRecord:
+        """Train and certify, or as much of it as there is time for."""
         complete, certificates = True, None
         try:
             try:
                 total = self.options["configurations"] * len(self.study.training_seeds)
                 steps = total * self.study.trainer.steps
-                with self.watch.stage(TRAINING, steps, "steps", _FOR_TRAINING):
-                    self._train_all(asker)
+                with self.clock.stage(TRAINING, steps, "steps", _FOR_TRAINING):
+                    self._train_all(proposer)
             except OutOfTime:
                 complete = False
             certificates = self._certify()
-            complete &= getattr(certificates, "stopped", "") != "interrupted"
+            complete &= certificates is None or certificates.stopped != "interrupted"
         except (KeyboardInterrupt, OutOfTime):
             complete = False
         return self._record(certificates, complete)
 
     # Training
 
-    def _train_all(self, asker: Asker) -> None:
-        barren = 0
-        while len(self.found) < self.options["configurations"] and barren < _BARREN:
-            proposed = asker.ask(self.options["configurations"] - len(self.found))
-            if not proposed:
+    def _train_all(self, proposer: Proposer) -> None:
+        wanted, barren = self.options["configurations"], 0
+        while len(self.configurations) < wanted and barren < _MOST_BARREN:
+            proposals = proposer.propose(wanted - len(self.configurations))
+            if not proposals:
                 return
-            fresh = self._added(proposed)
+            fresh = self._add(proposals)
             barren = 0 if fresh else barren + 1
             if fresh:
                 self._train(fresh)
-            if asker.learns:
-                asker.tell(self._badness_of(proposed))
+            if proposer.learns:
+                proposer.observe(self._objectives(proposals))
 
-    def _added(self, proposed: Sequence[Values]) -> list[int]:
-        """Numbers of the configurations that are new."""
+    def _add(self, proposals: Sequence[Hyperparameters]) -> list[int]:
+        """Add the configurations that are new; return their numbers."""
         fresh = []
-        for values in proposed:
+        for values in proposals:
             name = digest(values)
-            if name in self.known:
+            if name in self.numbers:
                 continue
-            self.known[name] = len(self.found)
-            fresh.append(len(self.found))
-            lessons = tuple(self.lessons.add(values, s) for s in self.study.training_seeds)
-            self.found.append(_Configuration(dict(values), lessons))
+            self.numbers[name] = len(self.configurations)
+            fresh.append(len(self.configurations))
+            runs = tuple(self.runs.add(values, seed) for seed in self.study.training_seeds)
+            self.configurations.append(_Configuration(dict(values), runs))
         return fresh
 
     def _train(self, numbers: Sequence[int]) -> None:
-        lessons = self._lessons_of(numbers)
+        runs = self._runs_of(numbers)
         last = len(self.study.snapshots_of(self.study.trainer.steps)) - 1
         if self.halving is None:
-            self.lessons.reach(lessons, max(map(self.lessons.rungs, lessons)) - 1)
-            self._measure(lessons)
+            self.runs.train(runs, max(map(self.runs.rungs, runs)) - 1)
+            self._measure_returns(runs)
             return
         for rung in range(last + 1):
-            self.lessons.reach(self._lessons_of(numbers), rung, further=rung < last)
-            self._measure(self._lessons_of(numbers))
+            self.runs.train(self._runs_of(numbers), rung, further=rung < last)
+            self._measure_returns(self._runs_of(numbers))
             if rung < last:
-                bad = self._judged_by(self.halving.by, numbers, rung)
-                kept = self.halving.kept(bad)
-                for number in set(bad) - set(kept):
-                    self.found[number].stopped = rung
-                    self.lessons.forget(self.found[number].lessons)
-                numbers = kept
+                values = self._halving_objectives(self.halving.by, numbers, rung)
+                selected = self.halving.select(values)
+                for number in set(values) - set(selected):
+                    self.configurations[number].stopped = rung
+                    self.runs.forget(self.configurations[number].runs)
+                numbers = selected
 
-    def _lessons_of(self, numbers: Sequence[int]) -> list[int]:
-        return [lesson for number in numbers for lesson in self.found[number].lessons]
+    def _runs_of(self, numbers: Sequence[int]) -> list[int]:
+        return [run for number in numbers for run in self.configurations[number].runs]
 
-    def _measure(self, lessons: Sequence[int]) -> None:
-        """The nominal returns of all snapshots of these trainings that have none yet."""
+    def _measure_returns(self, runs: Sequence[int]) -> None:
+        """Measure the nominal returns of all snapshots of training runs that have none yet."""
         missing: list[tuple[int, int]] = []
-        for lesson in lessons:
-            for rung in range(self.lessons.rungs(lesson)):
-                reached = self.lessons.reached(lesson, rung)
-                if reached is None or not reached.finite or (lesson, rung) in self.returns:
+        for run in runs:
+            for rung in range(self.runs.rungs(run)):
+                if not self._is_finite((run, rung)) or (run, rung) in self.returns:
                     continue
-                work = self.store.get(self._return_name(lesson, rung))
-                if work is None:
-                    missing.append((lesson, rung))
+                arrays = self.cache.get(self._return_name(run, rung))
+                if arrays is None:
+                    missing.append((run, rung))
                 else:
-                    self.returns[lesson, rung] = float(work["return"])
+                    self.returns[run, rung] = float(arrays["return"])
         policies = [self._policy(place) for place in missing]
-        task = self.study.trainer.measured_on
+        task = self.study.trainer.evaluation_task
         for some, values in batched_mean_returns(task, policies, episodes=self.options["episodes"]):
-            work = {}
+            entries: dict[str, Arrays] = {}
             for i, value in zip(some, values, strict=True):
                 self.returns[missing[i]] = float(value)
-                work[self._return_name(*missing[i])] = {"return": np.float64(value)}
-            self.store.put(work)
-            self.watch.check()
+                entries[self._return_name(*missing[i])] = {"return": np.asarray(value, np.float64)}
+            self.cache.put(entries)
+            self.clock.check()
 
-    def _return_name(self, lesson: int, rung: int) -> str:
-        return f"return/{self.lessons.name(lesson, rung)}"
+    def _return_name(self, run: int, rung: int) -> str:
+        return f"return/{self.runs.cache_name(run, rung)}"
 
-    def _policy(self, place: tuple[int, int]) -> Any:
-        reached = self.lessons.reached(*place)
-        assert reached is not None
-        return reached.policy
+    def _is_finite(self, place: tuple[int, int]) -> bool:
+        snapshot = self.runs.snapshot(*place)
+        return snapshot is not None and snapshot.finite
 
-    # What searches and halving go by
+    def _policy(self, place: tuple[int, int]) -> Policy:
+        snapshot = self.runs.snapshot(*place)
+        assert snapshot is not None
+        return snapshot.policy
 
-    def _judged_by(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
-        """How bad configurations are at a snapshot, for halving."""
+    # Objectives of searches and of halving
+
+    def _halving_objectives(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
+        """Return the objectives of configurations at a snapshot; NaN where one is unknown."""
         if by == SAFETY:
-            bad = self._quick({n: self._places_of(n, rung) for n in numbers})
-            return {n: float("nan") if b is None else b for n, b in bad.items()}
-        found = {}
+            values = self._screen({n: self._places_of(n, rung) for n in numbers})
+            return {n: float("nan") if value is None else value for n, value in values.items()}
+        objectives = {}
         for number in numbers:
             places = self._places_of(number, rung)
             returns = [self.returns.get(place, np.nan) for place in places]
-            found[number] = -float(np.mean(returns)) if places else float("nan")
-        return found
+            objectives[number] = -float(np.mean(returns)) if places else float("nan")
+        return objectives
 
-    def _badness_of(self, proposed: Sequence[Values]) -> list[float | None]:
-        """How bad the proposed configurations turned out, at the end of their training."""
-        numbers = [self.known[digest(values)] for values in proposed]
+    def _objectives(self, proposals: Sequence[Hyperparameters]) -> list[float | None]:
+        """Return the objectives of proposals at the end of their training; None if unknown."""
+        numbers = [self.numbers[digest(values)] for values in proposals]
         places = {}
         for number in dict.fromkeys(numbers):
-            rung = self.found[number].stopped
-            places[number] = self._places_of(number, 10**9 if rung is None else rung)
-        bad = self._quick(places)
-        return [bad[number] for number in numbers]
+            rung = self.configurations[number].stopped
+            places[number] = self._places_of(number, _LAST if rung is None else rung)
+        values = self._screen(places)
+        return [values[number] for number in numbers]
 
     def _places_of(self, number: int, rung: int) -> list[tuple[int, int]]:
-        """A configuration's trainings at a snapshot, or at their last."""
-        lessons = self.found[number].lessons
-        return [(n, min(rung, self.lessons.rungs(n) - 1)) for n in lessons]
+        """Return the places of a configuration's runs at a snapshot, or at their last."""
+        runs = self.configurations[number].runs
+        return [(n, min(rung, self.runs.rungs(n) - 1)) for n in runs]
 
-    def _quick(self, places: dict[int, list[tuple[int, int]]]) -> dict[int, float | None]:
-        """How bad configurations are, from few simulations: to choose by, never to certify."""
-        finite = [
-            place
-            for found in places.values()
-            for place in found
-            if (r := self.lessons.reached(*place)) is not None and r.finite
-        ]
+    def _screen(self, places: dict[int, list[tuple[int, int]]]) -> dict[int, float | None]:
+        """Estimate objectives of configurations by few simulations, never to certify."""
+        finite = [place for group in places.values() for place in group if self._is_finite(place)]
         returns = [self.returns[place] for place in finite]
-        if self.earned is None and returns:
-            self.earned = min(returns), max(returns)
-        samples = min(QUICK, self.options["samples"])
-        judged: dict[tuple[int, int], Judged] = {}
+        if self.return_range is None and returns:
+            self.return_range = min(returns), max(returns)
+        samples = min(SCREENING, self.options["samples"])
+        safety: dict[tuple[int, int], PolicySafety] = {}
         if finite:
             # Other samples than those of the certificates.
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
             policies = [self._policy(place) for place in finite]
-            quick = self._certified(
+            report = self._certify_policies(
                 policies,
                 samples=samples,
                 budget=samples * len(policies),
                 seed=seed,
-                attack_simulations=min(QUICK, self.options["attack_simulations"]),
+                attack_simulations=min(SCREENING, self.options["attack_simulations"]),
                 progress=None,
             )
-            if getattr(quick.certificates, "stopped", "") == "interrupted":
-                # Nobody should choose by half of what there is to know.
+            if report.certificates is not None and report.certificates.stopped == "interrupted":
+                # A half-finished screening would change the proposals of a resumed sweep.
                 raise KeyboardInterrupt
-            judged = dict(zip(finite, quick.policies, strict=True))
-        bad: dict[int, float | None] = {}
-        for number, found in places.items():
-            values = [self._bad(place, judged.get(place)) for place in found]
-            refused = any(place[0] in self.lessons.errors for place in found)
-            bad[number] = None if refused else float(np.mean(values))
-        return bad
+            safety = dict(zip(finite, report.policies, strict=True))
+        objectives: dict[int, float | None] = {}
+        for number, group in places.items():
+            values = [self._objective(place, safety.get(place)) for place in group]
+            failed = any(place[0] in self.runs.errors for place in group)
+            objectives[number] = None if failed else float(np.mean(values))
+        return objectives
 
-    def _bad(self, place: tuple[int, int], judged: Judged | None) -> float:
-        if judged is None or self.earned is None:
+    def _objective(self, place: tuple[int, int], safety: PolicySafety | None) -> float:
+        if safety is None or self.return_range is None:
             return WORST
-        found = badness(judged.rate, judged.worst, self.returns[place], self.earned)
-        return WORST if found is None else found
+        value = objective(safety.rate, safety.worst, self.returns[place], self.return_range)
+        return WORST if value is None else value
 
     # Certification
 
-    def _certify(self) -> Any:
-        """Certify the finite policies of all rows."""
+    def _certify(self) -> Certificates | None:
+        """Certify the finite policies of all rows; None where there are none."""
         places = [
-            (lesson, rung)
-            for lesson in self._lessons_of(range(len(self.found)))
-            for rung in range(self.lessons.rungs(lesson))
-            if (r := self.lessons.reached(lesson, rung)) is not None and r.finite
+            (run, rung)
+            for run in self._runs_of(range(len(self.configurations)))
+            for rung in range(self.runs.rungs(run))
+            if self._is_finite((run, rung))
         ]
         if not places:
             return None
         total = len(places) * self.options["samples"]
-        with self.watch.stage(CERTIFYING, total, "simulations"):
+        with self.clock.stage(CERTIFYING, total, "simulations"):
             # Training may have been out of time before returns were measured.
-            self._measure(list(dict.fromkeys(lesson for lesson, _ in places)))
-            made = self._certified(
+            self._measure_returns(list(dict.fromkeys(run for run, _ in places)))
+            report = self._certify_policies(
                 [self._policy(place) for place in places],
                 samples=self.options["samples"],
                 budget=self.options["budget"],
                 seed=self.options["seed"],
                 attack_simulations=self.options["attack_simulations"],
-                progress=self.watch.told,
+                progress=self.clock.show,
             )
-        self.judged = dict(zip(places, made.policies, strict=True))
-        return made.certificates
+        self.safety = dict(zip(places, report.policies, strict=True))
+        return report.certificates
 
-    def _certified(self, policies: list[Any], **how: Any) -> Judgement:
-        def remember(name: str, compute: Callable[[], dict[str, np.ndarray]]) -> Any:
+    def _certify_policies(
+        self,
+        policies: Sequence[Policy],
+        *,
+        samples: int,
+        budget: int | None,
+        seed: int,
+        attack_simulations: int,
+        progress: Callable[[int, int, str], None] | None,
+    ) -> SafetyReport:
+        def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
-                self.watch.check()
+                self.clock.check()
             except OutOfTime:
-                # As if somebody had stopped it: then the certification says what it knows.
+                # The certification answers an interruption by its finished part.
                 raise KeyboardInterrupt from None
-            return self.store.remember(f"certify/{name}", compute)
+            return self.cache.remember(f"certify/{name}", compute)
 
         return certify_policies(
             self.study.problem,
             policies,
             p=self.study.p,
             confidence=self.options["confidence"],
+            samples=samples,
+            seed=seed,
+            budget=budget,
             attack=self.attack,
+            attack_simulations=attack_simulations,
             remember=remember,
-            **how,
+            progress=progress,
         )
 
     # The record
 
-    def _record(self, certificates: Any, complete: bool) -> SweepRecord:
+    def _record(self, certificates: Certificates | None, complete: bool) -> SweepRecord:
         rows: list[Row] = []
         certified: dict[tuple[int, int], int] = {}
-        for number, configuration in enumerate(self.found):
-            for lesson in configuration.lessons:
-                for row in self._rows(number, configuration, lesson):
-                    if row.place in self.judged:
+        for number, configuration in enumerate(self.configurations):
+            for run in configuration.runs:
+                for row in self._rows(number, configuration, run):
+                    if row.place in self.safety:
                         certified[row.place] = len(rows)
                     rows.append(row)
-        table = tabulated(rows, self.study)
+        table = tabulate(rows, self.study)
         return SweepRecord(
             study=self.study.name,
             seed=self.options["seed"],
+            columns=table.columns,
             hyperparameters=tuple(self.study.space.columns),
+            policies=table.policies,
+            worst=table.worst,
+            curves=table.curves,
             certificates=certificates,
-            certified=tuple(certified[place] for place in self.judged),
+            certified=tuple(certified[place] for place in self.safety),
             options=self.options,
             version=__version__,
-            seconds=dict(self.watch.seconds),
+            seconds=dict(self.clock.seconds),
             complete=complete,
-            **table,
         )
 
-    def _rows(self, number: int, configuration: _Configuration, lesson: int) -> list[Row]:
-        asked = self.lessons.lessons[lesson]
-        found: list[Row] = []
-        for rung, steps in enumerate(asked.snapshots):
-            reached: Reached | None = self.lessons.reached(lesson, rung)
-            if reached is None:
+    def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
+        training = self.runs.runs[run]
+        rows: list[Row] = []
+        for rung, steps in enumerate(training.snapshots):
+            snapshot = self.runs.snapshot(run, rung)
+            if snapshot is None:
                 continue
             status = TRAINED if configuration.stopped != rung else STOPPED
-            found.append(
+            rows.append(
                 Row(
                     configuration=number,
-                    seed=asked.seed,
+                    seed=training.seed,
                     steps=steps,
                     values=configuration.values,
-                    status=status if reached.finite else NONFINITE,
-                    place=(lesson, rung),
-                    reached=reached,
-                    nominal_return=self.returns.get((lesson, rung), float("nan")),
-                    judged=self.judged.get((lesson, rung)),
+                    status=status if snapshot.finite else NONFINITE,
+                    place=(run, rung),
+                    snapshot=snapshot,
+                    nominal_return=self.returns.get((run, rung), float("nan")),
+                    safety=self.safety.get((run, rung)),
                 )
             )
-        if lesson in self.lessons.errors:
-            found.append(
+        if run in self.runs.errors:
+            rows.append(
                 Row(
                     configuration=number,
-                    seed=asked.seed,
-                    steps=asked.snapshots[-1],
+                    seed=training.seed,
+                    steps=training.snapshots[-1],
                     values=configuration.values,
-                    status=f"error: {self.lessons.errors[lesson]}",
-                    place=(lesson, -1),
+                    status=f"error: {self.runs.errors[run]}",
+                    place=(run, -1),
                 )
             )
-        return found
+        return rows

@@ -1,4 +1,10 @@
-"""The clock of a sweep: what its time goes to, how much is left, and a bar for each stage."""
+"""The clock of a sweep: seconds of each stage, the time limit, and a progress bar.
+
+with Clock("mine", max_seconds=600, show=None) as clock, clock.stage(TRAINING, 10, "steps"):
+    clock.advance(1)
+    clock.check()                                   # raises OutOfTime
+clock.seconds["training"]
+"""
 
 import contextlib
 import time
@@ -8,19 +14,23 @@ from collections.abc import Iterator
 from verifai_jax.core.progress import ProgressBar
 
 TRAINING, COMPILING, CERTIFYING = "training", "compiling", "certifying"
+"""Stages of a sweep, as its result names them."""
 
 
 class OutOfTime(Exception):
-    """The seconds of a sweep are over."""
+    """An error for a stage whose seconds are over."""
 
 
-class Watch:
-    """A context manager around a sweep.
+class Clock:
+    """Times the stages of a sweep, as a context manager.
 
+    `seconds` are the seconds spent in each stage; compilation is not counted in training.
+
+    **Arguments:**
+
+    - `name`: of the sweep, before the progress bar.
     - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
-    - `show`: whether to draw; None decides by where the error stream goes.
-
-    `seconds` is what was spent in each stage; compiling is taken out of training.
+    - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
     """
 
     def __init__(self, name: str, max_seconds: float | None, show: bool | None) -> None:
@@ -30,45 +40,44 @@ class Watch:
         self._until = None if max_seconds is None else self._began + max_seconds
         self._limit = self._until
 
-    def __enter__(self) -> "Watch":
+    def __enter__(self) -> "Clock":
         self._bar.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.__exit__()
 
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the beginning."""
-        return time.perf_counter() - self._began
-
     @contextlib.contextmanager
     def stage(self, name: str, total: float, unit: str, share: float = 1.0) -> Iterator[None]:
-        """Time inside goes to `name`; `total` of the `unit` are to be done.
+        """Time the statements inside as a stage.
 
-        - `share`: of the seconds, after which this stage is out of time.
+        **Arguments:**
+
+        - `name`: of the stage.
+        - `total`: units of work in it, and `unit`, their name.
+        - `share`: of `max_seconds`, after which the stage is out of time.
         """
-        began, inner = time.perf_counter(), self.seconds[COMPILING]
+        began, compiling = time.perf_counter(), self.seconds[COMPILING]
         if self._until is not None:
             self._limit = self._began + share * (self._until - self._began)
         self._bar.begin(f"{self.name}: {name}", total, unit)
         try:
             yield
         finally:
-            compiled = self.seconds[COMPILING] - inner
+            compiled = self.seconds[COMPILING] - compiling
             self.seconds[name] += time.perf_counter() - began - compiled
             self._bar.end()
 
     def advance(self, amount: float, figures: str = "") -> None:
-        """Tell that so much more is done."""
+        """Count further units of the present stage as done, and show `figures` beside the bar."""
         self._bar.advance(amount, figures)
 
-    def told(self, done: float, total: float, figures: str) -> None:
-        """Tell that `done` of `total` are done; the total may have changed."""
+    def show(self, done: float, total: float, figures: str) -> None:
+        """Set the units that are done and their total, which may have changed."""
         self._bar.update(done, total, figures)
 
-    def compiled(self, seconds: float) -> None:
-        """Tell that so much of the present stage went into compiling."""
+    def count_compilation(self, seconds: float) -> None:
+        """Count seconds of the present stage as compilation."""
         self.seconds[COMPILING] += max(0.0, seconds)
 
     def check(self) -> None:

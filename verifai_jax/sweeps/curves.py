@@ -1,7 +1,8 @@
 """Formulas over training itself: the learning curve is a trace whose time is environment steps.
 
-    trace = curve_trace(steps, mean_return)                     # signal `return`
-    judge_curve("eventually[0, 200000] (return >= 90 & always return >= 50)", steps, mean_return)
+    trace = curve_trace(steps, mean_return)             # signal `return`
+    formula = "eventually[0, 200000] (return >= 90 & always return >= 50)"
+    curve_robustness(formula, steps, mean_return)
 
 Bounds of the formula are environment steps from the beginning of the training.
 """
@@ -19,15 +20,18 @@ from verifai_jax.mtl.recording import resample
 from verifai_jax.mtl.rewriting import rebuilt
 
 SIGNALS = ("return",)
-"""What a learning curve has: the mean return of the episodes that ended in each update."""
+"""Signals of a learning curve: the mean return of the episodes that ended in each update."""
 _SHORTEST = 64
+"""Least length to which curves are padded, so that few lengths compile."""
 
 
 def check_curve(formula: Formula | str) -> Formula:
-    """The parsed formula, refused unless it speaks of signals of a learning curve only.
+    """Parse a formula and check that its signals are those of a learning curve.
 
-    **Raises:** what the parser does; `UnknownNameError` for another signal, with the nearest;
-    `TypeError` for something that is no formula.
+    **Returns:** the formula.
+
+    **Raises:** `FormulaSyntaxError` for text that does not parse; `UnknownNameError` for another
+    signal, with the nearest; `TypeError` for something that is no formula.
     """
     if isinstance(formula, str):
         formula = parse(formula)
@@ -40,13 +44,17 @@ def check_curve(formula: Formula | str) -> Formula:
 def curve_trace(
     steps: Int[np.ndarray, " updates"], mean_return: Float[np.ndarray, " updates"]
 ) -> Trace:
-    """The learning curve as a trace with the signal `return`, from step 0 on.
+    """Make a trace of a learning curve, with the signal `return`, from step 0 on.
+
+    An update in which no episode ended keeps the previous value. Until the first episode ends the
+    value is that of the first: those episodes began with the training.
+
+    **Arguments:**
 
     - `steps`: environment steps taken by the end of each update.
     - `mean_return`: of the episodes that ended in each update; NaN where none did.
 
-    An update in which no episode ended keeps the value before it. Until the first episode ends
-    the value is that of the first: those episodes began with the training.
+    **Returns:** the trace, whose time is environment steps.
 
     **Raises:** `ValueError` where no episode ended at all, or for steps that do not increase.
     """
@@ -70,16 +78,20 @@ def curve_trace(
     return Trace(signals, times=times)
 
 
-def judge_curve(
+def curve_robustness(
     formula: Formula | str,
     steps: Int[np.ndarray, " updates"],
     mean_return: Float[np.ndarray, " updates"],
 ) -> float:
-    """Robustness of a formula on a learning curve, in units of the return; NaN without a curve.
+    """Return the robustness of a formula on a learning curve.
+
+    **Arguments:**
 
     - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
       whole updates. Behind the end of the curve its last value stays.
-    - `steps`, `mean_return`: as in `curve_trace`.
+    - `steps`, `mean_return`: the curve, as in `curve_trace`.
+
+    **Returns:** the robustness in units of the return; NaN where no episode ended.
 
     **Raises:** as `check_curve`.
     """
@@ -90,7 +102,7 @@ def judge_curve(
     if trace.times is not None:
         # Updates of different lengths; a value holds until the next update has ended.
         trace = resample(trace, dt=float(np.diff(np.asarray(trace.times)).min()), method="hold")
-    # One length for many curves: the last value holds anyway, and each length is compiled once.
+    # Curves are padded to few lengths, each of which compiles once; the last value stays anyway.
     length = max(_SHORTEST, 1 << (trace.length - 1).bit_length())
     values = np.asarray(trace["return"], np.float32)
     padded = np.concatenate([values, np.full(length - len(values), values[-1], np.float32)])
@@ -99,12 +111,12 @@ def judge_curve(
 
 
 def _in_updates(formula: Formula, period: float) -> Formula:
-    """The formula on a clock that counts updates; bounds are rounded down to whole ones."""
+    """Rescale the bounds of a formula to updates, rounded down to whole ones."""
     changed = rebuilt(formula, tuple(_in_updates(part, period) for part in formula.operands()))
     interval = getattr(changed, "interval", None)
     if interval is None:
         return changed
-    # What an update brought counts from its end on: nothing changes before the next one ends.
+    # The value of an update counts from its end on: nothing changes before the next one ends.
     start, end = (
         float(np.floor(bound / period * (1 + 1e-9))) for bound in (interval.start, interval.end)
     )

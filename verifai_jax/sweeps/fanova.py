@@ -5,17 +5,25 @@ samples are drawn. Source: Hutter, Hoos and Leyton-Brown, An efficient approach 
 hyperparameter importance, ICML 2014, section 3 (fANOVA).
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+if TYPE_CHECKING:
+    from sklearn.ensemble import ExtraTreesRegressor
+
 _MOST_ENTRIES = 2**22
-"""Pairs of boxes times inputs worked on in one go."""
+"""Pairs of boxes times inputs in one block of memory."""
 
 
 class Boxes(NamedTuple):
-    """A function that is the sum of constants `[m]` on boxes `[m, d]` of the unit cube."""
+    """A function on the unit cube: the sum of constants on boxes.
+
+    - `low`, `high`: corners of the boxes.
+    - `value`: constants on them.
+    """
 
     low: Float[np.ndarray, "m d"]
     high: Float[np.ndarray, "m d"]
@@ -23,8 +31,11 @@ class Boxes(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """Parts of the variance: `first` goes away when an input is known, `total` stays when all
-    others are. `variance` is that of the function itself; the shares of a constant one are NaN.
+    """Shares of a function's variance; NaN for a constant function.
+
+    - `first`: of each input, the share that goes away when the input is known.
+    - `total`: of each input, the share that stays when all other inputs are known.
+    - `variance`: of the function.
     """
 
     first: Float[np.ndarray, " d"]
@@ -32,11 +43,16 @@ class Shares(NamedTuple):
     variance: float
 
 
-def boxes_of(forest: Any, edges: list[Float[np.ndarray, " edges"] | None]) -> Boxes:
-    """The leaves of scikit-learn's forest of regression trees over the unit cube.
+def leaf_boxes(
+    forest: "ExtraTreesRegressor", edges: Sequence[Float[np.ndarray, " _"] | None]
+) -> Boxes:
+    """Return the leaves of a forest of regression trees over the unit cube.
 
-    - `edges`: for each input where its cells begin and end, to the nearest of which thresholds
-      move; None for a continuous one.
+    **Arguments:**
+
+    - `forest`: of scikit-learn, fitted.
+    - `edges`: borders of the cells of each input, to the nearest of which thresholds move; None for
+      a continuous input.
     """
     dimensions = len(edges)
     low, high, value = [], [], []
@@ -62,12 +78,11 @@ def boxes_of(forest: Any, edges: list[Float[np.ndarray, " edges"] | None]) -> Bo
 
 
 def variance_shares(boxes: Boxes) -> Shares:
-    """First-order and total shares of each input, distributed uniformly on `[0, 1]`."""
+    """Return first-order and total shares of inputs distributed uniformly on `[0, 1]`."""
     width = boxes.high - boxes.low
-    kept = (width > 0).all(axis=1)
-    low, high, width = boxes.low[kept], boxes.high[kept], width[kept]
-    # Taking the mean away first loses no digits to it.
-    value = boxes.value[kept]
+    full = (width > 0).all(axis=1)
+    low, high, width = boxes.low[full], boxes.high[full], width[full]
+    value = boxes.value[full]
     volume = width.prod(axis=1)
     mean = float(value @ volume)
     count, dimensions = low.shape

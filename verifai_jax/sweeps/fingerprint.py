@@ -1,6 +1,12 @@
-"""A sweep as plain data, by which a store knows whether it is its own."""
+"""The fingerprint of a sweep: plain data by which a cache recognises its own sweep.
+
+fingerprint(study, options)                         # nested dictionaries of numbers and texts
+digest({"learning_rate": 1e-3})                     # 20 hexadecimal digits
+"""
 
 import dataclasses
+import hashlib
+import json
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -13,19 +19,30 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.sweeps.study import Study
 
 _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+"""Addresses in memory, which differ between processes."""
 
 
-def describe(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
-    """All that decides the table of a sweep, as far as data can say it: code is known by name."""
+def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Describe everything that decides the table of a sweep, as far as data can.
+
+    Code is described by its name only.
+
+    **Arguments:**
+
+    - `study`: the study that is swept.
+    - `options`: options of the sweep, as plain data.
+
+    **Returns:** nested dictionaries of plain data.
+    """
     problem = study.untrained_problem()
     return {
         "study": study.name,
-        "space": {name: _told(domain) for name, domain in study.space.domains.items()},
+        "space": _features(study.space),
         "constrained": study.space.where is not None,
-        "task": _described(study.trainer.task),
-        "nominal": _described(study.trainer.measured_on),
+        "task": _describe(study.trainer.task),
+        "nominal": _describe(study.trainer.evaluation_task),
         "algorithms": {
-            name: _described(algorithm) for name, algorithm in study.trainer.by_name.items()
+            name: _describe(algorithm) for name, algorithm in study.trainer.by_name.items()
         },
         "steps": study.trainer.steps,
         "snapshots": list(study.snapshots),
@@ -42,20 +59,24 @@ def describe(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def digest(value: Mapping[str, Any]) -> str:
+    """Return a short hash of plain data."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=repr).encode()).hexdigest()[:20]
+
+
 def _features(space: FeatureSpace) -> dict[str, str]:
-    return {name: _told(domain) for name, domain in space.domains.items()}
+    return {name: _text(domain) for name, domain in space.domains.items()}
 
 
-def _described(value: Any) -> Any:
-    """A dataclass by its fields, anything else by what it calls itself."""
+def _describe(value: object) -> dict[str, str]:
+    """Describe a dataclass by its fields, anything else by its `repr`."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _told(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: _text(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"kind": type(value).__qualname__, **fields}
-    return {"kind": type(value).__qualname__, "is": _told(value)}
+    return {"kind": type(value).__qualname__, "is": _text(value)}
 
 
-def _told(value: Any) -> str:
+def _text(value: object) -> str:
     if isinstance(value, np.ndarray | jax.Array):
         return repr(np.asarray(value).tolist())
-    # Where an object lies in memory says nothing of what it is.
     return _ADDRESS.sub("", repr(value))

@@ -1,10 +1,10 @@
-"""Successive halving: at each snapshot only the best go on, so that most training goes to them.
+"""Successive halving: at each snapshot only the best configurations continue to train.
 
     sweep(study, configurations=64, halving=Halving(reduction=3))
 
 Source: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
 optimization (2016), figure 1; Li et al., A system for massively parallel hyperparameter tuning
-(2020), section 3.1, whose asynchronous form buys nothing where all trainings run on one machine.
+(2020), section 3.1, whose asynchronous form gains nothing where all trainings run on one machine.
 """
 
 import math
@@ -14,19 +14,21 @@ from dataclasses import dataclass
 from verifai_jax.core.errors import check_names
 
 RETURN, SAFETY = "return", "safety"
+"""Criteria of halving."""
 
 
 @dataclass(frozen=True)
 class Halving:
-    """Who goes on.
+    """Successive halving: keep the best 1/reduction of the configurations at each snapshot.
 
     **Arguments:**
 
-    - `reduction`: of so many configurations one goes on, rounded up; greater than 1.
-    - `by`: `"return"`, the nominal return of the snapshot, or `"safety"`: how often its closed loop
-      fails in a few simulations, then how nearly, then the return.
+    - `reduction`: greater than 1; of so many configurations one continues, rounded up.
+    - `by`: the criterion. `"return"` is the nominal return at the snapshot; `"safety"` is the
+      failure rate of the closed loop in a few simulations, then the worst robustness, then the
+      return.
 
-    **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another `by`.
+    **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another criterion.
     """
 
     reduction: float = 3.0
@@ -38,15 +40,20 @@ class Halving:
             raise ValueError(f"reduction must be greater than 1; got {self.reduction!r}")
         check_names("criterion of halving", [self.by], (RETURN, SAFETY))
 
-    def count(self, configurations: int) -> int:
-        """How many of so many go on."""
+    def survivors(self, configurations: int) -> int:
+        """Return the number of configurations that continue."""
         return math.ceil(configurations / self.reduction)
 
-    def kept(self, badness: Mapping[int, float]) -> list[int]:
-        """The configurations that go on, in the order of their numbers; ties go to the first.
+    def select(self, objective: Mapping[int, float]) -> list[int]:
+        """Choose the configurations that continue.
 
-        - `badness`: of each configuration, the less the better; NaN is worse than anything.
+        **Arguments:**
+
+        - `objective`: of each configuration, by its number; the least is best, and NaN is worst.
+
+        **Returns:** numbers of the configurations, in ascending order; of equal ones the first
+        continue.
         """
-        count = self.count(len(badness))
-        bad = {n: math.inf if math.isnan(b) else b for n, b in badness.items()}
-        return sorted(sorted(bad, key=lambda n: (bad[n], n))[:count])
+        count = self.survivors(len(objective))
+        values = {n: math.inf if math.isnan(value) else value for n, value in objective.items()}
+        return sorted(sorted(values, key=lambda n: (values[n], n))[:count])

@@ -1,66 +1,77 @@
-"""Which hyper-parameters matter for safety and for return, from the table of a sweep alone.
+"""The importance of hyper-parameters for safety and for return, from the table of a sweep alone.
 
-    found = sweep.importance()
-    found.table                  loss of the score when one is shuffled, and shares of the variance
-    found.trusted("failure_rate")
-    found.unsafe, found.safe     principal components of the unsafe and of the safe ones
+    importance = sweep.importance()
+    importance.table                    # loss of R^2 when one is shuffled, shares of the variance
+    importance.is_reliable("failure_rate")
+    importance.unsafe, importance.safe  # principal components of unsafe and safe configurations
 
 A forest learns the failure rate and the return from the hyper-parameters, as coordinates in the
-unit cube of the study's space: a log-uniform one counts by its logarithm. It is judged on
-configurations that it was not trained on.
+unit cube of the study's space: a log-uniform one counts by its logarithm. Its R^2 is
+measured on configurations that it was not trained on.
 
 Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
 (2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001); shares of
-the variance as in `variance.py`; principal components as in the paper's case study of
+the variance as in `fanova.py`; principal components as in the paper's case study of
 hyper-parameters (Dreossi et al., CAV 2019).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis._pca import Components, pca
+from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import Constant, FeatureSpace
-from verifai_jax.sweeps.fanova import boxes_of, variance_shares
+from verifai_jax.sweeps.fanova import leaf_boxes, variance_shares
 from verifai_jax.sweeps.trends import trends
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
+    from sklearn.ensemble import ExtraTreesRegressor
 
 TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
-"""What is explained, and how people call it."""
+"""Columns that are explained, with their names in the summary."""
 FEWEST = 10
 """Configurations below which nothing is learned."""
 FEWEST_ROWS = 5
-"""Configurations of a verdict below which their principal components say nothing."""
+"""Configurations of a verdict below which they have no principal components."""
 FOLDS = 5
+"""Folds of the cross-validation."""
 TREES = 40
+"""Trees of the forest."""
 LEAST = 0.2
-"""R^2 on configurations kept aside below which importances mean nothing."""
+"""R^2 on held-out configurations below which importances mean nothing."""
 LEAST_LOSS = 0.02
+"""Loss of R^2 below which the summary does not name a hyper-parameter."""
 MOST_NAMED = 5
+"""Hyper-parameters that the summary names, at most."""
 MOST_CELLS = 8
-"""Different numbers in a column of an unknown domain up to which they are taken for choices."""
+"""Different numbers in a column of an unknown domain up to which they count as choices."""
 
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterImportance:
-    """How much each hyper-parameter matters.
+    """The importance of each hyper-parameter for failing and for the return.
 
-    **Fields:** `table`: one row a hyper-parameter, the most important first. For each of
-    `failure_rate` and `nominal_return`: the loss in R^2, on configurations that the model has not
-    seen, when the column is shuffled, with `_low` and `_high` two standard deviations of the
-    repetitions away; `_first` and `_total`, shares of the model's variance that it explains alone
-    and with all its interactions; `_trend`, its rank correlation by itself (NaN for choices). NaN
-    where there is no model. `scores`: R^2 of the models; `chance`: what the greatest trend of
-    unrelated ones stays below, 95 %; `missing`: why there is no model; `unsafe` and `safe`:
-    principal components of these configurations, None where there are fewer than five;
-    `configurations`: how many there are; `name` of the study.
+    **Fields:**
+
+    - `table`: one row for each hyper-parameter, the most important first. For each of
+      `failure_rate` and `nominal_return` it has the loss in R^2 on held-out configurations when the
+      column is shuffled, with `_low` and `_high` two standard deviations of the repetitions away;
+      `_first` and `_total`, the shares of the model's variance that it explains alone and with all
+      interactions; `_trend`, its rank correlation alone (NaN for choices). NaN without a model.
+    - `scores`: R^2 of the models, by target.
+    - `chance`: limit below which the greatest trend of unrelated ones stays in 95 %, by target.
+    - `missing`: reasons for a missing model, by target.
+    - `unsafe`, `safe`: principal components of these configurations; None for fewer than five.
+    - `configurations`: their number.
+    - `name`: of the study.
     """
 
     table: "pd.DataFrame"
@@ -72,29 +83,29 @@ class HyperparameterImportance:
     configurations: int
     name: str
 
-    def trusted(self, target: str) -> bool:
-        """Whether the model of `"failure_rate"` or `"nominal_return"` predicts at all."""
+    def is_reliable(self, target: str) -> bool:
+        """Check that the model of `"failure_rate"` or `"nominal_return"` predicts at all."""
         return self.scores.get(target, -np.inf) >= LEAST
 
     @property
-    def ranked(self) -> list[str]:
+    def ranking(self) -> list[str]:
         """Hyper-parameters from the most to the least important, for safety if that is known."""
         return [str(name) for name in self.table.index]
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the shares of the variance, or the trends where no model can be trusted.
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Draw the shares of the variance, or the trends where no model is reliable.
+
+        **Arguments:**
+
+        - `path`: file that the picture is written to, if given.
+
+        **Returns:** the Matplotlib figure.
 
         **Raises:** `ValueError` with too few configurations.
         """
-        from verifai_jax.plotting.style import new_figure, show_or_save
-        from verifai_jax.plotting.sweep import draw_importance, draw_trends
-
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
-        figure = new_figure(figsize=(6.4, 1.6 + 0.42 * len(self.table)))
-        draw = draw_importance if any(map(self.trusted, self.scores)) else draw_trends
-        draw(figure.subplots(), self)
-        return show_or_save(figure, path)
+        return late("verifai_jax.plotting.sweep", "plot_importance")(self, path)
 
     def __repr__(self) -> str:
         return str(self)
@@ -108,8 +119,8 @@ class HyperparameterImportance:
             if target in self.missing:
                 lines.append(f"{what}: {self.missing[target]}")
                 continue
-            score = f"R^2 {self.scores[target]:.2f} on configurations kept aside"
-            if not self.trusted(target):
+            score = f"R^2 {self.scores[target]:.2f} on held-out configurations"
+            if not self.is_reliable(target):
                 lines.append(
                     f"{what}: a model of these {self.configurations} configurations does not "
                     f"predict others ({score}); {self._trends(target)}"
@@ -127,17 +138,17 @@ class HyperparameterImportance:
         return lines
 
     def _trends(self, target: str) -> str:
-        """Which go with the target by themselves, beyond chance."""
+        """Write the hyper-parameters that correlate with the target beyond chance."""
         trends = self.table[f"{target}_trend"].dropna()
         trends = trends.loc[trends.abs() > self.chance[target]]
         if not len(trends):
-            return "alone none goes with it more than by chance"
+            return "no single one correlates with it beyond chance"
         order = trends.abs().sort_values(ascending=False).index[:MOST_NAMED]
         listed = ", ".join(f"{name} ({trends[name]:+.2f})" for name in order)
-        return f"its rank correlation with each alone, where beyond chance: {listed}"
+        return f"its rank correlations beyond chance: {listed}"
 
     def _directions(self) -> list[str]:
-        """Along what the unsafe and the safe configurations vary most."""
+        """Write the directions along which unsafe and safe configurations vary most."""
         lines = []
         for what, components in (("unsafe", self.unsafe), ("safe", self.safe)):
             if components is not None and len(components.directions):
@@ -155,7 +166,13 @@ class HyperparameterImportance:
 
 @dataclass(frozen=True)
 class _Input:
-    """One hyper-parameter as the models see it."""
+    """One hyper-parameter as the models see it.
+
+    - `name`: of the hyper-parameter.
+    - `values`: coordinates in [0, 1].
+    - `edges`: borders of the cells of a discrete one; None for a continuous one.
+    - `ordered`: True for numbers, False for choices.
+    """
 
     name: str
     values: Float[np.ndarray, " rows"]
@@ -172,23 +189,27 @@ def hyperparameter_importance(
     repeats: int = 5,
     seed: int = 0,
 ) -> HyperparameterImportance:
-    """Measure it from the rows of a sweep's table; nothing is trained or simulated.
+    """Measure the importance of hyper-parameters from the rows of a sweep's table.
+
+    Nothing is trained or simulated.
+
+    **Arguments:**
 
     - `table`: with columns `configuration`, `steps`, `verdict`, `failure_rate`, `nominal_return`
       and the hyper-parameters.
     - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
       one of them where it varies.
-    - `space`: that the study gave; None takes columns between their least and greatest entries.
-    - `repeats`: how often the folds are drawn anew and each column is shuffled.
-
-    Needs scikit-learn, which comes with verifai_jax.
+    - `space`: of the study; None scales columns between their least and greatest entries.
+    - `name`: of the study.
+    - `repeats`: number of times that the folds are drawn and each column is shuffled.
+    - `seed`: of folds, shuffles and forests.
     """
     import pandas as pd
 
     names = list(dict.fromkeys([*hyperparameters, "steps"]))
     inputs = _inputs(table, names, space)
     groups = table["configuration"].to_numpy()
-    columns: dict[str, Any] = {}
+    columns: dict[str, np.ndarray] = {}
     scores: dict[str, float] = {}
     chance: dict[str, float] = {}
     missing: dict[str, str] = {}
@@ -199,10 +220,10 @@ def hyperparameter_importance(
             missing[target] = reason
             continue
         matrix = np.stack([one.values for one in inputs], axis=1)[usable]
-        score, losses = _shuffled(matrix, values[usable], groups[usable], repeats, seed)
+        score, losses = _permutation_losses(matrix, values[usable], groups[usable], repeats, seed)
         mean, spread = losses.mean(axis=0), 2 * losses.std(axis=0, ddof=1)
         forest = _forest(matrix.shape[1], seed).fit(matrix, values[usable])
-        shares = variance_shares(boxes_of(forest, [one.edges for one in inputs]))
+        shares = variance_shares(leaf_boxes(forest, [one.edges for one in inputs]))
         scores[target] = score
         trend = trends(matrix, values[usable], groups[usable], seed)
         chance[target] = trend.chance
@@ -210,18 +231,18 @@ def hyperparameter_importance(
         columns[f"{target}_trend"] = np.where(ordered, trend.correlation, np.nan)
         columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
         columns |= {f"{target}_first": shares.first, f"{target}_total": shares.total}
-    found = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
+    importances = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
     if scores:
         by = max(scores, key=lambda target: (scores[target] >= LEAST, target == "failure_rate"))
-        found = found.sort_values(by, ascending=False, kind="stable")
+        importances = importances.sort_values(by, ascending=False, kind="stable")
     unsafe, safe = (_components(table, inputs, kind) for kind in ("counterexamples", "safe"))
     return HyperparameterImportance(
-        found, scores, chance, missing, unsafe, safe, len(np.unique(groups)), name
+        importances, scores, chance, missing, unsafe, safe, len(np.unique(groups)), name
     )
 
 
 def _unlearnable(values: np.ndarray, groups: np.ndarray, inputs: int) -> str:
-    """Why nothing can be learned; empty if something can."""
+    """Return the reason why no model can be learned; empty if one can."""
     count = len(np.unique(groups))
     if not inputs:
         return "no hyper-parameter varies"
@@ -233,7 +254,7 @@ def _unlearnable(values: np.ndarray, groups: np.ndarray, inputs: int) -> str:
     return ""
 
 
-def _forest(inputs: int, seed: int) -> Any:
+def _forest(inputs: int, seed: int) -> "ExtraTreesRegressor":
     from sklearn.ensemble import ExtraTreesRegressor
 
     return ExtraTreesRegressor(
@@ -245,14 +266,14 @@ def _forest(inputs: int, seed: int) -> Any:
     )
 
 
-def _shuffled(
+def _permutation_losses(
     matrix: Float[np.ndarray, "n d"],
     values: Float[np.ndarray, " n"],
     groups: Int[np.ndarray, " n"],
     repeats: int,
     seed: int,
 ) -> tuple[float, Float[np.ndarray, "repeats d"]]:
-    """R^2 on configurations kept aside, and what it loses when a column is shuffled."""
+    """Return R^2 on held-out configurations, and its loss when each column is shuffled."""
     generator = np.random.default_rng(seed)
     rows, dimensions = matrix.shape
     distinct, member = np.unique(groups, return_inverse=True)
@@ -265,25 +286,25 @@ def _shuffled(
         for k in range(FOLDS):
             aside = fold == k
             model = _forest(dimensions, seed + repeat).fit(matrix[~aside], values[~aside])
-            asked = np.repeat(matrix[aside][None], dimensions + 1, axis=0)
+            queries = np.repeat(matrix[aside][None], dimensions + 1, axis=0)
             for j, order in enumerate(orders):
-                asked[j + 1, :, j] = matrix[order, j][aside]
-            answers = model.predict(asked.reshape(-1, dimensions))
+                queries[j + 1, :, j] = matrix[order, j][aside]
+            answers = model.predict(queries.reshape(-1, dimensions))
             guess[:, aside] = answers.reshape(dimensions + 1, -1)
         errors = np.square(guess - values).sum(axis=1)
-        reached = 1 - errors / np.square(values - values.mean()).sum()
-        scores.append(reached[0])
-        losses.append(reached[0] - reached[1:])
+        r_squared = 1 - errors / np.square(values - values.mean()).sum()
+        scores.append(r_squared[0])
+        losses.append(r_squared[0] - r_squared[1:])
     return float(np.mean(scores)), np.array(losses)
 
 
 def _inputs(
     table: "pd.DataFrame", names: Sequence[str], space: FeatureSpace | None
 ) -> list[_Input]:
-    """The columns that vary, as coordinates in the unit cube."""
+    """Return the columns that vary, as coordinates in the unit cube."""
     import pandas as pd
 
-    found = []
+    inputs = []
     domains = {} if space is None else space.domains
     for name in names:
         entries: Any = table[name]
@@ -307,18 +328,22 @@ def _inputs(
             real = entries.to_numpy(np.float64)
             values, edges = (real - np.nanmin(real)) / np.ptp(real[~np.isnan(real)]), None
         else:
-            # Lengths of trainings, and columns of which nothing is known: by their order.
+            # Lengths of trainings, and columns of an unknown domain, by their order.
             codes, kinds = pd.factorize(entries, sort=True)
             values = np.where(codes < 0, np.nan, (codes + 0.5) / len(kinds))
             edges = np.linspace(0, 1, len(kinds) + 1)
-        # What an algorithm lacks says nothing: the middle is as good as any.
+        # For an algorithm that lacks it the value is irrelevant: the middle.
         values = np.where(np.isnan(values), 0.5, values)
-        found.append(_Input(name, values, edges, bool(number)))
-    return found
+        inputs.append(_Input(name, values, edges, bool(number)))
+    return inputs
 
 
-def _components(table: "pd.DataFrame", inputs: Sequence[_Input], which: Any) -> Components | None:
-    """Principal components of the ordered hyper-parameters of the unsafe or the safe rows."""
+def _components(
+    table: "pd.DataFrame",
+    inputs: Sequence[_Input],
+    which: Literal["counterexamples", "safe"],
+) -> Components | None:
+    """Compute principal components of the ordered hyper-parameters of unsafe or safe rows."""
     import pandas as pd
 
     ordered = [one for one in inputs if one.ordered and one.name != "steps"]
@@ -331,7 +356,7 @@ def _components(table: "pd.DataFrame", inputs: Sequence[_Input], which: Any) -> 
     frame = frame.loc[known & last].assign(configuration=table["configuration"])
     frame = frame.sort_values("violated", kind="stable")
     frame = frame.drop_duplicates("configuration", keep="last").drop(columns="configuration")
-    chosen = frame["violated"] == (which == "counterexamples")
-    if int(chosen.sum()) < FEWEST_ROWS or not ordered:
+    selected = frame["violated"] == (which == "counterexamples")
+    if int(selected.sum()) < FEWEST_ROWS or not ordered:
         return None
     return pca(frame, which=which, columns=[one.name for one in ordered], scale="raw")

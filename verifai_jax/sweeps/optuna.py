@@ -1,30 +1,28 @@
-"""Optuna's samplers choose the hyper-parameters: `sweep(study, search="optuna:tpe")`.
+"""Optuna's samplers as proposers of configurations: `sweep(study, search="optuna:tpe")`.
 
-Needs the extra `optuna`. Seeded, so that a resumed sweep asks for the same configurations.
+Needs the extra `optuna`. Samplers are seeded, so a resumed sweep proposes the same configurations.
 """
 
 import importlib.util
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from verifai_jax.core.errors import MissingExtra, require, unknown_name
-from verifai_jax.features import (
-    Box,
-    Categorical,
-    Constant,
-    DiscreteBox,
-    FeatureSpace,
-    LogUniform,
-)
+from verifai_jax.features import Box, Categorical, Constant, DiscreteBox, FeatureSpace, LogUniform
 from verifai_jax.features.domain import Domain
 from verifai_jax.features.fixed import Fixed
-from verifai_jax.sweeps.proposers import Values
-from verifai_jax.sweeps.trainer import labelled, labels
+from verifai_jax.sweeps.hyperparameters import Hyperparameters, values_at, values_of_features
+from verifai_jax.sweeps.optuna_distributions import optuna_distribution, plain_choice
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+    from optuna.samplers import BaseSampler
+    from optuna.trial import Trial
 
 _SAMPLERS = {
     "tpe": "TPESampler",
@@ -34,16 +32,19 @@ _SAMPLERS = {
     "nsgaii": "NSGAIISampler",
     "qmc": "QMCSampler",
 }
+"""Classes of Optuna's samplers, by the names that are used here."""
 _MOST_REFUSED = 1000
-"""Trials in a row that the constraint refuses, after which there are no more."""
+"""Trials in a row that the constraint may refuse before proposals end."""
 
 
 @dataclass(frozen=True)
 class OptunaSampler:
-    """A sampler of Optuna, by name, with its options: `OptunaSampler("tpe", {"multivariate": 1})`.
+    """A sampler of Optuna with its options, such as `OptunaSampler("tpe", {"multivariate": 1})`.
+
+    **Arguments:**
 
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
-    - `options`: keywords of the sampler's class; the seed is the sweep's.
+    - `options`: keyword arguments of the sampler's class; the seed is the sweep's.
 
     **Raises:** `UnknownNameError` for another name; `ValueError` for a seed among the options.
     """
@@ -57,107 +58,118 @@ class OptunaSampler:
         if "seed" in self.options:
             raise ValueError("the seed of Optuna's sampler is the sweep's: sweep(..., seed=...)")
 
-    def asker(self, space: FeatureSpace, seed: int, batch: int) -> "OptunaAsker":
-        """What asks this sampler.
+    def proposer(self, space: FeatureSpace, seed: int, batch: int) -> "OptunaProposer":
+        """Make the proposer of this sampler.
 
-        **Raises:** `MissingExtra` without Optuna, or what the sampler needs; `TypeError` for
-        options that the sampler does not have.
+        **Arguments:**
+
+        - `space`: of the hyper-parameters.
+        - `seed`: of the sampler.
+        - `batch`: configurations in a round.
+
+        **Raises:** `MissingExtra` without Optuna or a package that the sampler needs; `TypeError`
+        for options that the sampler does not have.
         """
         optuna = require("optuna", "optuna")
         if self.name == "cmaes" and importlib.util.find_spec("cmaes") is None:
             raise MissingExtra("Optuna's sampler cmaes needs a package: pip install cmaes")
         with warnings.catch_warnings():
-            # Optuna calls some of its samplers experimental; who names one has chosen it.
+            # Optuna warns that some samplers are experimental; this one was chosen by name.
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            made = getattr(optuna.samplers, _SAMPLERS[self.name])(seed=seed, **self.options)
-        return OptunaAsker(self, made, space, batch)
+            sampler = getattr(optuna.samplers, _SAMPLERS[self.name])(seed=seed, **self.options)
+        return OptunaProposer(self, sampler, space, batch)
 
 
-class OptunaAsker:
-    """A study of Optuna's that is asked for configurations and told how bad they are."""
+class OptunaProposer:
+    """A proposer that asks an Optuna study for trials.
+
+    **Arguments:**
+
+    - `description`: the sampler by name and options.
+    - `sampler`: Optuna's own object.
+    - `space`: of the hyper-parameters.
+    - `batch`: configurations in a round.
+    """
 
     learns = True
 
-    def __init__(self, described: OptunaSampler, made: Any, space: FeatureSpace, batch: int):
-        self.sampler, self.space, self.batch = described, space, batch
+    def __init__(
+        self,
+        description: OptunaSampler,
+        sampler: "BaseSampler",
+        space: FeatureSpace,
+        batch: int,
+    ) -> None:
+        self.description, self.space, self.batch = description, space, batch
         optuna = require("optuna", "optuna")
         self._failed = optuna.trial.TrialState.FAIL
-        self._distributions = distributions(space)
+        self._distributions = _distributions(space)
         before = optuna.logging.get_verbosity()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         try:
-            self._study = optuna.create_study(sampler=made)
+            self._study = optuna.create_study(sampler=sampler)
         finally:
             optuna.logging.set_verbosity(before)
-        self._trials: list[Any] = []
+        self._trials: list[Trial] = []
 
-    def ask(self, most: int) -> list[Values]:
-        self._trials, found, refused = [], [], 0
-        while len(found) < min(most, self.batch) and refused < _MOST_REFUSED:
+    def propose(self, most: int) -> list[Hyperparameters]:
+        """Return the next configurations; see `Proposer`."""
+        self._trials, proposals, refused = [], [], 0
+        while len(proposals) < min(most, self.batch) and refused < _MOST_REFUSED:
             trial = self._study.ask(self._distributions)
             values, accepted = _values(self.space, trial.params)
             if accepted:
                 self._trials.append(trial)
-                found.append(values)
+                proposals.append(values)
                 refused = 0
             else:
                 self._study.tell(trial, state=self._failed)
                 refused += 1
-        return found
+        return proposals
 
-    def tell(self, badness: Sequence[float | None]) -> None:
-        for trial, bad in zip(self._trials, badness, strict=False):
-            if bad is None:
+    def observe(self, objectives: Sequence[float | None]) -> None:
+        """Record the objectives of the last proposals; see `Proposer`."""
+        for trial, value in zip(self._trials, objectives, strict=False):
+            if value is None:
                 self._study.tell(trial, state=self._failed)
             else:
-                self._study.tell(trial, float(bad))
+                self._study.tell(trial, float(value))
 
-    def described(self) -> Any:
-        options = {name: repr(value) for name, value in self.sampler.options.items()}
-        return {"optuna": self.sampler.name, "options": options}
-
-
-def distributions(space: FeatureSpace) -> dict[str, Any]:
-    """The domains of a space as Optuna's distributions; one that it lacks by its probability."""
-    made = require("optuna", "optuna").distributions
-    found: dict[str, Any] = {}
-    for name, domain in space.domains.items():
-        match domain:
-            case Constant() | Fixed():
-                continue
-            case LogUniform():
-                found[name] = made.FloatDistribution(domain.low, domain.high, log=True)
-            case DiscreteBox():
-                found[name] = made.IntDistribution(domain.low, domain.high)
-            case Categorical():
-                found[name] = made.CategoricalDistribution([_plain(c) for c in domain.choices])
-            case Box() if np.ndim(domain.low) == 0:
-                found[name] = made.FloatDistribution(domain.low, domain.high)
-            case _:
-                found[name] = made.FloatDistribution(0.0, 1.0)
-    return found
+    def to_json(self) -> object:
+        """Return the sampler as plain data."""
+        options = {name: repr(value) for name, value in self.description.options.items()}
+        return {"optuna": self.description.name, "options": options}
 
 
-def _values(space: FeatureSpace, chosen: Mapping[str, Any]) -> tuple[Values, bool]:
-    """Values as a training sees them, and whether the constraint accepts them."""
+def _distributions(space: FeatureSpace) -> "dict[str, BaseDistribution]":
+    """Return Optuna's distributions of a space; probabilities where Optuna lacks a domain."""
+    unit = require("optuna", "optuna").distributions.FloatDistribution(0.0, 1.0)
+    return {
+        name: optuna_distribution(domain) or unit
+        for name, domain in space.domains.items()
+        if not isinstance(domain, Constant | Fixed)
+    }
+
+
+def _values(space: FeatureSpace, parameters: Mapping[str, object]) -> tuple[Hyperparameters, bool]:
+    """Return values as a training sees them, and whether the constraint accepts them."""
     features = {
-        name: domain.value if isinstance(domain, Constant | Fixed) else _value(domain, chosen[name])
+        name: domain.value
+        if isinstance(domain, Constant | Fixed)
+        else _value(domain, parameters[name])
         for name, domain in space.domains.items()
     }
     coerced = space.root.coerce(features)
     accepted = bool(space.accepts(coerced))
-    return labels(space, jax.tree.map(lambda leaf: np.asarray(leaf)[None], coerced))[0], accepted
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], coerced)
+    return values_of_features(space, batch)[0], accepted
 
 
-def _value(domain: Domain, chosen: Any) -> Any:
+def _value(domain: Domain, parameter: object) -> object:
     match domain:
         case LogUniform() | DiscreteBox() | Box():
-            return chosen
+            return parameter
         case Categorical():
-            return next(c for c in domain.choices if _plain(c) == chosen)
-    point = np.array([[chosen]], np.float32)
-    return labelled(FeatureSpace({"value": domain}), point)[0]["value"]
-
-
-def _plain(choice: Any) -> Any:
-    return choice if isinstance(choice, bool | int | float | str | None) else str(choice)
+            return next(c for c in domain.choices if plain_choice(c) == parameter)
+    point = np.array([[parameter]], np.float32)
+    return values_at(FeatureSpace({"value": domain}), point)[0]["value"]

@@ -1,17 +1,16 @@
-"""Which configurations to train: a search over the cube of the hyper-parameters, asked and told.
+"""Proposals of configurations: a search over the unit cube of the hyper-parameters, or Optuna.
 
-    asker = asker_for("bayes", space, configurations=64, seed=0)
-    values = asker.ask(8)                            # dictionaries of plain values, 8 at most
-    asker.tell([0.02, None, ...])                    # how bad each was; None: not to be learnt from
+    proposer = make_proposer("bayes", space, configurations=64, seed=0)
+    values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
+    proposer.observe([0.02, None, ...])                 # their objective; None where it is unknown
 
-A search looks for the least number. What it is told comes from `badness`: how often the policy
-fails, then how nearly, then what it earns.
+Proposers look for the least `objective`: failure rate first, then worst robustness, then return.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -22,51 +21,70 @@ from verifai_jax.falsification.validation import needs_slopes
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Portfolio, Search
 from verifai_jax.search.proposals import Proposals
-from verifai_jax.sweeps.trainer import labelled
+from verifai_jax.sweeps.hyperparameters import Hyperparameters, values_at
+from verifai_jax.sweeps.optuna import OptunaSampler
 
-Values = dict[str, Any]
 WORST = 1.2
-"""The badness of a training that gave no finite policy: more than any other."""
+"""Objective of a training without a finite policy: greater than any other."""
 ROUNDS = 8
-"""In which a search that learns is asked for all configurations, if nobody says how many a round.
-More learn more; fewer keep the cores busy."""
+"""Rounds of a search that learns, unless its batch is given.
+
+More rounds learn more; fewer keep the cores busy."""
 
 
-class Asker(Protocol):
-    """What proposes configurations."""
+@runtime_checkable
+class Proposer(Protocol):
+    """A source of configurations.
+
+    - `learns`: True where proposals depend on observed objectives.
+    - `batch`: configurations in a round.
+    """
 
     learns: bool
     batch: int
 
-    def ask(self, most: int) -> list[Values]:
-        """The next configurations, at most `most` and `batch`; none if there are no more."""
+    def propose(self, most: int) -> list[Hyperparameters]:
+        """Return the next configurations, at most `most` and `batch`; none at the end."""
         ...
 
-    def tell(self, badness: Sequence[float | None]) -> None:
-        """How bad those of the last `ask` were, one by one; None where nothing is known."""
+    def observe(self, objectives: Sequence[float | None]) -> None:
+        """Record the objectives of the last proposals, one by one; None where one is unknown."""
         ...
 
-    def described(self) -> Any:
-        """The search as plain data."""
+    def to_json(self) -> object:
+        """Return the search as plain data."""
         ...
 
 
-def asker_for(
-    search: Any, space: FeatureSpace, *, configurations: int, seed: int, batch: int | None = None
-) -> Asker:
-    """The asker of a search: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
+def make_proposer(
+    search: object,
+    space: FeatureSpace,
+    *,
+    configurations: int,
+    seed: int,
+    batch: int | None = None,
+) -> Proposer:
+    """Make the proposer of a search.
 
-    **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs
-    gradients, or cannot work on this space; `MissingExtra` without Optuna.
+    **Arguments:**
+
+    - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
+    - `space`: of the hyper-parameters.
+    - `configurations`: number of proposals in all.
+    - `seed`: of the proposals.
+    - `batch`: configurations in a round.
+
+    **Returns:** the proposer.
+
+    **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
+    or does not fit this space; `TypeError` for something that is no search; `MissingExtra` without
+    Optuna.
     """
     rounds = max(available_cores(), -(-configurations // ROUNDS))
-    if hasattr(search, "asker"):
-        return search.asker(space, seed, rounds if batch is None else batch)
     if isinstance(search, str) and search.startswith("optuna:"):
-        from verifai_jax.sweeps.optuna import OptunaSampler
-
-        sampler = OptunaSampler(search.removeprefix("optuna:"))
-        return sampler.asker(space, seed, rounds if batch is None else batch)
+        search = OptunaSampler(search.removeprefix("optuna:"))
+    if isinstance(search, OptunaSampler):
+        return search.proposer(space, seed, rounds if batch is None else batch)
     if isinstance(search, str):
         search = searches.named(search)
     if not isinstance(search, Search):
@@ -83,50 +101,64 @@ def asker_for(
         )
     search.check(space.cube)
     whole = configurations if not search.learns else rounds
-    return CubeAsker(search, space, whole if batch is None else batch, seed)
+    return SearchProposer(search, space, whole if batch is None else batch, seed)
 
 
-class CubeAsker:
-    """One of our own searches, on the unit cube of the space."""
+class SearchProposer:
+    """A search of this package, on the unit cube of the space."""
 
     def __init__(self, search: Search, space: FeatureSpace, batch: int, seed: int) -> None:
         self.search, self.space, self.batch = search, space, batch
         self.learns = search.learns
         self._proposals = Proposals(search, space.cube, batch, run_keys(seed)[0], space.constraint)
-        self._asked = 0
+        self._count = 0
 
-    def ask(self, most: int) -> list[Values]:
+    def propose(self, most: int) -> list[Hyperparameters]:
+        """Return the next configurations; see `Proposer`."""
         if self._proposals.exhausted:
-            self._asked = 0
+            self._count = 0
             return []
         points = np.asarray(self._proposals.next(min(most, self.batch)))
-        # A search that learns gives whole rounds, of which the last may be one too many.
-        self._asked = len(points)
-        return labelled(self.space, points)[:most]
+        # A search that learns gives whole rounds, also where fewer are wanted at the end.
+        self._count = len(points)
+        return values_at(self.space, points)[:most]
 
-    def tell(self, badness: Sequence[float | None]) -> None:
-        known = [*badness, *[None] * (self._asked - len(badness))]
-        rho = np.array([np.nan if b is None else b for b in known], np.float32)
+    def observe(self, objectives: Sequence[float | None]) -> None:
+        """Record the objectives of the last proposals; see `Proposer`."""
+        known = [*objectives, *[None] * (self._count - len(objectives))]
+        rho = np.array([np.nan if value is None else value for value in known], np.float32)
         self._proposals.tell(rho, np.isfinite(rho), None)
 
-    def described(self) -> Any:
+    def to_json(self) -> object:
+        """Return the search as plain data."""
         return searches.to_json(self.search) or repr(self.search)
 
 
-def badness(
-    failure_rate: float, worst: float, merit: float, earned: tuple[float, float]
+def objective(
+    failure_rate: float,
+    worst_robustness: float,
+    nominal_return: float,
+    return_range: tuple[float, float],
 ) -> float | None:
-    """How bad a policy is, between 0 and 1.11, for a search that looks for the least.
+    """Return the objective of a policy, between 0 and 1.11, which searches minimise.
 
     The failure rate counts most; among equal rates the worst robustness, squeezed into a tenth;
     among equal ones of these the return, squeezed into a hundredth.
 
-    - `merit`, `earned`: its nominal return, and the range of those of the first round.
+    **Arguments:**
+
+    - `failure_rate`: between 0 and 1.
+    - `worst_robustness`: the least robustness of all simulations.
+    - `nominal_return`: mean return on the nominal task.
+    - `return_range`: least and greatest nominal return of the first round.
+
+    **Returns:** the objective; None where the failure rate is not known.
     """
     if not math.isfinite(failure_rate):
         return None
-    worst = 0.0 if math.isnan(worst) else float(np.clip(worst, -1e30, 1e30))
-    low, high = earned
-    share = (merit - low) / (high - low) if high > low and math.isfinite(merit) else 0.0
+    worst = 0.0 if math.isnan(worst_robustness) else float(np.clip(worst_robustness, -1e30, 1e30))
+    low, high = return_range
+    known = high > low and math.isfinite(nominal_return)
+    share = (nominal_return - low) / (high - low) if known else 0.0
     near = 0.5 - 0.5 * worst / (1 + abs(worst))
     return failure_rate + 0.1 * near + 0.01 * (1 - float(np.clip(share, 0.0, 1.0)))

@@ -1,6 +1,6 @@
-"""Rows of a sweep's table in the order in which a careful person would choose among them."""
+"""The order of preference among the rows of a sweep's table, and tables derived from it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FULL = 0.01
-"""Part of the span of nominal returns within which a return counts as the best one."""
+"""Part of the span of nominal returns within which a return counts as full."""
 _WORST_FIRST = ("unsafe", "undecided")
 
 
 def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
-    """Which rows have the verdict `safe@p`."""
+    """Return True for rows with the verdict `safe@p`."""
     return table["verdict"].astype(str).str.startswith("safe").to_numpy(bool)
 
 
-def chosen_first(table: "pd.DataFrame") -> Int[np.ndarray, " judged"]:
-    """Places of the rows with a certificate, the one to choose first.
+def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
+    """Return the places of the rows with a certificate, the most preferable first.
 
     Safe ones come before others, by their nominal return; the others by the upper end of their
     failure probability. Then the lower failure rate, then fewer environment steps.
@@ -41,18 +41,19 @@ def chosen_first(table: "pd.DataFrame") -> Int[np.ndarray, " judged"]:
 
 
 def pareto_fronts(table: "pd.DataFrame") -> Int[np.ndarray, " rows"]:
-    """The front of each row: more nominal return, less failure, fewer environment steps.
+    """Return the number of each row's Pareto front, 0 for the first.
 
-    Failure counts by its upper end. -1 for a row without a return or a certificate.
+    Rows are compared by nominal return, the upper end of the failure probability, and environment
+    steps. -1 for a row without a return or a certificate.
     """
     columns = (-table["nominal_return"], table["failure_high"], table["steps"])
     return fronts(np.stack([np.asarray(column, np.float64) for column in columns], axis=1))
 
 
-def least_full_return(table: "pd.DataFrame") -> float:
-    """The nominal return from which on a policy counts as one that has learnt the task.
+def full_return_threshold(table: "pd.DataFrame") -> float:
+    """Return the nominal return from which on a policy has learnt the task.
 
-    The best of the table less one hundredth of the span of all; NaN for a table without any.
+    It is the best of the table less one hundredth of the span of all; NaN for a table without any.
     """
     returned = table["nominal_return"].to_numpy(np.float64)
     returned = returned[np.isfinite(returned)]
@@ -62,17 +63,17 @@ def least_full_return(table: "pd.DataFrame") -> float:
 
 
 def last_snapshots(table: "pd.DataFrame") -> "pd.DataFrame":
-    """The rows at the end of each training, as far as it went."""
+    """Return the rows at the last snapshot of each training."""
     last = table.groupby(["configuration", "seed"])["steps"].transform("max")
     return table.loc[table["steps"] == last]
 
 
-def by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
-    """One row a configuration: its trainings at their last snapshots, together."""
+def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
+    """Return one row for each configuration: its trainings at their last snapshots, together."""
     import pandas as pd
 
     names = [name for name in hyperparameters if name != "steps"]
-    place = {int(i): rank for rank, i in enumerate(table.index[chosen_first(table)])}
+    place = {int(i): rank for rank, i in enumerate(table.index[preference_order(table)])}
     rows: list[dict[str, Any]] = []
     for number, part in table.groupby("configuration", sort=True):
         last = last_snapshots(part)
@@ -91,7 +92,7 @@ def by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "
                 "failure_rate_worst": last["failure_rate"].max(),
                 "failure_high": last["failure_high"].max(skipna=False),
                 "training_seconds": last["training_seconds"].sum(),
-                "status": _told(last["status"]),
+                "status": _join_statuses(last["status"]),
                 "best_row": best,
                 "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
                 "best_verdict": table.loc[best, "verdict"] if best >= 0 else "",
@@ -100,29 +101,29 @@ def by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "
     return pd.DataFrame(rows).set_index("configuration") if rows else pd.DataFrame()
 
 
-def return_and_safety(table: "pd.DataFrame") -> float:
-    """Spearman's rank correlation of nominal return and safety (one less the failure rate).
+def return_safety_correlation(table: "pd.DataFrame") -> float:
+    """Return Spearman's rank correlation of nominal return and safety, one less the failure rate.
 
     NaN for fewer than three rows that have both, or where one of them is the same for all.
     """
-    pairs: Any = table[["nominal_return", "failure_rate"]].dropna()
+    pairs = table.loc[:, ["nominal_return", "failure_rate"]].dropna()
     if len(pairs) < 3 or (pairs.nunique() < 2).any():
         return float("nan")
     ranks = pairs.rank()
     return -float(np.corrcoef(ranks["nominal_return"], ranks["failure_rate"])[0, 1])
 
 
-def _worst_verdict(rows: Any) -> str:
-    verdicts = rows["verdict"].astype(str)
+def _worst_verdict(rows: "pd.DataFrame") -> str:
+    verdicts: Any = rows["verdict"].astype(str)
     for verdict in _WORST_FIRST:
         if (verdicts == verdict).any():
             return verdict
     if is_safe(rows).all():
         return str(verdicts.iloc[0])
-    # A seed without a certificate: what it would have trained is not known to be safe.
+    # A seed without a certificate leaves the configuration undecided.
     return "undecided" if is_safe(rows).any() else ""
 
 
-def _told(statuses: Any) -> str:
-    """What became of the trainings: one word if it is the same for all."""
+def _join_statuses(statuses: Iterable[object]) -> str:
+    """Write the different statuses of trainings, one word if they are equal."""
     return ", ".join(dict.fromkeys(str(status) for status in statuses))

@@ -1,19 +1,23 @@
-"""What a sweep leaves behind, as plain data: the driver writes it, `Sweep` shows it."""
+"""The record of a sweep as plain data: the sweep writes it, its result shows it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from verifai_jax.rl.policy import Policy
 
-TRAINED, NONFINITE, STOPPED = "trained", "nonfinite", "stopped"
-"""Of a row: a policy that trained on, one with a number that is not finite, one that halving
-stopped here. A configuration that cannot train has `error: ...` instead."""
+if TYPE_CHECKING:
+    from verifai_jax.certification.result import Certificates
 
+TRAINED, NONFINITE, STOPPED = "trained", "nonfinite", "stopped"
+"""Statuses of a row: trained, with a number that is not finite, and stopped here by halving.
+
+A configuration that cannot train has `error: ...` instead."""
 BEFORE = ("configuration", "seed", "steps")
+"""Columns of the table before those of the hyper-parameters."""
 AFTER = (
     "status",
     "training_return",
@@ -28,11 +32,15 @@ AFTER = (
     "curve_robustness",
     "training_seconds",
 )
-"""Columns of the table; those of the hyper-parameters stand between the two."""
+"""Columns of the table after those of the hyper-parameters."""
 
 
 class Curve(NamedTuple):
-    """A learning curve: environment steps by the end of each update, and the mean return in it."""
+    """A learning curve.
+
+    - `steps`: environment steps taken by the end of each update.
+    - `mean_return`: mean return of the episodes that ended in the update; NaN where none did.
+    """
 
     steps: Int[np.ndarray, " updates"]
     mean_return: Float[np.ndarray, " updates"]
@@ -40,32 +48,33 @@ class Curve(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """The table of a sweep and all that belongs to its rows. A row is one policy.
+    """The table of a sweep and everything that belongs to its rows. A row is one policy.
 
-    - `study`: its name; `seed`: of the sweep.
+    - `study`: name of the study.
+    - `seed`: of the sweep.
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
-      `AFTER`. Numbers that are not known are NaN, texts `""`. `steps` are those asked for.
-    - `hyperparameters`: the columns that the space of the study gave; `steps` is `BEFORE`'s own.
+      `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the wanted ones.
+    - `hyperparameters`: columns that the space of the study gave; `steps` is that of `BEFORE`.
     - `policies`: of each row, on the host; None where there is none.
-    - `worst`: of each row the features with the least robustness met, as `space.rows` shows them
-      (the problem's table columns); None where nothing was simulated.
-    - `curves`: of each training, by `(configuration, seed)`.
-    - `certificates`: what the certification said, and `certified`: the rows that its policies are,
-      in its order. None and empty where nothing was certified.
-    - `options`: what the sweep was asked for, plain data.
+    - `worst`: features of each row with the least robustness, as `space.rows` writes them; None
+      where nothing was simulated.
+    - `curves`: learning curve of each training run, by `(configuration, seed)`.
+    - `certificates`: result of the certification; None where nothing was certified.
+    - `certified`: rows of the certified policies, in the order of the certification.
+    - `options`: options of the sweep, plain data.
     - `version`: of verifai_jax.
-    - `seconds`: of the whole, by what they were spent on ("training", "certification", ...).
-    - `complete`: False where it was interrupted or out of time.
+    - `seconds`: wall-clock time of each stage, such as `training` and `certifying`.
+    - `complete`: False where the sweep was interrupted or out of time.
     """
 
     study: str
     seed: int
-    columns: Mapping[str, np.ndarray]
+    columns: Mapping[str, Shaped[np.ndarray, " _"]]
     hyperparameters: tuple[str, ...]
     policies: tuple[Policy | None, ...]
     worst: tuple[Mapping[str, Any] | None, ...]
     curves: Mapping[tuple[int, int], Curve]
-    certificates: Any | None
+    certificates: "Certificates | None"
     certified: tuple[int, ...]
     options: Mapping[str, Any]
     version: str
@@ -76,3 +85,15 @@ class SweepRecord:
     def rows(self) -> int:
         """Number of rows."""
         return len(self.policies)
+
+
+def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: str) -> bool:
+    """Return whether an algorithm has a hyper-parameter.
+
+    **Arguments:**
+
+    - `used`: names of the hyper-parameters of each algorithm; one that is missing has all.
+    - `algorithm`: name of the algorithm; None has all.
+    - `name`: of the hyper-parameter.
+    """
+    return name in used.get(str(algorithm), (name,))

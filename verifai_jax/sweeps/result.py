@@ -1,10 +1,11 @@
-"""The result of a sweep: which configurations train policies that are safe, and how sure that is.
+"""The result of a sweep: the certified safety of every policy that was trained.
 
-sweep.summary()                      how many reach full return, how many of those are safe
-sweep.table, sweep.safe, sweep.best  rows are policies
+sweep.summary()                      # configurations with full return, and the safe ones of them
+sweep.table, sweep.safe, sweep.best  # rows are policies
 sweep.policy(12).act(observation)
-vj.falsify(sweep.problem(12))        the closed loop with that policy
-sweep.save("sweeps/mine"); load_sweep("sweeps/mine", study)
+vj.falsify(sweep.problem(12))        # the closed loop with that policy
+sweep.save("sweeps/mine")
+load_sweep("sweeps/mine", study)
 """
 
 from collections.abc import Mapping
@@ -14,8 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.lazy import late
+from verifai_jax.core.targets import load_target
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.features import FeatureSpace
@@ -23,33 +27,45 @@ from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.curves import check_curve, curve_trace, judge_curve
+from verifai_jax.sweeps import storage
+from verifai_jax.sweeps.curves import check_curve, curve_robustness, curve_trace
 from verifai_jax.sweeps.importance import HyperparameterImportance, hyperparameter_importance
-from verifai_jax.sweeps.ranking import by_configuration, chosen_first, is_safe, pareto_fronts
-from verifai_jax.sweeps.record import SweepRecord
+from verifai_jax.sweeps.optuna_export import export_to_optuna
+from verifai_jax.sweeps.ranking import (
+    group_by_configuration,
+    is_safe,
+    pareto_fronts,
+    preference_order,
+)
+from verifai_jax.sweeps.record import SweepRecord, algorithm_uses
+from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.summary import Findings, format_headline, format_html, format_summary
+from verifai_jax.sweeps.trainer import ALGORITHM
 
 if TYPE_CHECKING:
+    import optuna
     import pandas as pd
-
-    from verifai_jax.sweeps.study import Study
-
-ALGORITHM = "algorithm"
-"""The hyper-parameter that says which of the others have a meaning."""
+    from matplotlib.figure import Figure
+    from optuna.storages import BaseStorage
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """What `sweep` returns.
+    """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
-    **Fields:** `record`: all that was trained and certified, as plain data; `study`: what was
-    swept, None for a loaded sweep without it; `space` of the hyper-parameters, the study's if left
-    out, None where it is not known; `folder` on disk, if it was loaded; `failing`: what each row
-    failed with, row -> DataFrame, of a loaded sweep, which has no certificates to ask; `used`:
-    the hyper-parameters that each algorithm has, by its name; empty where all have all.
+    **Fields:**
+
+    - `record`: everything that was trained and certified, as plain data.
+    - `study`: the study that was swept; None for a loaded sweep without it.
+    - `space`: of the hyper-parameters; the study's if left out, None where it is not known.
+    - `folder`: place on disk of a loaded sweep.
+    - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
+      certificates.
+    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
     """
 
     record: SweepRecord
-    study: "Study | None" = None
+    study: Study | None = None
     space: FeatureSpace | None = None
     folder: Path | None = None
     failing: "Mapping[int, pd.DataFrame]" = field(default_factory=dict, repr=False)
@@ -60,11 +76,11 @@ class Sweep:
         if self.space is None and self.study is not None:
             object.__setattr__(self, "space", self.study.space)
         if not self.used and self.study is not None:
-            object.__setattr__(self, "used", _used(self.study))
+            object.__setattr__(self, "used", _used_hyperparameters(self.study))
 
     @property
     def name(self) -> str:
-        """Of the study."""
+        """Name of the study."""
         return self.record.study
 
     @property
@@ -72,19 +88,21 @@ class Sweep:
         """Names of the columns that were swept."""
         return self.record.hyperparameters
 
-    def applies(self, name: str, algorithm: Any) -> bool:
-        """Whether the algorithm of this name has the hyper-parameter; None has all."""
-        return name in self.used.get(str(algorithm), (name,))
+    @property
+    def p(self) -> float | None:
+        """Failure probability below which a policy is safe, where it is known."""
+        p = self.record.options.get("p", None if self.study is None else self.study.p)
+        return None if p is None else float(p)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """One row a policy: a configuration, trained with a seed up to a snapshot.
+        """One row for each policy: a configuration, trained with a seed up to a snapshot.
 
-        `steps` are environment steps; `training_return` the mean return of the last episodes with
-        exploration, `nominal_return` that of the policy's likeliest actions on the task itself;
-        `failures` of `simulations` fresh samples of the problem's features, and the
-        `failure_rate` with the ends of its interval; `worst_robustness` over everything that was
-        simulated; `curve_robustness` of the formula over the learning curve.
+        `steps` are environment steps; `training_return` is the mean return of the last episodes
+        with exploration, `nominal_return` that of the policy's likeliest actions on the nominal
+        task; `failures` of `simulations` fresh samples of the problem's features, and the
+        `failure_rate` with the ends of its interval; `worst_robustness` of all simulations;
+        `curve_robustness` of the formula over the learning curve.
         """
         import pandas as pd
 
@@ -93,20 +111,20 @@ class Sweep:
 
     @property
     def safe(self) -> "pd.DataFrame":
-        """The rows whose verdict is `safe@p`, the best nominal return first."""
-        order = chosen_first(self.table)
+        """Rows whose verdict is `safe@p`, the best nominal return first."""
+        order = preference_order(self.table)
         return self.table.iloc[order[is_safe(self.table)[order]]]
 
     @property
     def best(self) -> "pd.Series":
-        """The row to choose: the best nominal return among the safe ones.
+        """Row to choose: the best nominal return among the safe ones.
 
         Where none is safe it is the one whose failure probability has the lowest upper end; its
         `verdict` says so.
 
         **Raises:** `ValueError` where no policy was certified at all.
         """
-        order = chosen_first(self.table)
+        order = preference_order(self.table)
         if not len(order):
             raise ValueError(
                 f"the sweep of {self.name!r} has no policy with a certificate: "
@@ -120,30 +138,30 @@ class Sweep:
 
     @cached_property
     def configurations(self) -> "pd.DataFrame":
-        """One row a configuration, over its training seeds at their last snapshot.
+        """One row for each configuration, over its training seeds at their last snapshot.
 
         `nominal_return` and `failure_rate` are means over the seeds, `failure_rate_worst` and
-        `failure_high` the greatest, `verdict` the worst of them, `seeds_safe` how many are safe.
-        `best_row` is the row of the table to choose among all seeds and snapshots, -1 for none.
+        `failure_high` the greatest, `verdict` the worst of them, `seeds_safe` the number of safe
+        ones. `best_row` is the row of the table to choose among all seeds and snapshots, or -1.
         """
-        return by_configuration(self.table, self.hyperparameters)
+        return group_by_configuration(self.table, self.hyperparameters)
 
-    def policy(self, i: int) -> Policy:
-        """The policy of row `i` of the table: `sweep.policy(i).act(observation)`.
+    def policy(self, i: int | np.integer) -> Policy:
+        """Return the policy of row `i` of the table: `sweep.policy(i).act(observation)`.
 
-        **Raises:** `IndexError` for a row that is not in the table; `ValueError` for one that has
-        no policy, saying why.
+        **Raises:** `IndexError` for a row that is not in the table; `ValueError` for one without a
+        policy, with the reason.
         """
         policy = self.record.policies[i := self._row(i)]
         if policy is None:
             raise ValueError(f"row {i} has no policy: {self.table.loc[i, 'status']}")
         return policy
 
-    def problem(self, i: int) -> Problem:
-        """The verification problem with the policy of row `i` in the loop.
+    def problem(self, i: int | np.integer) -> Problem:
+        """Return the verification problem with the policy of row `i` in the loop.
 
-        Ready for `falsify`, `estimate`, `synthesize`. The same object each time, so that it keeps
-        what it compiles.
+        Ready for `falsify`, `estimate`, `synthesize`. Each call returns the same object, so that it
+        keeps its compiled programs.
 
         **Raises:** as `policy`; `ValueError` for a sweep that was loaded without its study.
         """
@@ -153,14 +171,14 @@ class Sweep:
             given = repr(target) if target else "study"
             raise ValueError(
                 f"the sweep of {self.name!r} was loaded without its study, which has the "
-                f"verification problem; give it: load_sweep(path, {given})"
+                f"verification problem; give it: load_sweep(folder, {given})"
             )
         i = self._row(i)
         if i not in self._problems:
             self._problems[i] = self.study.problem(policy)
         return self._problems[i]
 
-    def _row(self, i: int) -> int:
+    def _row(self, i: int | np.integer) -> int:
         if isinstance(i, bool) or not isinstance(i, int | np.integer):
             raise TypeError(f"a row is named by its number in the table; got {i!r}")
         if not 0 <= i < self.record.rows:
@@ -168,10 +186,10 @@ class Sweep:
         return int(i)
 
     def pareto(self) -> "pd.DataFrame":
-        """The rows that no other row outdoes, the lowest failure probability first.
+        """Return the rows on the Pareto front, the lowest failure probability first.
 
-        Compared by nominal return, the upper end of the failure probability, and environment
-        steps; see `pareto.py`.
+        Rows are compared by nominal return, the upper end of the failure probability, and
+        environment steps.
         """
         front = self.table.loc[pareto_fronts(self.table) == 0]
         return front.sort_values(
@@ -180,15 +198,20 @@ class Sweep:
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:
-        """Which hyper-parameters matter for safety and for return; see `importance.py`.
+        """Measure the importance of the hyper-parameters for safety and for return.
 
-        Nothing is trained or simulated. With too few configurations it says so.
+        Nothing is trained or simulated. With too few configurations the result says so.
+
+        **Arguments:**
+
+        - `repeats`: number of times that the folds are drawn and each column is shuffled.
+        - `seed`: of folds, shuffles and forests.
         """
         table = self.table
         if self.used:
-            # What an algorithm lacks cannot matter to it.
+            # A hyper-parameter that an algorithm lacks cannot matter to it.
             for name in self.hyperparameters:
-                has = [self.applies(name, algorithm) for algorithm in table[ALGORITHM]]
+                has = [algorithm_uses(self.used, kind, name) for kind in table[ALGORITHM]]
                 table = table.assign(**{name: table[name].where(np.array(has, bool))})
         return hyperparameter_importance(
             table,
@@ -202,71 +225,76 @@ class Sweep:
     @suggests_options
     def counterexamples(
         self,
-        i: int | None = None,
+        i: int | np.integer | None = None,
         *,
         simulations: int = 0,
         search: str | Search = "portfolio",
         seed: int = 0,
     ) -> "pd.DataFrame":
-        """Features with which the policy of row `i` fails, the worst first; of the best by default.
+        """Return features with which the policy of a row fails, the worst first.
 
-        - `simulations`: that the `search` may take to find more than the sweep itself met, which
-          needs the study.
+        An empty table does not mean that there is no failure: the certificate bounds that.
 
-        Columns are the problem's features and `rho`. None found does not mean that there are none:
-        that is what the certificate is about.
+        **Arguments:**
+
+        - `i`: number of the row; the best when left out.
+        - `simulations`: budget of a search for more than those of the sweep; needs the study.
+        - `search`, `seed`: of these simulations.
+
+        **Returns:** columns of the problem's features, and `rho`, the robustness.
 
         **Raises:** as `problem` and `best`.
         """
         import pandas as pd
 
-        i = int(self.best.name) if i is None else self._row(i)  # pyright: ignore[reportArgumentType]
-        parts = [self.met(i)]
+        i = int(str(self.best.name)) if i is None else self._row(i)
+        parts = [self.recorded_counterexamples(i)]
         if simulations:
             problem = self.problem(i)
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
-            more: Any = run.table.counterexamples[[*problem.space.columns, "rho"]]
-            parts.append(more)
-        found = pd.concat([part for part in parts if len(part)] or parts[-1:])
-        return found.sort_values("rho", kind="stable").reset_index(drop=True)
+            parts.append(run.table.counterexamples.loc[:, [*problem.space.columns, "rho"]])
+        failures = pd.concat([part for part in parts if len(part)] or parts[-1:])
+        return failures.sort_values("rho", kind="stable").reset_index(drop=True)
 
-    def met(self, i: int) -> "pd.DataFrame":
-        """Features with which the policy of row `i` failed during the sweep, and `rho`."""
+    def recorded_counterexamples(self, i: int | np.integer) -> "pd.DataFrame":
+        """Return features with which the policy of row `i` failed in the sweep, and `rho`."""
         import pandas as pd
 
         i = self._row(i)
-        certificates: Any = self.record.certificates
+        certificates = self.record.certificates
         if certificates is not None and i in self.record.certified:
             return certificates.counterexamples(self.record.certified.index(i))
         if i in self.failing:
             return self.failing[i]
         worst, rho = self.record.worst[i], float(self.record.columns["worst_robustness"][i])
-        found = pd.DataFrame([{**(worst or {}), "rho": rho}])
-        return found if rho < 0 and worst is not None else found.iloc[:0]
+        row = pd.DataFrame([{**(worst or {}), "rho": rho}])
+        return row if rho < 0 and worst is not None else row.iloc[:0]
 
-    def curve(self, i: int) -> Trace:
-        """The learning curve up to the policy of row `i`, a trace over environment steps.
+    def curve(self, i: int | np.integer) -> Trace:
+        """Return the learning curve up to the policy of row `i`, a trace over environment steps.
 
         Signal `return`: the mean return of the episodes that ended in each update, exploration
-        included; an update in which none did keeps the value before it.
+        included; an update in which none did keeps the previous value.
 
         **Raises:** `IndexError` as `policy`; `ValueError` where no episode ended.
         """
-        return curve_trace(*self._points(self._row(i)))
+        return curve_trace(*self.curve_points(self._row(i)))
 
-    def judge_curves(self, formula: Formula | str) -> "pd.Series":
-        """Robustness of a formula on the learning curve up to each row; see `judge_curve`.
+    def curve_robustness(self, formula: Formula | str) -> "pd.Series":
+        """Return the robustness of a formula on the learning curve up to each row.
 
-        **Raises:** as `judge_curve`.
+        **Raises:** as `sweeps.curve_robustness`.
         """
         import pandas as pd
 
         formula = check_curve(formula)
-        judged = {i: judge_curve(formula, *self._points(i)) for i in self.table.index}
-        return pd.Series(judged, name=str(formula), dtype=float)
+        values = {i: curve_robustness(formula, *self.curve_points(i)) for i in self.table.index}
+        return pd.Series(values, name=str(formula), dtype=float)
 
-    def _points(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Steps and returns of the updates behind a row; empty where it never trained."""
+    def curve_points(
+        self, i: int | np.integer
+    ) -> tuple[Int[np.ndarray, " updates"], Float[np.ndarray, " updates"]]:
+        """Return steps and mean returns of the updates up to row `i`; empty without training."""
         row = self.table.loc[i]
         curve = self.record.curves.get((int(row["configuration"]), int(row["seed"])))
         if curve is None:
@@ -275,16 +303,18 @@ class Sweep:
         return np.asarray(curve.steps)[:count], np.asarray(curve.mean_return)[:count]
 
     @property
-    def p(self) -> float | None:
-        """The failure probability below which a policy was called safe, where it is known."""
-        p = self.record.options.get("p", None if self.study is None else self.study.p)
-        return None if p is None else float(p)
+    def findings(self) -> Findings:
+        """Data that the summary is written from."""
+        return Findings(self.record, self.table, self.configurations, self.used, self.p)
+
+    @property
+    def headline(self) -> str:
+        """Number of configurations with full return, and of the safe ones among them."""
+        return format_headline(self.findings)
 
     def summary(self) -> str:
-        """How many learn the task and how many of those are safe, the best, and its price."""
-        from verifai_jax.sweeps.summary import summary
-
-        return summary(self)
+        """Write the findings of the sweep, the most important first."""
+        return format_summary(self.findings)
 
     def __str__(self) -> str:
         return self.summary()
@@ -293,51 +323,96 @@ class Sweep:
         return self.summary()
 
     def _repr_html_(self) -> str:
-        from verifai_jax.sweeps.summary import as_html
+        return format_html(self.findings)
 
-        return as_html(self)
-
-    def plot(self, path: str | Path | None = None) -> Any:
+    def plot(self, path: str | Path | None = None) -> "Figure":
         """Draw return against failure probability, learning curves and importances.
 
-        Returns the figure, which is also written where a `path` is given.
+        **Arguments:**
+
+        - `path`: file that the picture is written to, if given.
+
+        **Returns:** the Matplotlib figure.
         """
-        from verifai_jax.plotting.sweep import plot_sweep
+        return late("verifai_jax.plotting.sweep", "plot_sweep")(self, path)
 
-        return plot_sweep(self, path)
+    def save(self, folder: str | Path) -> Path:
+        """Write the sweep to a folder: table, policies, curves, record.
 
-    def save(self, path: str | Path) -> Path:
-        """Write the sweep to a folder: table, policies, curves, record; returns the folder.
+        The files hold numbers and text only; `load_sweep` reads them, and `rl.load_policy` the
+        policies.
 
-        Numbers and text only; `load_sweep` reads it. The policies are files that `rl.load_policy`
-        reads too.
+        **Returns:** the folder.
         """
-        from verifai_jax.sweeps.storage import save_sweep
+        import pandas as pd
 
-        return save_sweep(self, path)
+        rows = [self.recorded_counterexamples(i).assign(row=i) for i in range(self.record.rows)]
+        nothing = [pd.DataFrame({"row": [0]})[:0]]
+        failing: Any = pd.concat([part for part in rows if len(part)] or nothing)
+        stored = storage.StoredSweep(self.record, self.space, self.used, failing)
+        return storage.write_sweep(stored, self.table, Path(folder))
 
-    def to_optuna(self, storage: Any = None, name: str | None = None) -> Any:
-        """An Optuna study with one trial a configuration, for its plots and its dashboard.
+    def to_optuna(
+        self, storage: "str | BaseStorage | None" = None, name: str | None = None
+    ) -> "optuna.Study":
+        """Make an Optuna study with one trial for each configuration.
 
-        - `storage`: where Optuna keeps it, such as `"sqlite:///sweep.db"`; in memory if left out.
-        - `name` of the study there; the sweep's own if left out.
+        Its values are the upper end of the failure probability, to minimise, and the nominal
+        return, to maximise.
 
-        Values are the upper end of the failure probability, to minimise, and the nominal return,
-        to maximise.
+        **Arguments:**
+
+        - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
+          out.
+        - `name`: of the study there; the sweep's own when left out.
 
         **Raises:** `MissingExtra` without the package.
         """
-        from verifai_jax.sweeps.to_optuna import to_optuna
+        return export_to_optuna(
+            self.configurations,
+            self.hyperparameters,
+            self.space,
+            self.used,
+            name=self.name if name is None else name,
+            storage=storage,
+        )
 
-        return to_optuna(self, storage, name)
+
+def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
+    """Read a sweep back from the folder that `Sweep.save` wrote.
+
+    The certificates are those of the table, and the recorded counterexamples.
+
+    **Arguments:**
+
+    - `folder`: the folder.
+    - `study`: the study or its name, such as `"specs/cartpole.py:safe_training"`; needed for
+      `.problem(i)` and further counterexamples. The files never name code to run.
+
+    **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
+    one, one of another format, or a study of another name or with other hyper-parameters.
+    """
+    folder = Path(folder)
+    description = storage.read_description(folder)
+    if isinstance(study, str):
+        study = load_target(study, Study)
+    if study is not None:
+        storage.check_study(description, folder, study.name, study.space.columns)
+    stored = storage.read_sweep(description, folder)
+    groups: Any = stored.failing.groupby("row")
+    failing = {int(i): part.drop(columns="row").reset_index(drop=True) for i, part in groups}
+    space = stored.space if study is None else None
+    return Sweep(stored.record, study, space, folder, failing, stored.used)
 
 
-def _used(study: Any) -> dict[str, tuple[str, ...]]:
-    """Which of the hyper-parameters each algorithm of a study has."""
+def _used_hyperparameters(study: Study) -> dict[str, tuple[str, ...]]:
+    """Return the names of the hyper-parameters of each algorithm of a study."""
     names = study.space.columns
-    if ALGORITHM not in names or not hasattr(study, "trainer"):
+    if ALGORITHM not in names:
         return {}
     return {
-        algorithm: study.trainer.uses({**dict.fromkeys(names), ALGORITHM: algorithm})
+        algorithm: study.trainer.used_hyperparameters(
+            {**dict.fromkeys(names), ALGORITHM: algorithm}
+        )
         for algorithm in study.trainer.by_name
     }

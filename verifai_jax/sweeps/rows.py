@@ -2,92 +2,113 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Shaped
 
-from verifai_jax.sweeps.curves import judge_curve
+from verifai_jax.rl.policy import Policy
+from verifai_jax.sweeps.curves import curve_robustness
 from verifai_jax.sweeps.record import AFTER, BEFORE, Curve
-from verifai_jax.sweeps.safety import Judged
+from verifai_jax.sweeps.safety import PolicySafety
 from verifai_jax.sweeps.study import Study
-from verifai_jax.sweeps.training_runs import Reached
+from verifai_jax.sweeps.training_runs import RunSnapshot
+
+_INTEGERS = {"configuration", "seed", "steps", "failures", "simulations"}
+_TEXTS = {"status", "verdict"}
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One policy, or what became of it. `place` is its training and snapshot."""
+    """One policy, or one training run without a policy.
+
+    - `configuration`, `seed`, `steps`: number of the configuration, training seed, snapshot.
+    - `values`: hyper-parameters.
+    - `status`: see `record`.
+    - `place`: numbers of the training run and of its snapshot.
+    - `snapshot`: the run there; None where it did not train.
+    - `nominal_return`: mean return on the nominal task; NaN where it is not known.
+    - `safety`: of the policy; None where it was not certified.
+    """
 
     configuration: int
     seed: int
     steps: int
-    values: Mapping[str, Any]
+    values: Mapping[str, object]
     status: str
     place: tuple[int, int]
-    reached: Reached | None = None
+    snapshot: RunSnapshot | None = None
     nominal_return: float = float("nan")
-    judged: Judged | None = None
+    safety: PolicySafety | None = None
 
 
-def tabulated(rows: Sequence[Row], study: Study) -> dict[str, Any]:
-    """The parts of a `SweepRecord` that go row by row: columns, policies, worst, curves."""
+class Table(NamedTuple):
+    """The parts of a `SweepRecord` that have one entry for each row, and the learning curves."""
+
+    columns: Mapping[str, Shaped[np.ndarray, " rows"]]
+    policies: tuple[Policy | None, ...]
+    worst: tuple[Mapping[str, object] | None, ...]
+    curves: Mapping[tuple[int, int], Curve]
+
+
+def tabulate(rows: Sequence[Row], study: Study) -> Table:
+    """Turn rows into columns, policies, worst features and learning curves."""
     names = [n for n in study.space.columns if n not in BEFORE]
-    whole = {"configuration", "seed", "steps", "failures", "simulations"}
-    texts = {"status", "verdict"}
     cells = [_cells(row, study) for row in rows]
     columns: dict[str, np.ndarray] = {}
     for name in (*BEFORE, *names, *AFTER):
         entries = [cell[name] for cell in cells]
-        if name in whole:
+        if name in _INTEGERS:
             columns[name] = np.array(entries, np.int64)
-        elif name in texts:
+        elif name in _TEXTS:
             columns[name] = np.array(entries, object)
         elif name in names:
-            columns[name] = _values(entries)
+            columns[name] = _hyperparameter_column(entries)
         else:
             columns[name] = np.array(entries, np.float64)
     curves: dict[tuple[int, int], Curve] = {}
     for row in rows:
-        # The longest comes last.
-        if row.reached is not None:
-            curves[row.configuration, row.seed] = row.reached.curve
-    return {
-        "columns": columns,
-        "policies": tuple(
-            row.reached.policy if row.reached is not None and row.reached.finite else None
+        # The last snapshot of a run has the longest curve.
+        if row.snapshot is not None:
+            curves[row.configuration, row.seed] = row.snapshot.curve
+    return Table(
+        columns=columns,
+        policies=tuple(
+            row.snapshot.policy if row.snapshot is not None and row.snapshot.finite else None
             for row in rows
         ),
-        "worst": tuple(None if row.judged is None else row.judged.features for row in rows),
-        "curves": curves,
-    }
+        worst=tuple(None if row.safety is None else row.safety.features for row in rows),
+        curves=curves,
+    )
 
 
-def _cells(row: Row, study: Study) -> dict[str, Any]:
-    nan, reached, judged = float("nan"), row.reached, row.judged
+def _cells(row: Row, study: Study) -> dict[str, object]:
+    nan, snapshot, safety = float("nan"), row.snapshot, row.safety
     curve = nan
-    if study.curve_formula is not None and reached is not None:
-        curve = judge_curve(study.curve_formula, *reached.curve)
+    if study.curve_formula is not None and snapshot is not None:
+        curve = curve_robustness(study.curve_formula, *snapshot.curve)
     return {
         **row.values,
         "configuration": row.configuration,
         "seed": row.seed,
         "steps": row.steps,
         "status": row.status,
-        "training_return": nan if reached is None else reached.training_return,
+        "training_return": nan if snapshot is None else snapshot.training_return,
         "nominal_return": row.nominal_return,
-        "failures": 0 if judged is None else judged.failures,
-        "simulations": 0 if judged is None else judged.simulations,
-        "failure_rate": nan if judged is None else judged.rate,
-        "failure_low": nan if judged is None else judged.low,
-        "failure_high": nan if judged is None else judged.high,
-        "worst_robustness": nan if judged is None else judged.worst,
-        "verdict": "" if judged is None else judged.verdict,
+        "failures": 0 if safety is None else safety.failures,
+        "simulations": 0 if safety is None else safety.simulations,
+        "failure_rate": nan if safety is None else safety.rate,
+        "failure_low": nan if safety is None else safety.low,
+        "failure_high": nan if safety is None else safety.high,
+        "worst_robustness": nan if safety is None else safety.worst,
+        "verdict": "" if safety is None else safety.verdict,
         "curve_robustness": curve,
-        "training_seconds": nan if reached is None else reached.seconds,
+        "training_seconds": nan if snapshot is None else snapshot.seconds,
     }
 
 
-def _values(entries: list[Any]) -> np.ndarray:
-    """A column of hyper-parameters: numbers as numbers, all else as text."""
+def _hyperparameter_column(entries: Sequence[object]) -> Shaped[np.ndarray, " rows"]:
+    """Make a column of hyper-parameters: numbers stay numbers, all else becomes text."""
     kinds = {type(entry) for entry in entries}
     if kinds == {bool}:
         return np.array(entries, bool)

@@ -1,25 +1,37 @@
-"""The certification as a sweep calls it: policies in, one judgement a policy out."""
+"""The certification of a sweep's policies: one safety result for each policy.
+
+report = certify_policies(problem_of, policies, p=0.01, ...)
+report.policies[3].verdict
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from verifai_jax.certification._certify import certify
+from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
+from verifai_jax.sweeps.cache import Arrays
 
-QUICK = 64
-"""Samples of a policy, and simulations of the attack on it, by which a search or halving chooses;
-verdicts take fresh ones."""
+SCREENING = 64
+"""Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
+
+Certificates take fresh samples."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """What the certification says of one policy.
+class PolicySafety:
+    """The safety of one policy.
 
-    - `failures` of `simulations` samples of the prior, those without a verdict among them; `rate`
-      between `low` and `high`.
-    - `worst`: the least robustness met, `features` those it was met with.
+    - `failures`: samples of the prior that fail or have no verdict.
+    - `simulations`: number of samples.
+    - `rate`: failure rate, between `low` and `high`.
+    - `low`, `high`: ends of its interval.
+    - `worst`: the least robustness of all simulations.
+    - `features`: the features at which it was met; None where nothing had a verdict.
+    - `verdict`: `safe@p`, `unsafe` or `undecided`; empty for a policy that was not sampled.
     """
 
     failures: int
@@ -28,15 +40,19 @@ class Judged:
     low: float
     high: float
     worst: float
-    features: Mapping[str, Any] | None
+    features: Mapping[str, object] | None
     verdict: str
 
 
-class Judgement(NamedTuple):
-    """The certification's own result, and what it says policy by policy."""
+class SafetyReport(NamedTuple):
+    """The safety of all policies.
 
-    certificates: Any
-    policies: list[Judged]
+    - `certificates`: the result of the certification itself.
+    - `policies`: the safety of each policy, in their order.
+    """
+
+    certificates: Certificates | None
+    policies: list[PolicySafety]
 
 
 def certify_policies(
@@ -50,12 +66,10 @@ def certify_policies(
     budget: int | None,
     attack: str | Search,
     attack_simulations: int,
-    remember: Callable[[str, Callable[[], Any]], Any],
+    remember: Callable[[str, Callable[[], Arrays]], Arrays],
     progress: Callable[[int, int, str], None] | None,
-) -> Judgement:
-    """Falsify and certify policies; what `certification.certify` does."""
-    from verifai_jax.certification._certify import certify
-
+) -> SafetyReport:
+    """Attack and certify policies; arguments are those of `certify`."""
     certificates = certify(
         problem_of,
         policies,
@@ -69,13 +83,13 @@ def certify_policies(
         remember=remember,
         progress=progress,
     )
-    return Judgement(certificates, [_judged(certificates[i]) for i in range(len(policies))])
+    return SafetyReport(certificates, [_safety(certificates[i]) for i in range(len(policies))])
 
 
-def _judged(certificate: Any) -> Judged:
+def _safety(certificate: Certificate) -> PolicySafety:
     rate = certificate.rate
     nan = float("nan")
-    return Judged(
+    return PolicySafety(
         failures=certificate.failures + certificate.not_finite,
         simulations=certificate.simulations,
         rate=nan if rate is None else rate.estimate,
@@ -83,6 +97,6 @@ def _judged(certificate: Any) -> Judged:
         high=nan if rate is None else rate.high,
         worst=certificate.worst_robustness,
         features=certificate.worst_features,
-        # Nothing is known of a policy that was not sampled before an interruption.
+        # An interruption leaves policies without a sample, and so without a verdict.
         verdict="" if rate is None else certificate.verdict,
     )

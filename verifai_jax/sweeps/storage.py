@@ -1,69 +1,102 @@
-"""A sweep in a folder: numbers and text only.
+"""A sweep in a folder, as numbers and text only.
 
     sweep.json            study, options, space of the hyper-parameters, worst features
     table.parquet         the table
-    failing.parquet       what each row failed with
+    failing.parquet       counterexamples of each row
     curves.npz            the learning curves
     policies/12.npz       the policy of row 12; `rl.load_policy` reads it too
 
-The study is code, which no file names to be run: `load_sweep(path, study)` gets it from a person.
+The study is code, which the files never name: `load_sweep(folder, study)` takes it from its caller.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.core.targets import load_target
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.sweeps.record import Curve, SweepRecord
-from verifai_jax.sweeps.result import Sweep
-from verifai_jax.sweeps.study import Study
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RECORD = "sweep.json"
+"""File of everything that is neither table, policy nor curve."""
 TABLE = "table.parquet"
+"""File of the table."""
 FAILING = "failing.parquet"
+"""File of the counterexamples."""
 CURVES = "curves.npz"
+"""File of the learning curves."""
 POLICIES = "policies"
-FORMAT = 1
+"""Folder of the policies."""
+FORMAT = 2
+"""Format of the files; another one is refused."""
 _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version", "seconds")
+"""Fields of the record that are plain data."""
 
 
 class SweepFileError(ValueError):
-    """A folder that holds no sweep of ours, or one of another study."""
+    """An error for a folder that holds no sweep, or the sweep of another study."""
 
 
-def save_sweep(sweep: Sweep, path: str | Path) -> Path:
-    """Write a sweep to a folder, in place of one that it may hold; returns the folder."""
-    folder, record = Path(path), sweep.record
+class StoredSweep(NamedTuple):
+    """The contents of a sweep's folder.
+
+    - `record`: table, policies, curves and options; without certificates once it was read.
+    - `space`: of the hyper-parameters, where it is known.
+    - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `failing`: counterexamples of all rows, with a column `row`.
+    """
+
+    record: SweepRecord
+    space: FeatureSpace | None
+    used: Mapping[str, tuple[str, ...]]
+    failing: "pd.DataFrame"
+
+
+def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Path:
+    """Write a sweep to a folder, in place of one that it may hold.
+
+    **Arguments:**
+
+    - `stored`: the sweep.
+    - `table`: its table, the columns of the record.
+    - `folder`: the folder; it is created.
+
+    **Returns:** the folder.
+    """
+    record = stored.record
     (folder / POLICIES).mkdir(parents=True, exist_ok=True)
-    # Whole only once its record is there.
+    # The record is written last: a folder without it holds no sweep.
     (folder / RECORD).unlink(missing_ok=True)
     for old in (folder / POLICIES).glob("*.npz"):
         old.unlink()
-    mixed = _mixed(sweep.table)
-    texts = {name: [json.dumps(_plain(v)) for v in sweep.table[name]] for name in mixed}
-    sweep.table.assign(**texts).to_parquet(folder / TABLE)
+    mixed = _mixed_columns(table)
+    texts = {name: [json.dumps(_plain(v)) for v in table[name]] for name in mixed}
+    table.assign(**texts).to_parquet(folder / TABLE)
     for i, policy in enumerate(record.policies):
         if policy is not None:
-            notes = {"study": record.study, "row": i, "verdict": str(sweep.table.loc[i, "verdict"])}
+            notes = {"study": record.study, "row": i, "verdict": str(table.loc[i, "verdict"])}
             save_policy(policy, folder / POLICIES / f"{i}.npz", **notes)
-    _failing(sweep).to_parquet(folder / FAILING)
-    arrays: dict[str, Any] = {}
+    stored.failing.to_parquet(folder / FAILING)
+    arrays: dict[str, np.ndarray] = {}
     for (configuration, seed), curve in record.curves.items():
         arrays[f"{configuration}/{seed}/steps"] = np.asarray(curve.steps)
         arrays[f"{configuration}/{seed}/mean_return"] = np.asarray(curve.mean_return)
-    np.savez_compressed(folder / CURVES, **arrays)
+    np.savez_compressed(folder / CURVES, **arrays)  # pyright: ignore[reportArgumentType]
     data = {name: _plain(getattr(record, name)) for name in _PLAIN}
-    data |= {"format": FORMAT, "complete": record.complete, "rows": record.rows}
     data |= {
-        "used": _plain(sweep.used),
+        "format": FORMAT,
+        "complete": record.complete,
+        "rows": record.rows,
+        "used": _plain(stored.used),
         "mixed": mixed,
         "worst": _plain(record.worst),
-        "space": _space_data(sweep.space),
+        "space": _space_to_json(stored.space),
     }
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(data, indent=2) + "\n")
@@ -71,48 +104,38 @@ def save_sweep(sweep: Sweep, path: str | Path) -> Path:
     return folder
 
 
-def load_sweep(path: str | Path, study: Study | str | None = None) -> Sweep:
-    """Read a sweep back from the folder that `Sweep.save` wrote.
-
-    - `study`: or its name, such as `"specs/cartpole.py:safe_training"`; needed for `.problem(i)`
-      and new counterexamples. The file says which it was, and names no code to run.
-
-    The certificates are those of the table, and what the policies failed with; the object that
-    made them is not saved.
+def read_description(folder: Path) -> dict[str, Any]:
+    """Read the record's file of a folder.
 
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
-    one, one of another format, or a study of another name or with other hyper-parameters.
+    file, or one of another format.
     """
-    folder = Path(path)
-    if not (folder / RECORD).exists():
+    file = folder / RECORD
+    if not file.exists():
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
-        data = json.loads((folder / RECORD).read_text())
+        data = json.loads(file.read_text())
     except ValueError as error:
-        raise SweepFileError(f"{folder / RECORD} is damaged: {error}") from error
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        found = data.get("format") if isinstance(data, dict) else None
-        raise SweepFileError(f"{folder / RECORD} has format {found!r}; this version reads {FORMAT}")
-    if isinstance(study, str):
-        study = load_target(study, Study)
-    if study is not None:
-        _check_same(folder, data, study)
-    try:
-        record = _record(folder, data)
-        space = _space_from(data["space"])
-        failing = _failing_from(folder)
-    except FileNotFoundError as error:
-        raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
-    used = {name: tuple(has) for name, has in data.get("used", {}).items()}
-    return Sweep(record, study, None if study is not None else space, folder, failing, used)
+        raise SweepFileError(f"{file} is damaged: {error}") from error
+    form = data.get("format") if isinstance(data, dict) else None
+    if form != FORMAT:
+        raise SweepFileError(
+            f"{file} has format {form!r}, and this verifai_jax reads format {FORMAT}; "
+            "read it with the version that wrote it"
+        )
+    return data
 
 
-def _check_same(folder: Path, data: Mapping[str, Any], study: Study) -> None:
+def check_study(
+    description: Mapping[str, Any], folder: Path, name: str, columns: Sequence[str]
+) -> None:
+    """Check that a folder holds the sweep of this study.
+
+    **Raises:** `SweepFileError` for another name or other hyper-parameters.
+    """
     for what, recorded, given in (
-        ("name", data["study"], study.name),
-        ("hyper-parameters", list(data["hyperparameters"]), list(study.space.columns)),
+        ("name", description["study"], name),
+        ("hyper-parameters", list(description["hyperparameters"]), list(columns)),
     ):
         if recorded != given:
             raise SweepFileError(
@@ -121,17 +144,39 @@ def _check_same(folder: Path, data: Mapping[str, Any], study: Study) -> None:
             )
 
 
-def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
+def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
+    """Read a sweep from a folder.
+
+    **Arguments:**
+
+    - `description`: of the folder, as `read_description` returns it.
+    - `folder`: the folder.
+
+    **Raises:** `SweepFileError` where a file is missing or damaged.
+    """
     import pandas as pd
 
-    frame = pd.read_parquet(folder / TABLE)
-    if len(frame) != data["rows"] or len(data["worst"]) != data["rows"]:
+    try:
+        used = {name: tuple(names) for name, names in description.get("used", {}).items()}
+        record, space = _read_record(folder, description), _space_from_json(description["space"])
+        return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
+    except FileNotFoundError as error:
+        raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
+
+
+def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
+    import pandas as pd
+
+    table = pd.read_parquet(folder / TABLE)
+    rows = description["rows"]
+    if len(table) != rows or len(description["worst"]) != rows:
         raise SweepFileError(
-            f"the sweep in {folder} is damaged: {len(frame)} rows in {TABLE}, "
-            f"{data['rows']} in {RECORD}"
+            f"the sweep in {folder} is damaged: {len(table)} rows in {TABLE}, {rows} in {RECORD}"
         )
-    for name in data.get("mixed", ()):
-        frame[name] = pd.Series([json.loads(v) for v in frame[name]], frame.index, dtype=object)
+    for name in description.get("mixed", ()):
+        table[name] = pd.Series([json.loads(v) for v in table[name]], table.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
     with np.load(folder / CURVES, allow_pickle=False) as arrays:
         for name in arrays.files:
@@ -140,24 +185,24 @@ def _record(folder: Path, data: Mapping[str, Any]) -> SweepRecord:
                 returns = arrays[f"{configuration}/{seed}/mean_return"]
                 curves[int(configuration), int(seed)] = Curve(arrays[name], returns)
     policies: list[Policy | None] = []
-    for i in range(len(frame)):
+    for i in range(len(table)):
         file = folder / POLICIES / f"{i}.npz"
         policies.append(load_policy(file) if file.exists() else None)
     return SweepRecord(
-        columns={str(name): frame[name].to_numpy() for name in frame.columns},
+        columns={str(name): table[name].to_numpy() for name in table.columns},
         policies=tuple(policies),
-        worst=tuple(data["worst"]),
+        worst=tuple(description["worst"]),
         curves=curves,
         certificates=None,
-        complete=bool(data["complete"]),
-        hyperparameters=tuple(data["hyperparameters"]),
-        certified=tuple(data["certified"]),
-        **{name: data[name] for name in ("study", "seed", "options", "version", "seconds")},
+        complete=bool(description["complete"]),
+        hyperparameters=tuple(description["hyperparameters"]),
+        certified=tuple(description["certified"]),
+        **{name: description[name] for name in ("study", "seed", "options", "version", "seconds")},
     )
 
 
-def _mixed(table: Any) -> list[str]:
-    """Columns of choices that are not all texts, which Parquet does not have: a number or None."""
+def _mixed_columns(table: "pd.DataFrame") -> list[str]:
+    """Return the names of columns with choices of several types, which Parquet does not have."""
     return [
         str(name)
         for name in table.columns
@@ -165,40 +210,23 @@ def _mixed(table: Any) -> list[str]:
     ]
 
 
-def _failing(sweep: Sweep) -> Any:
-    """What the rows failed with, one below the other."""
-    import pandas as pd
-
-    parts = [sweep.met(i).assign(row=i) for i in range(sweep.record.rows)]
-    return pd.concat([part for part in parts if len(part)] or [pd.DataFrame({"row": [0]})[:0]])
-
-
-def _failing_from(folder: Path) -> dict[int, Any]:
-    import pandas as pd
-
-    frame: Any = pd.read_parquet(folder / FAILING)
-    return {
-        int(i): part.drop(columns="row").reset_index(drop=True) for i, part in frame.groupby("row")
-    }
-
-
-def _space_data(space: FeatureSpace | None) -> Any:
+def _space_to_json(space: FeatureSpace | None) -> dict[str, Any] | None:
     try:
         return None if space is None else space.to_json()
     except ValueError:
-        return None  # Domains of the user's own: the table alone has to do.
+        return None  # Domains of the user's own cannot be stored; the table is enough.
 
 
-def _space_from(data: Any) -> FeatureSpace | None:
-    # The constraint is code; the domains without it are enough for what a result does with them.
+def _space_from_json(data: Mapping[str, Any] | None) -> FeatureSpace | None:
+    # The constraint is code; the domains without it are enough for a result.
     try:
         return None if data is None else FeatureSpace.from_json({**data, "where": None})
     except ValueError:
         return None
 
 
-def _plain(value: Any) -> Any:
-    """NumPy numbers and tuples as JSON has them."""
+def _plain(value: object) -> Any:
+    """Convert NumPy numbers and tuples to what JSON has."""
     if isinstance(value, Mapping):
         return {str(name): _plain(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""What to sweep: a space of hyper-parameters, what they train, and what a policy must keep.
+"""A study: a space of hyper-parameters, a trainer, and the specification of a safe policy.
 
     study = Study(
         "safe_training",
@@ -8,7 +8,7 @@
         snapshots=(8_192, 16_384, 32_768),
     )
 
-`Study.check()` says everything that is wrong with it before anything trains.
+`Study.check()` finds everything that is wrong with it before anything trains.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,89 +18,116 @@ from typing import Any
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.domain import Domain
 from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.curves import check_curve
-from verifai_jax.sweeps.trainer import STEPS, StudyError, Trainer, probes
+from verifai_jax.sweeps.hyperparameters import probe_values
+from verifai_jax.sweeps.trainer import ALGORITHM, STEPS, StudyError, Trainer
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Study:
-    """Hyper-parameters to sweep, under a name.
+    """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
 
     **Arguments:**
 
-    - `name`: how the command line and the report call it.
+    - `name`: name on the command line and in results.
     - `space`: of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
-    - `trainer`: what they train.
+    - `trainer`: the task and the algorithms.
     - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
       weights.
-    - `snapshots`: environment steps at which a training's policy is a row of the table; the end of
-      the training always is one.
-    - `seeds`: training seeds of each configuration: how many (0, 1, ...), or which.
-    - `p`: the failure probability below which a policy is called safe.
+    - `snapshots`: environment steps at which a training's policy is a row of the table, beside the
+      end of the training.
+    - `seeds`: training seeds of each configuration: their number (0, 1, ...), or the seeds.
+    - `p`: the failure probability below which a policy is safe, between 0 and 1.
     - `curve`: a formula over the learning curve, whose time is environment steps; None for none.
     - `description`: one line.
 
-    `training_seeds` and `curve_formula` are the seeds and the formula.
+    **Fields** beside these:
 
-    **Raises:** `StudyError` for parts of a wrong kind or out of range; what the parser says of
-    the curve's formula.
+    - `training_seeds`: the seeds.
+    - `curve_formula`: the parsed formula.
+
+    **Raises:** `StudyError` for parts of a wrong kind or out of range; `FormulaSyntaxError` and
+    `UnknownNameError` for the formula of the curve.
     """
 
     name: str
     space: FeatureSpace
     trainer: Trainer
     problem: Callable[[Policy], Problem]
-    snapshots: Sequence[int] = ()
-    seeds: int | Sequence[int] = 1
-    p: float = 0.01
-    curve: Formula | str | None = None
-    description: str = ""
+    snapshots: tuple[int, ...]
+    seeds: int | Sequence[int]
+    p: float
+    curve: Formula | str | None
+    description: str
     training_seeds: tuple[int, ...] = field(init=False, repr=False)
-    curve_formula: Formula | None = field(init=False, repr=False, default=None)
-    _problems: dict[str, Problem] = field(init=False, repr=False, default_factory=dict)
+    curve_formula: Formula | None = field(init=False, repr=False)
+    _problems: dict[str, Problem] = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise StudyError(f"a study needs a name; got {self.name!r}")
-        if isinstance(self.space, Mapping):
-            object.__setattr__(self, "space", FeatureSpace(self.space))
-        if not isinstance(self.space, FeatureSpace):
+    def __init__(
+        self,
+        name: str,
+        space: FeatureSpace | Mapping[str, Domain],
+        trainer: Trainer,
+        problem: Callable[[Policy], Problem],
+        snapshots: Sequence[int] = (),
+        seeds: int | Sequence[int] = 1,
+        p: float = 0.01,
+        curve: Formula | str | None = None,
+        description: str = "",
+    ) -> None:
+        if not isinstance(name, str) or not name.strip():
+            raise StudyError(f"a study needs a name; got {name!r}")
+        if isinstance(space, Mapping):
+            space = FeatureSpace(space)
+        if not isinstance(space, FeatureSpace):
             raise StudyError(
-                f"space must be a FeatureSpace or a dictionary of domains; got {self.space!r}"
+                f"space must be a FeatureSpace or a dictionary of domains; got {space!r}"
             )
-        if not isinstance(self.trainer, Trainer):
-            raise StudyError(f"trainer must be a Trainer; got {self.trainer!r}")
-        if isinstance(self.problem, Problem) or not callable(self.problem):
+        if not isinstance(trainer, Trainer):
+            raise StudyError(f"trainer must be a Trainer; got {trainer!r}")
+        if isinstance(problem, Problem) or not callable(problem):
             raise StudyError(
-                f"problem must be a function from a policy to a Problem; got {self.problem!r}"
+                f"problem must be a function from a policy to a Problem; got {problem!r}"
             )
-        object.__setattr__(self, "training_seeds", _seeds(self.seeds))
-        snapshots = tuple(check_count("a snapshot", at, error=StudyError) for at in self.snapshots)
-        object.__setattr__(self, "snapshots", tuple(sorted(set(snapshots))))
-        check_fraction("p", self.p, error=StudyError)
-        if self.curve is not None:
-            object.__setattr__(self, "curve_formula", check_curve(self.curve))
+        check_fraction("p", p, error=StudyError)
+        steps = {check_count("a snapshot", at, error=StudyError) for at in snapshots}
+        values = {
+            "name": name,
+            "space": space,
+            "trainer": trainer,
+            "problem": problem,
+            "snapshots": tuple(sorted(steps)),
+            "seeds": seeds,
+            "p": p,
+            "curve": curve,
+            "description": description,
+            "training_seeds": _seeds(seeds),
+            "curve_formula": None if curve is None else check_curve(curve),
+            "_problems": {},
+        }
+        for attribute, value in values.items():
+            object.__setattr__(self, attribute, value)
 
     def snapshots_of(self, steps: int) -> tuple[int, ...]:
-        """The environment steps of the rows of a training that takes so many."""
+        """Return the environment steps of the rows of a training that takes `steps` in all."""
         return (*(at for at in self.snapshots if at < steps), steps)
 
     def check(self) -> None:
-        """Refuse what cannot be swept, before anything compiles or trains.
+        """Check that the study can be swept, before anything compiles or trains.
 
         **Raises:** `StudyError` and `UnknownNameError` as `Trainer.check`; `StudyError` for
         snapshots after the end of every training, and for a problem that raises for an untrained
-        policy, returns no `Problem`, or has a specification over signals that its closed loop
-        lacks.
+        policy, is no `Problem`, or has a specification over signals that its closed loop lacks.
         """
         self.trainer.check(self.space)
         self.space.check_where()
         most = self.trainer.steps
         if STEPS in self.space.domains:
-            most = max(int(value) for value, _ in probes(self.space.domains[STEPS]))
+            most = max(int(value) for value, _ in probe_values(self.space.domains[STEPS]))
         late = [at for at in self.snapshots if at > most]
         if late:
             raise StudyError(f"snapshots must lie between 1 and steps = {most}; got {late[0]}")
@@ -116,28 +143,34 @@ class Study:
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """The names of the algorithms that the space can choose."""
-        from verifai_jax.sweeps.trainer import ALGORITHM
-
+        """Names of the algorithms that the space can choose."""
         if ALGORITHM not in self.space.domains:
             return tuple(self.trainer.by_name)
-        return tuple(value for value, _ in probes(self.space.domains[ALGORITHM]))
+        return tuple(value for value, _ in probe_values(self.space.domains[ALGORITHM]))
 
     def untrained_problem(self) -> Problem:
-        """The problem of a policy whose weights are all zero."""
+        """Return the problem of a policy whose weights are all zero."""
         return self._problem_of(self.algorithms[0])
 
     def only(self, *names: str, nominal: Mapping[str, Any] | None = None) -> "Study":
-        """The same study with these hyper-parameters varied alone; see `FeatureSpace.only`."""
+        """Return the study with these hyper-parameters varied alone; see `FeatureSpace.only`.
+
+        **Arguments:**
+
+        - `names`: hyper-parameters to vary.
+        - `nominal`: values of the others.
+
+        **Raises:** `UnknownNameError` for another name; `ValueError` for a missing value.
+        """
         return replace(self, space=self.space.only(*names, nominal=nominal))
 
     def _problem_of(self, algorithm: str) -> Problem:
         if algorithm not in self._problems:
-            self._problems[algorithm] = self._made_problem(algorithm)
+            self._problems[algorithm] = self._build_problem(algorithm)
         return self._problems[algorithm]
 
-    def _made_problem(self, algorithm: str) -> Problem:
-        policy = self.trainer.untrained(algorithm)
+    def _build_problem(self, algorithm: str) -> Problem:
+        policy = self.trainer.untrained_policy(algorithm)
         try:
             problem = self.problem(policy)
         except Exception as error:
@@ -166,10 +199,11 @@ class Study:
         return f"{self.trainer.steps} steps"
 
 
-def _seeds(seeds: Any) -> tuple[int, ...]:
+def _seeds(seeds: object) -> tuple[int, ...]:
+    """Return the training seeds; a number of them stands for 0, 1, ..."""
     if isinstance(seeds, Sequence) and not isinstance(seeds, str):
-        found = tuple(check_count("a training seed", seed, 0, error=StudyError) for seed in seeds)
-        if not found or len(set(found)) < len(found):
+        chosen = tuple(check_count("a training seed", seed, 0, error=StudyError) for seed in seeds)
+        if not chosen or len(set(chosen)) < len(chosen):
             raise StudyError(f"training seeds must be different, at least one; got {seeds!r}")
-        return found
+        return chosen
     return tuple(range(check_count("seeds", seeds, error=StudyError)))

@@ -9,13 +9,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 SHUFFLES = 1000
+"""Shuffled outcomes that decide what chance can do."""
 
 
 class Trends(NamedTuple):
-    """Spearman's rank correlation of each input with the outcome; NaN for one that is constant.
+    """Rank correlations of inputs with an outcome.
 
-    `chance`: what the greatest of all of them stays below in 95 % of shuffled outcomes, so that
-    one beyond it is a finding however many inputs there are.
+    - `correlation`: Spearman's, of each input; NaN for one that is constant.
+    - `chance`: limit below which the greatest of all correlations stays in 95 % of shuffled
+      outcomes; one beyond it is significant, however many inputs there are.
     """
 
     correlation: Float[np.ndarray, " d"]
@@ -28,26 +30,26 @@ def trends(
     groups: Int[np.ndarray, " n"],
     seed: int = 0,
 ) -> Trends:
-    """Trends over groups of rows, which count once, with their means."""
+    """Correlate inputs with an outcome over groups of rows, each of which counts by its mean."""
     distinct, member = np.unique(groups, return_inverse=True)
     counts = np.bincount(member)
     means = np.stack(
         [np.bincount(member, column) / counts for column in (outcome, *inputs.T)], axis=1
     )
-    ranks = _ranked(means)
+    ranks = _rank(means)
     result, columns = ranks[:, 0], ranks[:, 1:]
     rng = np.random.default_rng(seed)
     shuffled = np.stack([result, *(rng.permutation(result) for _ in range(SHUFFLES))])
     with np.errstate(invalid="ignore"):
-        found = shuffled @ columns / len(distinct)
+        correlations = shuffled @ columns / len(distinct)
     constant = (columns == 0).all(axis=0)
-    greatest = np.abs(found[1:, ~constant]).max(axis=1, initial=0.0)
-    correlation = np.where(constant, np.nan, found[0])
+    greatest = np.abs(correlations[1:, ~constant]).max(axis=1, initial=0.0)
+    correlation = np.where(constant, np.nan, correlations[0])
     return Trends(correlation, float(np.quantile(greatest, 0.95)))
 
 
-def _ranked(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    """Ranks of each column, equal ones sharing theirs, with mean 0 and deviation 1 (or all 0)."""
+def _rank(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Return ranks of columns with mean 0 and deviation 1 (or all 0); equal values share one."""
     ranks = np.empty(values.shape)
     for j, column in enumerate(values.T):
         _, place, counts = np.unique(column, return_inverse=True, return_counts=True)

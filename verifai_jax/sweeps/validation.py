@@ -1,6 +1,4 @@
-"""What a sweep is asked for, refused before anything trains."""
-
-from typing import Any
+"""Checks of the options of a sweep, before anything trains."""
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.sweeps.halving import Halving
@@ -8,8 +6,8 @@ from verifai_jax.sweeps.study import Study, StudyError
 from verifai_jax.sweeps.trainer import STEPS
 
 
-def check_asked(
-    study: Any,
+def check_options(
+    study: object,
     *,
     configurations: int,
     seed: int,
@@ -17,16 +15,16 @@ def check_asked(
     confidence: float,
     budget: int | None,
     attack_simulations: int,
-    halving: Any,
+    halving: object,
     batch: int | None,
     episodes: int,
     max_seconds: float | None,
 ) -> None:
-    """Refuse options of a sweep that make no sense, alone or with this study.
+    """Check the options of a sweep, alone and with its study.
 
     **Raises:** `TypeError` for something that is no study or no `Halving`; `ValueError` for a
-    number out of range, or a budget that not all policies can be sampled with; `StudyError` for
-    halving without snapshots or of trainings of several lengths.
+    number out of range, or a budget that cannot sample all policies; `StudyError` for halving
+    without snapshots or of trainings of several lengths.
     """
     if not isinstance(study, Study):
         raise TypeError(f"sweep needs a Study; got {study!r}")
@@ -43,26 +41,28 @@ def check_asked(
     if halving is not None:
         _check_halving(study, halving)
     if budget is not None:
-        most = most_policies(study, configurations, halving)
-        if budget < most * samples:
+        policies = count_policies(
+            study, configurations, halving if isinstance(halving, Halving) else None
+        )
+        if budget < policies * samples:
             raise ValueError(
-                f"{most} policies with {samples} samples each need a budget of at least "
-                f"{most * samples}; got {budget}"
+                f"{policies} policies with {samples} samples each need a budget of at least "
+                f"{policies * samples}; got {budget}"
             )
 
 
-def most_policies(study: Study, configurations: int, halving: Halving | None) -> int:
-    """How many rows a sweep has at most."""
-    lengths = STEPS in study.space.domains
-    rungs = 1 + sum(lengths or at < study.trainer.steps for at in study.snapshots)
-    going, total = configurations, 0
-    for _ in range(rungs):
-        total += going
-        going = going if halving is None else halving.count(going)
+def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
+    """Return the greatest number of rows that a sweep can have."""
+    several_lengths = STEPS in study.space.domains
+    snapshots = 1 + sum(several_lengths or at < study.trainer.steps for at in study.snapshots)
+    left, total = configurations, 0
+    for _ in range(snapshots):
+        total += left
+        left = left if halving is None else halving.survivors(left)
     return total * len(study.training_seeds)
 
 
-def _check_halving(study: Study, halving: Any) -> None:
+def _check_halving(study: Study, halving: object) -> None:
     if not isinstance(halving, Halving):
         raise TypeError(f"halving must be a Halving; got {halving!r}")
     if STEPS in study.space.domains:
