@@ -102,7 +102,7 @@ class Categorical(Domain):
 
     @cached_property
     def numeric(self) -> bool:
-        """Whether a value is the choice itself rather than its place in `choices`."""
+        """True if a value is the choice itself rather than its place in `choices`."""
         return self._dtype.kind != "O"
 
     @cached_property

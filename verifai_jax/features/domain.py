@@ -119,7 +119,7 @@ class Domain(abc.ABC):
 
     @property
     def ordered(self) -> tuple[bool, ...]:
-        """Whether the values of each unit coordinate have an order; choices have none."""
+        """Order of each unit coordinate: True if its values have one; choices have none."""
         return (True,) * self.size
 
     @property

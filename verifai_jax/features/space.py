@@ -80,7 +80,7 @@ class FeatureSpace:
 
     @cached_property
     def ordered(self) -> tuple[bool, ...]:
-        """Whether the values of each coordinate have an order."""
+        """Order of each coordinate: True if its values have one."""
         return self.root.ordered
 
     @cached_property
