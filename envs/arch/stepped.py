@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import bound
+from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.ode.integrators import check_factor
@@ -97,7 +97,7 @@ class Stepped(System):
         collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
     ) -> tuple[Any, Any, Any]:
         self.check(features)
-        features = bound({**self.nominal, **features}, self.duration)
+        features = set_durations({**self.nominal, **features}, self.duration)
 
         # A gradient's way back takes each step again instead of storing what is within it: a
         # quarter faster where a step has stages, and quicker to compile.

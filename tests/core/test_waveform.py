@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from verifai_jax.core.waveform import Waveform, bound
+from verifai_jax.core.waveform import Waveform, set_durations
 
 KNOTS = np.float32([1, -2, 0.5, 4, 4])
 LINEAR = Waveform(jnp.asarray(KNOTS), "linear", 2.0)
@@ -70,7 +70,7 @@ def test_a_duration_is_needed_and_can_be_given():
         unbound(0.5)
     assert float(unbound.over(2.0)(0.625)) == float(LINEAR(0.625))
     features = {"wind": unbound, "x": 1.0, "short": LINEAR, "many": [unbound]}
-    given = bound(features, 8.0)
+    given = set_durations(features, 8.0)
     assert given["wind"].duration == given["many"][0].duration == 8.0
     assert given["short"].duration == 2.0
 

@@ -7,6 +7,7 @@ import operator
 from hypothesis import strategies as st
 
 from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal, signal
 
 DT = 0.5
 COMPARE = {
@@ -39,15 +40,15 @@ class Oracle:
 
     def number(self, e, i):
         match e:
-            case ast.Number(value):
+            case Number(value):
                 return value
-            case ast.Signal(name):
+            case Signal(name):
                 return self.signals[name][min(i, self.length - 1)]
-            case ast.Component(ast.Signal(name), k):
+            case Component(Signal(name), k):
                 return self.signals[name][min(i, self.length - 1)][k]
-            case ast.Arithmetic("norm", (ast.Signal(name),)):
+            case Arithmetic("norm", (Signal(name),)):
                 return math.hypot(*self.signals[name][min(i, self.length - 1)])
-            case ast.Arithmetic(name, arguments):
+            case Arithmetic(name, arguments):
                 values = [self.number(a, i) for a in arguments]
                 return {
                     "+": lambda: values[0] + values[1],
@@ -163,7 +164,7 @@ class Oracle:
 # Random formulas
 
 _quarters = st.integers(-8, 8).map(lambda n: n / 4)
-_signals = st.sampled_from([ast.signal("x"), ast.signal("y")])
+_signals = st.sampled_from([signal("x"), signal("y")])
 _expressions = st.one_of(
     _signals,
     _signals,
@@ -171,16 +172,16 @@ _expressions = st.one_of(
     st.builds(lambda a, b: a - b, _signals, _signals),
     st.builds(lambda a, b: a * 2 + b, _signals, _quarters),
     st.builds(lambda a, b: a.min(b), _signals, _quarters),
-    st.builds(lambda k: ast.signal("p")[k], st.integers(0, 1)),
+    st.builds(lambda k: signal("p")[k], st.integers(0, 1)),
 )
 _leaves = st.one_of(
     st.builds(
         ast.Predicate,
         st.sampled_from(["<", "<=", ">", ">="]),
         _expressions,
-        _quarters.map(ast.Number),
+        _quarters.map(Number),
     ),
-    st.builds(ast.Predicate, st.sampled_from(["==", "!="]), _signals, _quarters.map(ast.Number)),
+    st.builds(ast.Predicate, st.sampled_from(["==", "!="]), _signals, _quarters.map(Number)),
     st.builds(ast.Atom, _signals),
     st.sampled_from([ast.TRUE, ast.FALSE]),
 )

@@ -11,13 +11,13 @@ from mtl_oracle import DT, Oracle, formulas, recordings
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import (
     boolean,
-    certificate,
     nnf,
     parse,
     robustness,
     robustness_signal,
     simplify,
     smooth,
+    smoothing_error,
 )
 
 # Every example is another program: compiling them would take far longer than running them.
@@ -54,7 +54,7 @@ def test_smooth_stays_within_its_certificate(formula, recording, tau):
     if np.isinf(exact):
         assert value == exact
         return
-    sides = certificate(formula, trace)
+    sides = smoothing_error(formula, trace)
     rounding = 1e-9
     assert value - tau * sides.above <= exact + rounding
     assert exact <= value + tau * sides.below + rounding

@@ -7,38 +7,38 @@ import pytest
 
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl import anneal, normalised, parse, robustness, satisfied
+from verifai_jax.mtl import anneal, normalize, parse, robustness, satisfied
 
 FORMULA = parse("G (abs(x) <= 2.4 & abs(theta) <= 0.2) & F (x > 0)")
 
 
 def test_scales_divide_both_sides():
-    scaled = normalised(FORMULA, {"x": 2.4, "theta": 0.2})
+    scaled = normalize(FORMULA, {"x": 2.4, "theta": 0.2})
     expected = "G (abs(x) / 2.4 <= 1 & abs(theta) / 0.2 <= 1) & F (x / 2.4 > 0)"
     assert scaled == parse(expected)
 
 
 def test_a_scale_keeps_the_truth_and_makes_the_margin_relative():
     trace = Trace({"x": np.array([0.0, 1.2, 0.6]), "theta": np.array([0.1, 0.0, -0.19])}, dt=0.1)
-    scaled = normalised(FORMULA, {"x": 2.4, "theta": 0.2})
+    scaled = normalize(FORMULA, {"x": 2.4, "theta": 0.2})
     assert bool(satisfied(scaled, trace)) == bool(satisfied(FORMULA, trace))
     np.testing.assert_allclose(robustness(scaled, trace), 0.05, rtol=1e-5)
 
 
 def test_scales_from_a_trace_are_the_ranges_of_the_margins():
     trace = Trace({"x": np.array([0.0, 1.0, 4.0]), "theta": np.array([0.0, 0.1, 0.0])}, dt=0.1)
-    scaled = normalised(parse("G (x < 8 & theta < 0.3 & 2 > 1)"), trace)
+    scaled = normalize(parse("G (x < 8 & theta < 0.3 & 2 > 1)"), trace)
     np.testing.assert_allclose(robustness(scaled, trace), 1.0, rtol=1e-6)
     assert str(scaled).startswith("always (x / 4 < 2 & theta / 0.1 < ")
 
 
 def test_wrong_scales():
     with pytest.raises(UnknownNameError, match="unknown signal 'theta2'; did you mean 'theta'"):
-        normalised(FORMULA, {"x": 1.0, "theta2": 1.0})
+        normalize(FORMULA, {"x": 1.0, "theta2": 1.0})
     with pytest.raises(ValueError, match="these signals need a scale: theta"):
-        normalised(FORMULA, {"x": 1.0})
+        normalize(FORMULA, {"x": 1.0})
     with pytest.raises(ValueError, match="scale of 'x' must be positive and finite; got 0"):
-        normalised(FORMULA, {"x": 0.0, "theta": 1.0})
+        normalize(FORMULA, {"x": 0.0, "theta": 1.0})
 
 
 def test_annealing_is_geometric_and_may_be_traced():

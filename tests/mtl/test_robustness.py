@@ -12,7 +12,6 @@ from verifai_jax.mtl import (
     IntervalError,
     always,
     boolean,
-    certificate,
     eventually,
     hard,
     parse,
@@ -21,6 +20,7 @@ from verifai_jax.mtl import (
     satisfied,
     signal,
     smooth,
+    smoothing_error,
 )
 from verifai_jax.mtl import formula as ast
 
@@ -263,7 +263,7 @@ def test_single_precision_is_finite_at_every_scale(scale, tau):
     value, gradient = run(signals, jnp.float32(tau))
     assert np.isfinite(value)
     assert all(np.isfinite(g).all() for g in gradient.values())
-    sides = certificate(NESTED, Trace(signals, dt=0.1))
+    sides = smoothing_error(NESTED, Trace(signals, dt=0.1))
     exact = float(robustness(NESTED, Trace(signals, dt=0.1)))
     slack = 1e-5 * max(scale, tau)
     assert value - tau * sides.above - slack <= exact <= value + tau * sides.below + slack

@@ -1,4 +1,4 @@
-"""How many clauses of a requirement are told apart; `mtl.clauses` computes them for searches."""
+"""The number of clauses of a requirement that have values of their own (`mtl.clauses`)."""
 
 CLAUSES = 4
 """Clauses of a goal that have values of their own; those beyond are joined in the last one."""

@@ -81,7 +81,7 @@ class Cube:
         )
 
     def take(self, places: tuple[int, ...]) -> "Cube":
-        """The cube of these coordinates alone."""
+        """Return the cube of these coordinates alone."""
         return Cube(
             levels=tuple(self.levels[i] for i in places),
             weights=tuple(self.weights[i] for i in places),
@@ -96,7 +96,7 @@ class Cube:
         )
 
     def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
-        """Which cell holds each discrete coordinate of these points."""
+        """Return the cell of each discrete coordinate of these points."""
         points = jnp.asarray(u)[..., self.discrete]
         counts = np.array([self.levels[i] for i in self.discrete], np.int32)
         found = jnp.clip((points * counts).astype(jnp.int32), 0, counts - 1)
@@ -106,7 +106,7 @@ class Cube:
         return found
 
     def centres(self, cells: Int[Array, "*n k"]) -> Float[Array, "*n k"]:
-        """The middles of these cells, as coordinates."""
+        """Return the middles of these cells, as coordinates."""
         counts = np.array([self.levels[i] for i in self.discrete], np.float32)
         middles = ((jnp.asarray(cells) + 0.5) / counts).astype(jnp.float32)
         for j, edges in self._edges:

@@ -1,4 +1,4 @@
-"""What a simulation leaves behind: named signals on one clock.
+"""The trace of a simulation: named signals on one clock.
 
     Trace({"x": xs, "theta": thetas}, dt=0.02)
     Trace({"x": xs}, times=ts)                              # a recording, not evenly sampled
@@ -21,7 +21,7 @@ Samples: TypeAlias = Float[Array | np.ndarray, "time *k"]
 
 
 class Status(enum.IntEnum):
-    """How a simulation ended. Only `OK` rows carry a verdict."""
+    """The end of a simulation; only `OK` rows carry a verdict."""
 
     OK = 0
     NONFINITE = 1
@@ -91,14 +91,14 @@ class Trace:
         return np.shape(next(iter(self.signals.values())))[0]
 
     def clock(self) -> Float[Array, " time"]:
-        """Sample times `[time]` in seconds."""
+        """Return the sample times `[time]` in seconds."""
         if self.times is not None:
             return jnp.asarray(self.times)
         assert self.dt is not None
         return jnp.arange(self.length) * self.dt
 
     def hold(self) -> "Trace":
-        """The same trace with every sample from `valid` on set to the last valid one."""
+        """Return the trace with every sample from `valid` on set to the last valid one."""
         if self.valid is None or self.held:
             return self
         index = jnp.minimum(jnp.arange(self.length), jnp.asarray(self.valid) - 1)
@@ -106,7 +106,7 @@ class Trace:
         return replace(self, signals=signals, held=True)
 
     def trim(self) -> "Trace":
-        """The valid part only, as NumPy arrays; for people and plots, not under `jit`."""
+        """Return the valid part only, as NumPy arrays; for people and plots, not under `jit`."""
         n = self.length if self.valid is None else int(self.valid)
         return replace(
             self,

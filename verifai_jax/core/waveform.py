@@ -1,4 +1,4 @@
-"""A function of time by its control points: what a `Signal` feature gives to a rollout.
+"""Functions of time by their control points, as a `Signal` feature gives them to a rollout.
 
 wind = Waveform(knots, hold="linear", duration=4.0)
 wind(time)                                                   # in seconds; traced or concrete
@@ -7,16 +7,20 @@ features["wind"].over(4.0)(time)                             # where no duration
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeGuard, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.checks import is_number
 from verifai_jax.core.errors import unknown_name
 
 HOLDS = ("linear", "constant")
+"""Courses between two control points: a line, or the value of the first."""
+
+Features = TypeVar("Features")
 
 
 @jax.tree_util.register_dataclass
@@ -42,14 +46,14 @@ class Waveform:
             raise unknown_name("hold", self.hold, HOLDS)
 
     def over(self, duration: float) -> "Waveform":
-        """The same control points over so many seconds.
+        """Return the same control points over so many seconds.
 
         **Raises:** `ValueError` for a duration that is not positive.
         """
-        return replace(self, duration=seconds(duration))
+        return replace(self, duration=check_duration(duration))
 
     def __call__(self, time: Float[Array, ""] | float) -> Float[Array, "*shape"]:
-        """The value at a time in seconds.
+        """Return the value at a time in seconds.
 
         **Raises:** `ValueError` without a duration.
         """
@@ -76,7 +80,7 @@ class Waveform:
         return knots[left] * (1 - share) + knots[left + 1] * share
 
     def refined(self, factor: int) -> "Waveform":
-        """The same function by more control points; see `Signal.refined`."""
+        """Return the same function by more control points; see `Signal.refined`."""
         knots = jnp.asarray(self.knots)
         if self.hold == "constant" or knots.shape[0] == 1:
             return replace(self, knots=jnp.repeat(knots, factor, axis=0))
@@ -86,26 +90,25 @@ class Waveform:
         return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
 
 
-def seconds(duration: Any) -> float:
-    """A duration, checked.
+def check_duration(duration: object) -> float:
+    """Check a duration in seconds.
 
     **Raises:** `ValueError` unless it is a positive finite number.
     """
-    number = isinstance(duration, int | float | np.number) and not isinstance(duration, bool)
-    if not (number and 0 < duration < math.inf):
+    if not is_number(duration) or not 0 < duration < math.inf:
         raise ValueError(f"duration must be a positive number of seconds; got {duration!r}")
     return float(duration)
 
 
-def bound(features: Any, duration: float) -> Any:
-    """The same features, in which every waveform without a duration has this one."""
+def set_durations(features: Features, duration: float) -> Features:
+    """Return the features with this duration in every waveform that has none."""
 
-    def bind(leaf: Any) -> Any:
+    def bind(leaf: object) -> object:
         return leaf.over(duration) if is_waveform(leaf) and leaf.duration is None else leaf
 
     return jax.tree.map(bind, features, is_leaf=is_waveform)
 
 
-def is_waveform(value: Any) -> bool:
-    """Whether this is a `Waveform`, a leaf to `jax.tree` functions that are told so."""
+def is_waveform(value: object) -> TypeGuard[Waveform]:
+    """Return whether this is a `Waveform`, which `jax.tree` functions take as a leaf if told so."""
     return isinstance(value, Waveform)

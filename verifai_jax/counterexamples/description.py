@@ -7,7 +7,8 @@ import numpy as np
 from verifai_jax.counterexamples.influence import Influence, Span
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
-from verifai_jax.mtl.formula import Atom, Expression, Formula, Number, Predicate
+from verifai_jax.mtl.expression import Number
+from verifai_jax.mtl.formula import Atom, Formula, Predicate, Term
 
 MUST = {
     "<": "has to be below",
@@ -98,7 +99,7 @@ def describe_predicate(predicate: Predicate, why: Explanation, at: str) -> str:
     return f"at {at} {predicate.left} is {shown}: {predicate} holds where it must not"
 
 
-def value_at(expression: Expression, why: Explanation) -> float:
+def value_at(expression: Term, why: Explanation) -> float:
     """Return the value of an expression at the instant that decides."""
     formula: Formula = Atom(expression)
     signal = np.asarray(robustness_signal(formula, why.trace))

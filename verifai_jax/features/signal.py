@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.waveform import HOLDS, Waveform, is_waveform, seconds
+from verifai_jax.core.waveform import HOLDS, Waveform, check_duration, is_waveform
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
 from verifai_jax.features.domain import Domain, Row, as_numbers, indexed
@@ -53,7 +53,7 @@ class Signal(Domain):
             )
         object.__setattr__(self, "knots", int(knots))
         if self.duration is not None:
-            object.__setattr__(self, "duration", seconds(self.duration))
+            object.__setattr__(self, "duration", check_duration(self.duration))
 
     @property
     def levels(self) -> tuple[int, ...]:

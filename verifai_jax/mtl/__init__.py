@@ -2,51 +2,47 @@
 
 from verifai_jax.mtl._explain import Explanation as Explanation
 from verifai_jax.mtl._explain import explain as explain
+from verifai_jax.mtl._latex import latex as latex
 from verifai_jax.mtl._online import Online as Online
 from verifai_jax.mtl._online import online as online
-from verifai_jax.mtl._parse import FormulaSyntaxError as FormulaSyntaxError
 from verifai_jax.mtl._parse import parse as parse
-from verifai_jax.mtl._robustness import HorizonError as HorizonError
-from verifai_jax.mtl._robustness import certificate as certificate
 from verifai_jax.mtl._robustness import robustness as robustness
 from verifai_jax.mtl._robustness import robustness_signal as robustness_signal
 from verifai_jax.mtl._robustness import satisfied as satisfied
+from verifai_jax.mtl._smoothing_error import SmoothingError as SmoothingError
+from verifai_jax.mtl._smoothing_error import smoothing_error as smoothing_error
 from verifai_jax.mtl.evaluate import End as End
 from verifai_jax.mtl.evaluate import IntervalError as IntervalError
+from verifai_jax.mtl.expression import Expression as Expression
+from verifai_jax.mtl.expression import signal as signal
 from verifai_jax.mtl.formula import FALSE as FALSE
 from verifai_jax.mtl.formula import TRUE as TRUE
-from verifai_jax.mtl.formula import Expression as Expression
 from verifai_jax.mtl.formula import Formula as Formula
-from verifai_jax.mtl.formula import always as always
-from verifai_jax.mtl.formula import eventually as eventually
-from verifai_jax.mtl.formula import historically as historically
-from verifai_jax.mtl.formula import next_ as next_
-from verifai_jax.mtl.formula import once as once
-from verifai_jax.mtl.formula import prev as prev
-from verifai_jax.mtl.formula import signal as signal
-from verifai_jax.mtl.formula import since as since
-from verifai_jax.mtl.formula import until as until
+from verifai_jax.mtl.grammar import FormulaSyntaxError as FormulaSyntaxError
 from verifai_jax.mtl.normalization import anneal as anneal
-from verifai_jax.mtl.normalization import normalised as normalised
+from verifai_jax.mtl.normalization import normalize as normalize
+from verifai_jax.mtl.operators import always as always
+from verifai_jax.mtl.operators import eventually as eventually
+from verifai_jax.mtl.operators import historically as historically
+from verifai_jax.mtl.operators import next_ as next_
+from verifai_jax.mtl.operators import once as once
+from verifai_jax.mtl.operators import prev as prev
+from verifai_jax.mtl.operators import since as since
+from verifai_jax.mtl.operators import until as until
 from verifai_jax.mtl.plot import draw as draw
-from verifai_jax.mtl.printing import latex as latex
 from verifai_jax.mtl.recording import read as read
 from verifai_jax.mtl.recording import resample as resample
-from verifai_jax.mtl.rewriting import history as history
-from verifai_jax.mtl.rewriting import horizon as horizon
 from verifai_jax.mtl.rewriting import nnf as nnf
-from verifai_jax.mtl.rewriting import signals as signals
 from verifai_jax.mtl.rewriting import simplify as simplify
 from verifai_jax.mtl.semantics import Semantics as Semantics
 from verifai_jax.mtl.semantics import boolean as boolean
 from verifai_jax.mtl.semantics import hard as hard
 from verifai_jax.mtl.semantics import smooth as smooth
-from verifai_jax.mtl.smoothing_error import Certificate as Certificate
+from verifai_jax.mtl.setting import HorizonError as HorizonError
 
 __all__ = [
     "FALSE",
     "TRUE",
-    "Certificate",
     "End",
     "Explanation",
     "Expression",
@@ -56,21 +52,19 @@ __all__ = [
     "IntervalError",
     "Online",
     "Semantics",
+    "SmoothingError",
     "always",
     "anneal",
     "boolean",
-    "certificate",
     "draw",
     "eventually",
     "explain",
     "hard",
     "historically",
-    "history",
-    "horizon",
     "latex",
     "next_",
     "nnf",
-    "normalised",
+    "normalize",
     "once",
     "online",
     "parse",
@@ -81,10 +75,10 @@ __all__ = [
     "robustness_signal",
     "satisfied",
     "signal",
-    "signals",
     "simplify",
     "since",
     "smooth",
+    "smoothing_error",
     "until",
 ]
 

@@ -1,4 +1,4 @@
-"""Why a trace satisfies or breaks a formula: which predicate, when, and through which path.
+"""The reason why a trace satisfies or breaks a formula: a predicate, an instant and a path to it.
 
     why = explain("always[0, 4] (abs(x) <= 2.4 & abs(theta) <= 0.2095)", trace)
     print(why)                                        # the path, the tree, the critical instants
@@ -21,11 +21,11 @@ from jaxtyping import Float
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl._robustness import prepared, satisfied, seconds
+from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
-from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.printing import sugared
+from verifai_jax.mtl.formula import Formula, surface
 from verifai_jax.mtl.semantics import hard
+from verifai_jax.mtl.setting import prepare, seconds
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Node:
     series: Float[np.ndarray, " time"] = field(repr=False)
 
     def path(self) -> tuple["Node", ...]:
-        """From here down to the responsible leaf."""
+        """Return the nodes from here down to the responsible leaf."""
         below = next((child for child in self.children if child.decides), None)
         return (self,) if below is None else (self, *below.path())
 
     def flat(self, depth: int = 0) -> list[tuple[int, "Node"]]:
-        """Itself and all nodes below with their depths, parents first."""
+        """Return itself and all nodes below with their depths, parents first."""
         return [(depth, self)] + [e for child in self.children for e in child.flat(depth + 1)]
 
 
@@ -68,7 +68,7 @@ class Instant:
 
 @dataclass(frozen=True)
 class Explanation:
-    """Why a formula holds or fails on a trace. `str()` tells it; `draw` shows it."""
+    """The reason why a formula holds or fails on a trace; `str()` writes it, `draw` shows it."""
 
     formula: Formula
     holds: bool
@@ -79,7 +79,7 @@ class Explanation:
 
     @property
     def path(self) -> tuple[Node, ...]:
-        """From the formula down to the responsible predicate."""
+        """Return the nodes from here down to the responsible leaf."""
         return self.tree.path()
 
     @property
@@ -113,10 +113,10 @@ class Explanation:
 
 
 def heading(f: Formula) -> str:
-    """The operator alone, as in `always[0,4]`; a leaf in full."""
+    """Return the operator alone, as in `always[0,4]`; a leaf in full."""
     if not f.operands():
         return str(f)
-    word, _, interval = sugared(f)
+    word, _, interval = surface(f)
     return word if interval is None or interval.everything else f"{word}{interval}"
 
 
@@ -127,7 +127,7 @@ def explain(
     end: End = "hold",
     tau: float | None = None,
 ) -> Explanation:
-    """Find out why a formula holds or fails on one trace.
+    """Find the predicate, instant and path that decide a formula on one trace.
 
     **Arguments:**
 
@@ -141,7 +141,7 @@ def explain(
     """
     trace = trace.trim()
     holds = bool(satisfied(formula, trace, end))
-    setting, signals, _, _ = prepared(formula, trace, hard, end, None)
+    setting, signals, _, _ = prepare(formula, trace, hard, end, None)
     formula = setting.formula
     series = dict(
         zip(_distinct(formula), map(np.asarray, _all_values(setting, signals)), strict=True)
@@ -167,7 +167,7 @@ def _distinct(formula: Formula) -> tuple[Formula, ...]:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _all_values(setting: Any, signals: Any) -> list[Any]:
-    """Values of every sub-formula, each to where it settles and at least to the last sample."""
+    """Compute every sub-formula, each to where it settles and at least to the last sample."""
     e = Evaluator(signals, setting.length, setting.dt, end=setting.end)
     values = []
     for f in _distinct(setting.formula):
@@ -178,7 +178,7 @@ def _all_values(setting: Any, signals: Any) -> list[Any]:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _influence(setting: Any, signals: Any, tau: Any) -> list[Any]:
-    """Gradient of the smooth robustness with respect to every leaf at every sample."""
+    """Compute the gradient of the smooth robustness with respect to every leaf at every sample."""
     leaves = [f for f in _distinct(setting.formula) if isinstance(f, ast.Predicate | ast.Atom)]
     dtype = next(iter(signals.values())).dtype if signals else jnp.result_type(float)
 
@@ -230,7 +230,7 @@ class _Walk:
         )
 
     def asked(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
-        """Each operand of `f` at the instant that matters for `f` at `i`; none if vacuous."""
+        """Return the operands at the instants that matter for `f` at `i`; none if vacuous."""
         match f:
             case ast.Not(p):
                 return [(p, i)]
@@ -251,7 +251,7 @@ class _Walk:
         return []
 
     def chosen(self, f: Formula, i: int, asked: list[tuple[Formula, int]]) -> int | None:
-        """Which of the operands has the value of `f`."""
+        """Return the number of the operand that has the value of `f`."""
         if not asked:
             return None
         values = [self.at(p, j) for p, j in asked]
@@ -280,7 +280,7 @@ class _Walk:
     def witness(
         self, p: Formula, q: Formula, window: range, i: int, step: int
     ) -> list[tuple[Formula, int]]:
-        """Where until (since) is most nearly fulfilled: the witness and the weakest link to it."""
+        """Find where until (since) is most nearly fulfilled: the witness and the weakest link."""
         if not window:
             return []
         best, found = -math.inf, None
@@ -306,7 +306,7 @@ def _critical(
     walk: _Walk,
     k: int,
 ) -> tuple[Instant, ...]:
-    """The greatest local peaks of each leaf's share over time."""
+    """Find the greatest local peaks of each leaf's share over time."""
     total = sum(float(np.abs(share).sum()) for share in shares) or 1.0
     found = []
     for leaf, share in zip(leaves, shares, strict=True):

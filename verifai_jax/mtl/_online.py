@@ -51,14 +51,14 @@ class Online:
     dt: float
 
     def init(self) -> State:
-        """The state before any sample."""
+        """Return the state before any sample."""
         leaves = tuple(jnp.asarray(jnp.nan) for _ in _leaves(self.formula))
         machine = _Machine(self.dt, lambda f, sign: jnp.asarray(jnp.nan), jnp.int32(-1), {})
         machine.anchored("", self.formula, 1)
         return State(jnp.int32(0), leaves, machine.fresh)
 
     def step(self, state: State, sample: Mapping[str, Any]) -> State:
-        """The state after one more sample: numbers (or vectors `[k]`) by signal name.
+        """Return the state after one more sample: numbers (or vectors `[k]`) by signal name.
 
         **Raises:** `UnknownNameError` for a signal that the sample lacks.
         """
@@ -68,11 +68,11 @@ class Online:
         return _step(self, state, {name: sample[name] for name in self.formula.signals()})
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Between which values the robustness at time 0 will lie, whatever samples follow."""
+        """Return the least and greatest robustness at time 0 that further samples allow."""
         return _ended(self, state, -math.inf), _ended(self, state, math.inf)
 
     def finish(self, state: State) -> Float[Array, ""]:
-        """The robustness at time 0 if the trace ends here and is held: the offline value.
+        """Return the robustness at time 0 if the trace ends here and is held: the offline value.
 
         NaN before the first sample.
         """
@@ -80,12 +80,12 @@ class Online:
 
     @property
     def memory(self) -> int:
-        """How many numbers the state holds."""
+        """Number of numbers that the state holds."""
         return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(self.init)))
 
 
 def online(formula: Formula | str, dt: float) -> Online:
-    """A monitor of `formula` for samples `dt` seconds apart.
+    """Make a monitor of `formula` for samples `dt` seconds apart.
 
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`, `ValueError` for an
     unbounded future operator within another temporal operator, which no bounded memory can follow.
@@ -126,7 +126,7 @@ def _advanced(monitor: Online, state: State, last: tuple[Array, ...]) -> State:
 
 @functools.partial(jax.jit, static_argnums=(0, 2), inline=True)
 def _ended(monitor: Online, state: State, unknown: float | None) -> Array:
-    """The value at time 0 if all further leaves are `unknown` (repeat the last, if None)."""
+    """Compute the value at time 0 if all further leaves are `unknown` (the last, if None)."""
     values = dict(zip(_leaves(monitor.formula), state.last, strict=True))
 
     def leaf(f: Formula, sign: int) -> Array:
@@ -167,12 +167,12 @@ class _Machine:
         return int(a), samples(interval.end, self.dt, interval)
 
     def cell(self, path: str, value: Array, start: float, n: int = 0) -> Array:
-        """What the cell holds; at first `start`, `n` times (once and scalar, if 0)."""
+        """Return the content of a cell; at first `start`, `n` times (once and scalar, if 0)."""
         default = jnp.full((n,) if n else (), start, value.dtype)
         return self.cells.get(path, default)
 
     def pushed(self, path: str, value: Array, start: float, n: int) -> Array:
-        """The last `n` values of a stream, the newest last."""
+        """Return the last `n` values of a stream, the newest last."""
         held = self.cell(path, value, start, n)
         self.fresh[path] = jnp.concatenate([held[1:], value[None]])
         return self.fresh[path]
@@ -180,7 +180,7 @@ class _Machine:
     # Streams
 
     def delay(self, f: Formula) -> int:
-        """How many samples later a stream gives its value."""
+        """Count the samples by which a stream lags behind."""
         below = max((self.delay(p) for p in f.operands()), default=0)
         match f:
             case ast.Always(_, interval) | ast.Eventually(_, interval) | ast.Until(_, _, interval):
@@ -196,7 +196,7 @@ class _Machine:
         return below
 
     def settling(self, f: Formula) -> int:
-        """Samples after which everything below has taken in a constant input."""
+        """Count the samples after which everything below has taken in a constant input."""
         below = max((self.settling(p) for p in f.operands()), default=0)
         match f:
             case ast.Historically(_, i) | ast.Once(_, i) | ast.Since(_, _, i):
@@ -211,7 +211,7 @@ class _Machine:
         return below
 
     def stream(self, path: str, f: Formula, sign: int) -> Array:
-        """The value of `f` at the instant `now - delay(f)`; anything at instants before 0."""
+        """Return the value of `f` at the instant `now - delay(f)`; anything before time 0."""
         self.delay(f)  # Refuses what looks ahead without end.
         match f:
             case ast.Not(p):
@@ -248,7 +248,7 @@ class _Machine:
         return self.leaf(f, sign)
 
     def aligned(self, path: str, parts: tuple[Formula, ...], sign: int) -> list[Array]:
-        """Streams of several formulas, the quicker ones delayed to match the slowest."""
+        """Return streams of several formulas, the quicker ones delayed to match the slowest."""
         slowest = max(map(self.delay, parts))
         values = []
         for k, part in enumerate(parts):
@@ -260,14 +260,14 @@ class _Machine:
         return values
 
     def past(self, path: str, p: Formula, sign: int, nothing: float) -> Array:
-        """The stream of `p`, `nothing` before time 0."""
+        """Return the stream of `p`, `nothing` before time 0."""
         value = self.stream(path + "0", p, sign)
         return jnp.where(self.now - self.delay(p) >= 0, value, nothing)
 
     def window(
         self, path: str, value: Array, a: int, b: float, nothing: float, least: bool
     ) -> Array:
-        """The least (greatest) of a stream's values from `b` to `a` samples ago."""
+        """Return the least (greatest) of a stream's values from `b` to `a` samples ago."""
         if math.isfinite(b):
             kept = self.pushed(path, value, nothing, int(b) + 1)[: int(b) - a + 1]
             return kept.min() if least else kept.max()
@@ -298,7 +298,7 @@ class _Machine:
     # Anchored at time 0
 
     def anchored(self, path: str, f: Formula, sign: int) -> Array:
-        """The value of `f` at time 0 if every stream stays as it is from now on."""
+        """Return the value of `f` at time 0 if every stream stays as it is from now on."""
         match f:
             case ast.Constant():
                 return self.constant(f)
@@ -325,7 +325,7 @@ class _Machine:
     def accumulated(
         self, path: str, value: Array, index: Array, a: int, b: float, least: bool
     ) -> Array:
-        """The least (greatest) of a stream over the instants `a` to `b`."""
+        """Return the least (greatest) of a stream over the instants `a` to `b`."""
         held = self.cell(path, value, math.inf if least else -math.inf)
         both = jnp.minimum(held, value) if least else jnp.maximum(held, value)
         counts = (index >= a) & (index <= b)

@@ -1,4 +1,4 @@
-"""The text of a formula, read: `parse("always[0, 4] (abs(x) <= 2.4 & F[0,500ms] safe)")`.
+"""The parser of formulas: `parse("always[0, 4] (abs(x) <= 2.4 & F[0,500ms] safe)")`.
 
 One LALR grammar covers Boolean and arithmetic expressions, because two would collide on
 parentheses; what may stand where is checked afterwards, on the tree, where the position is known.
@@ -6,7 +6,6 @@ It reads more than it accepts: chains and mixtures on which tools disagree are r
 with the parentheses that would settle them.
 """
 
-import functools
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,8 +14,10 @@ from typing import Any
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.formula import FUNCTIONS, Expression, Formula, Interval
-from verifai_jax.mtl.printing import NAME, WORDS
+from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
+from verifai_jax.mtl.formula import Formula, Interval
+from verifai_jax.mtl.grammar import BINARY, FormulaSyntaxError, explain_error, parser
+from verifai_jax.mtl.words import FUNCTIONS, NAME
 
 _UNITS = {
     "s": Decimal(1),
@@ -25,25 +26,7 @@ _UNITS = {
     "ns": Decimal("1e-9"),
     "min": Decimal(60),
 }
-_UNARY = ("always", "eventually", "historically", "once", "next", "prev", "weak_prev")
-_BINARY = ("until", "weak_until", "release", "since")
-_TIMED = ("always", "eventually", "historically", "once", *_BINARY)
-
-
-class FormulaSyntaxError(ValueError):
-    """A text that is not a formula; the message shows the place and what to write instead.
-
-    `position` is the offset of the place in the text.
-    """
-
-    def __init__(self, reason: str, text: str, position: int, width: int = 1) -> None:
-        self.position = position
-        before = text[:position]
-        line = before.count("\n")
-        shown = text.split("\n")[line]
-        column = position - (before.rfind("\n") + 1)
-        carets = "^" * max(1, min(width, len(shown) - column))
-        super().__init__(f"{reason}\n  {shown}\n  {' ' * column}{carets}")
+_TIMED = ("always", "eventually", "historically", "once", *BINARY)
 
 
 def parse(
@@ -51,7 +34,7 @@ def parse(
     constants: Mapping[str, float] | None = None,
     definitions: Mapping[str, Formula | str] | None = None,
 ) -> Formula:
-    """Read a formula.
+    """Read a formula from its text.
 
     **Arguments:**
 
@@ -80,139 +63,15 @@ def _read(text: str, constants: Mapping[str, float], known: Mapping[str, Formula
     import lark
 
     try:
-        tree = _parser().parse(text)
+        tree = parser().parse(text)
     except lark.UnexpectedInput as error:
-        raise _explained(error, text) from None
+        raise explain_error(error, text) from None
     return _Builder(text, constants, known).formula(tree)
-
-
-@functools.cache
-def _parser() -> Any:
-    import lark
-
-    def keyword(word: str) -> str:
-        # An underscore may join an operator to its interval: `alw_[0,10]`.
-        joint = r"(?:(?![\w.])|_(?=\s*\[))"
-        alternatives = []
-        for option in sorted(WORDS[word], key=len, reverse=True):
-            if NAME.fullmatch(option):
-                alternatives.append(option + joint)
-            else:
-                escaped = "".join("\\" + c for c in option)
-                alternatives.append(escaped + r"(?:_(?=\s*\[))?")
-        return f"/{'|'.join(alternatives)}/"
-
-    unary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in _UNARY)
-    binary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in _BINARY)
-    # XOR, IFF and IMPLIES come before the comparisons that start like them.
-    joints = "\n".join(
-        f"{w.upper()}.4: {keyword(w)}" for w in ("iff", "xor", "implies", "or", "and")
-    )
-    grammar = rf"""
-        ?start: iff
-        ?iff: impl ((IFF | XOR) impl)*
-        ?impl: or_ (IMPLIES or_)*
-        ?or_: and_ (OR and_)*
-        ?and_: bin (AND bin)*
-        ?bin: unary (_binary unary)*
-        _binary: ({" | ".join(w.upper() for w in _BINARY)}) [interval]
-        ?unary: NOT unary -> negation
-              | ({" | ".join(w.upper() for w in _UNARY)}) [interval] unary -> temporal
-              | cmp
-        ?cmp: sum (COMPARISON sum)*
-        ?sum: product ((PLUS | MINUS) product)*
-        ?product: factor ((STAR | SLASH) factor)*
-        ?factor: MINUS factor -> minus
-               | postfix
-        ?postfix: atom
-                | atom "[" NUMBER "]" -> component
-        ?atom: NUMBER -> number
-             | NAME -> name
-             | QUOTED -> quoted
-             | TRUE -> true
-             | FALSE -> false
-             | NAME "(" iff ("," iff)* ")" -> call
-             | "(" iff ")" -> parens
-        interval: "[" bound ("," | ":") bound "]"
-        bound: [MINUS] NUMBER [UNIT] | NAME
-
-        {unary}
-        {binary}
-        {joints}
-        NOT.2: {keyword("not")}
-        TRUE.3: {keyword("TRUE")}
-        FALSE.3: {keyword("FALSE")}
-        COMPARISON.3: />=|<=|==|!=|>|</
-        PLUS: "+"
-        MINUS: "-"
-        STAR: "*"
-        SLASH: "/"
-        UNIT.5: /(?:min|ms|us|ns|s)(?!\w)/
-        NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
-        NAME: /{NAME.pattern}/
-        QUOTED: /"[^"\n]+"/
-        %ignore /\s+/
-    """
-    return lark.Lark(
-        grammar,
-        parser="lalr",
-        lexer="contextual",
-        propagate_positions=True,
-        maybe_placeholders=True,
-    )
-
-
-_GROUPS = (
-    ({"NUMBER", "NAME", "QUOTED"}, "a signal or a number"),
-    ({"NOT"}, "'!'"),
-    ({"ALWAYS"}, "a temporal operator (always, eventually, ...)"),
-    ({"LPAR"}, "'('"),
-    ({"AND", "OR"}, "'&', '|', '->'"),
-    ({"UNTIL"}, "until"),
-    ({"COMPARISON"}, "a comparison (<=, >, ...)"),
-    ({"PLUS"}, "arithmetic"),
-    ({"UNIT"}, "a unit (s, ms, us, ns, min)"),
-    ({"COMMA"}, "','"),
-    ({"COLON"}, "':'"),
-    ({"RPAR"}, "')'"),
-    ({"LSQB"}, "'['"),
-    ({"RSQB"}, "']'"),
-    ({"$END"}, "the end"),
-)
-
-
-def _explained(error: Any, text: str) -> FormulaSyntaxError:
-    import lark
-
-    if not text.strip():
-        return FormulaSyntaxError("a formula is needed; got an empty text", text, 0)
-    at_end = isinstance(error, lark.UnexpectedEOF) or (
-        isinstance(error, lark.UnexpectedToken) and error.token.type == "$END"
-    )
-    if at_end:
-        position, width, found = len(text.rstrip()), 1, "the end of the text"
-    elif isinstance(error, lark.UnexpectedToken):
-        position = error.token.start_pos or 0
-        width, found = len(error.token), f"{str(error.token)!r}"
-    else:
-        position = error.pos_in_stream or 0
-        width, found = 1, f"{text[position]!r}"
-    if found == "'='":
-        return FormulaSyntaxError(
-            "'=' is no comparison: write == for equal, >= or <=", text, position
-        )
-    if found == "')'" and text[:position].count("(") == text[:position].count(")"):
-        return FormulaSyntaxError("there is no '(' for this ')'", text, position)
-    expected = set(getattr(error, "accepts", None) or getattr(error, "expected", None) or ())
-    expected |= set(getattr(error, "allowed", None) or ())
-    words = [word for names, word in _GROUPS if names & expected]
-    wanted = " or ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
-    return FormulaSyntaxError(f"expected {wanted}, but found {found}", text, position, width)
 
 
 @dataclass
 class _Part:
-    """What a piece of the text means, and where it stands."""
+    """The meaning of a part of the text, and its place there."""
 
     value: Formula | Expression
     start: int
@@ -243,7 +102,7 @@ class _Builder:
 
     def _formula(self, part: _Part) -> Formula:
         if isinstance(part.value, Expression):
-            if isinstance(part.value, ast.Number):
+            if isinstance(part.value, Number):
                 raise self._fail(
                     f"a formula is needed here, not the number {self._source(part)}",
                     part.start,
@@ -334,7 +193,7 @@ class _Builder:
         )
 
     def _refuse_open(self, parts: list[_Part], words: list[Any]) -> None:
-        """`always a & b`: tools disagree on how far the word reaches."""
+        """Refuse `always a & b`: tools disagree on how far the word reaches."""
         for part, word in zip(parts, words, strict=False):
             if part.rule == "word" and not part.closed:
                 operator, _, operand = self._source(part).partition(" ")
@@ -423,7 +282,7 @@ class _Builder:
         parts, words = self._operands(tree)
         value = self._expression(parts[0])
         for word, part in zip(words, parts[1:], strict=True):
-            value = ast.Arithmetic(str(word), (value, self._expression(part)))
+            value = Arithmetic(str(word), (value, self._expression(part)))
         return _Part(value, *self._span(tree))
 
     _product = _sum
@@ -433,12 +292,12 @@ class _Builder:
         return _Part(-self._expression(part), *self._span(tree))
 
     def _number(self, tree: Any) -> _Part:
-        return _Part(ast.Number(float(tree.children[0])), *self._span(tree))
+        return _Part(Number(float(tree.children[0])), *self._span(tree))
 
     def _name(self, tree: Any) -> _Part:
         name = str(tree.children[0])
         if name in self.constants:
-            return _Part(ast.Number(float(self.constants[name])), *self._span(tree))
+            return _Part(Number(float(self.constants[name])), *self._span(tree))
         if name in self.known:
             return _Part(self.known[name], *self._span(tree))
         if name in FUNCTIONS:
@@ -446,10 +305,10 @@ class _Builder:
                 f"{name} is a function: write {name}(...), or quote it if it is a signal",
                 *self._span(tree),
             )
-        return _Part(ast.Signal(name), *self._span(tree))
+        return _Part(Signal(name), *self._span(tree))
 
     def _quoted(self, tree: Any) -> _Part:
-        return _Part(ast.Signal(str(tree.children[0])[1:-1]), *self._span(tree))
+        return _Part(Signal(str(tree.children[0])[1:-1]), *self._span(tree))
 
     def _true(self, tree: Any) -> _Part:
         return _Part(ast.TRUE, *self._span(tree), closed=True)
@@ -476,7 +335,7 @@ class _Builder:
             raise self._fail(str(error), name.start_pos, name.start_pos + len(name))
         parts = tuple(self._expression(self._build(c)) for c in arguments)
         try:
-            return _Part(ast.Arithmetic(str(name), parts), *span)
+            return _Part(Arithmetic(str(name), parts), *span)
         except ValueError as error:
             raise self._fail(str(error), *span) from None
 
@@ -486,5 +345,5 @@ class _Builder:
 
 
 def _text(text: str, tree: Any) -> str:
-    """The piece of `text` that a node of the tree was read from."""
+    """Return the part of `text` that a node of the tree was read from."""
     return text[tree.meta.start_pos : tree.meta.end_pos]

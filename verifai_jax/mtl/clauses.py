@@ -1,4 +1,4 @@
-"""What has to be broken, part by part: a formula as goals, each of a few clauses.
+"""Formulas as goals to break, each of a few clauses to violate together.
 
     goals = goals_of([formula])
     goals.values(trace, hard)                           # [goals, CLAUSES]
@@ -20,11 +20,13 @@ from jaxtyping import Array, Float
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl._robustness import prepared, robustness
+from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.expression import Number, Signal
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.rewriting import expressions, nnf, rebuilt
+from verifai_jax.mtl.rewriting import nnf, rebuild
 from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.setting import prepare
 
 CLAUSES = 4
 """Clauses told apart at most; what a disjunction has beyond is the last one."""
@@ -51,7 +53,7 @@ class Goals:
         return max(len(goal) for goal in self.goals)
 
     def margins(self, trace: Trace, end: End = "hold") -> Trace:
-        """The margins of the predicates over their scale, as the signals of a trace.
+        """Compute the margins of the predicates over their scale, as the signals of a trace.
 
         The scale is the standard deviation along the trace, with a share of the size of what the
         predicate compares, for signals that are constant; it is not differentiated.
@@ -60,12 +62,12 @@ class Goals:
             return trace  # Constants alone.
         signals = {}
         for i, leaf in enumerate(self.leaves):
-            setting, arrays, _, valid = prepared(leaf, trace, hard, end, None)
+            setting, arrays, _, valid = prepare(leaf, trace, hard, end, None)
             evaluator = Evaluator(arrays, setting.length, setting.dt, valid=valid)
             margin = evaluator.value(leaf, 0, setting.length - 1)
             size = sum(
                 jnp.mean(jnp.abs(jnp.asarray(evaluator.expression(side, 0, setting.length - 1))))
-                for side in expressions(leaf)
+                for side in leaf.terms()
             )
             scale = jnp.sqrt(jnp.var(margin) + (0.1 * size) ** 2)
             scale = jax.lax.stop_gradient(scale)
@@ -76,7 +78,7 @@ class Goals:
     def values(
         self, trace: Trace, semantics: Semantics = hard, end: End = "hold"
     ) -> Float[Array, "goals clauses"]:
-        """The robustness of each clause over scaled margins; `ABSENT` where there is none."""
+        """Compute the robustness of each clause over scaled margins; `ABSENT` if there is none."""
         scaled = self.margins(trace, end)
         rows = []
         for goal in self.goals:
@@ -88,7 +90,7 @@ class Goals:
 
 
 def goals_of(formulas: Iterable[Formula]) -> Goals:
-    """The goals of a conjunction of these formulas."""
+    """Return the goals of a conjunction of these formulas."""
     goals: list[tuple[Formula, ...]] = []
     for formula in formulas:
         goals.extend(_few(_parts(part, ast.Or), ast.Or, CLAUSES) for part in _conjuncts(formula))
@@ -105,8 +107,7 @@ def goals_of(formulas: Iterable[Formula]) -> Goals:
         )
     )
     names: dict[Formula, Formula] = {
-        leaf: ast.Predicate(">", ast.Signal(_name(i)), ast.Number(0.0))
-        for i, leaf in enumerate(leaves)
+        leaf: ast.Predicate(">", Signal(_name(i)), Number(0.0)) for i, leaf in enumerate(leaves)
     }
     return Goals(leaves, tuple(tuple(_over(clause, names) for clause in goal) for goal in goals))
 
@@ -120,7 +121,7 @@ def _conjuncts(formula: Formula) -> list[Formula]:
 
 
 def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formula, ...]:
-    """The parts of a conjunction or disjunction, through the operators that distribute over it."""
+    """Split a conjunction or disjunction, through the operators that distribute over it."""
     if isinstance(formula, kind):
         return tuple(part for each in formula.operands() for part in _parts(each, kind))
     if isinstance(
@@ -128,7 +129,7 @@ def _parts(formula: Formula, kind: type[ast.And] | type[ast.Or]) -> tuple[Formul
     ):
         inner = _parts(formula.operand, kind)
         if len(inner) > 1:
-            return tuple(rebuilt(formula, (part,)) for part in inner)
+            return tuple(rebuild(formula, (part,)) for part in inner)
     return (formula,)
 
 
@@ -141,9 +142,9 @@ def _few(
 
 
 def _over(formula: Formula, names: dict[Formula, Formula]) -> Formula:
-    """The formula over other leaves."""
+    """Return the formula over other leaves."""
     if formula in names:
         return names[formula]
     if isinstance(formula, ast.Constant):
         return formula
-    return rebuilt(formula, tuple(_over(part, names) for part in formula.operands()))
+    return rebuild(formula, tuple(_over(part, names) for part in formula.operands()))

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
-from verifai_jax.mtl.formula import Expression, Formula, Interval
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.formula import Formula, Interval, Term
 
 End = Literal["hold", "truncate", "strict"]
 
@@ -25,7 +26,7 @@ class IntervalError(ValueError):
 
 
 def samples(time: float, dt: float, interval: Interval) -> float:
-    """`time` in samples. **Raises:** `IntervalError` if it is not a multiple of `dt`."""
+    """Return `time` in samples. **Raises:** `IntervalError` unless it is a multiple of `dt`."""
     if math.isinf(time):
         return math.inf
     n = time / dt
@@ -69,7 +70,7 @@ class Evaluator:
         return self.end != "truncate"
 
     def span(self, interval: Interval) -> tuple[int, float]:
-        """First and last sample of an interval, relative to now."""
+        """Return the first and last sample of an interval, relative to now."""
         a = samples(interval.start, self.dt, interval)
         b = samples(interval.end, self.dt, interval)
         if self.open_right and b > a:
@@ -77,7 +78,7 @@ class Evaluator:
         return int(a), b
 
     def settles(self, f: Formula) -> int:
-        """The instant from which `f` is constant under `hold`; the last sample otherwise."""
+        """Return the instant from which `f` is constant under `hold`; the last sample otherwise."""
         if not self._hold:
             return self._last
         below = [self.settles(part) for part in f.operands()]
@@ -98,7 +99,7 @@ class Evaluator:
         return max(below)
 
     def value(self, f: Formula, first: int, last: int) -> Float[Array, "instants *lanes"]:
-        """Values of `f` at the instants `first` to `last`, both included."""
+        """Compute the values of `f` at the instants `first` to `last`, both included."""
         key = (f, first, last)
         if key not in self._memo:
             self._memo[key] = self._value(f, first, last)
@@ -173,12 +174,12 @@ class Evaluator:
         verdict = jnp.where(holds, 1.0, -1.0).astype(margin.dtype)
         return jnp.where(jnp.isnan(margin), margin, verdict)
 
-    def expression(self, e: Expression, start: int, stop: int) -> Any:
-        """The expression's values at the samples `start` to `stop` (a float, if it is constant)."""
+    def expression(self, e: Term, start: int, stop: int) -> Any:
+        """Compute an expression at the samples `start` to `stop` (a float, if it is constant)."""
         match e:
-            case ast.Number(value):
+            case Number(value):
                 return value
-            case ast.Signal(name):
+            case Signal(name):
                 signal = self.signals[name]
                 if signal.ndim != 1 + self.lanes:
                     raise TypeError(
@@ -186,17 +187,17 @@ class Evaluator:
                         f"be used as a number: take a component, {e}[0], or norm({e})"
                     )
                 return signal[start : stop + 1]
-            case ast.Component(ast.Signal(name), index):
+            case Component(Signal(name), index):
                 return self._vector(name, f"{e}", index)[start : stop + 1, ..., index]
-            case ast.Arithmetic("norm", (argument,)):
-                if not isinstance(argument, ast.Signal):
+            case Arithmetic("norm", (argument,)):
+                if not isinstance(argument, Signal):
                     raise TypeError(f"norm takes a vector signal; got norm({argument})")
                 vector = self._vector(argument.name, f"{e}")[start : stop + 1]
                 square = jnp.sum(vector * vector, axis=-1)
                 # The gradient of a square root is infinite at 0, where that of the norm is not.
                 safe = jnp.where(square == 0, 1.0, square)
                 return jnp.where(square == 0, square, jnp.sqrt(safe))
-            case ast.Arithmetic(name, arguments):
+            case Arithmetic(name, arguments):
                 return _apply(name, [self.expression(a, start, stop) for a in arguments])
         raise TypeError(f"not an expression: {e!r}")
 
@@ -221,7 +222,7 @@ class Evaluator:
         return {"boolean": -1.0, "smooth": -windows.NEVER}.get(self.kind, -math.inf)
 
     def _extended(self, x: Array, n: int, sign: int = 1) -> Array:
-        """`x` with `n` instants: the last one repeated under `hold`, nothing otherwise."""
+        """Extend `x` to `n` instants: the last one repeated under `hold`, nothing otherwise."""
         if x.shape[0] >= n:
             return x
         shape = (n - x.shape[0], *x.shape[1:])
@@ -231,7 +232,7 @@ class Evaluator:
         return jnp.concatenate([x, tail.astype(x.dtype)])
 
     def _cut(self, x: Array, first: int, sign: int = 1) -> Array:
-        """Samples that do not count, replaced by nothing."""
+        """Replace samples that do not count by nothing."""
         if self._hold or self.valid is None:
             return x
         return jnp.where(self._index(first, x) < self.valid, x, sign * self._nothing)

@@ -1,4 +1,4 @@
-"""Formulas of metric temporal logic: what they say, not what they mean.
+"""Formulas of metric temporal logic: a tree of operators that prints itself.
 
     x, theta = signal("x"), signal("theta")
     always((abs(x) <= 2.4) & (theta.abs() <= 0.2095), 0, 4)
@@ -7,184 +7,40 @@
 
 A formula is a frozen tree, hashable and equal by value, so it is a static argument under `jax.jit`.
 Sugar (implication, equivalence, weak until, release) is rewritten into the few nodes below when it
-is written; their meaning lives in `robustness.py`, their text in `printing.py`.
+is written, and restored when it is printed; their meaning lives in `evaluate`.
 """
 
+import abc
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
-Formulaic: TypeAlias = Union["Formula", "Expression"]
-
-COMPARISONS = (">=", ">", "<=", "<", "==", "!=")
-FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
+from verifai_jax.mtl.words import Text, number_text, operator_text
 
 
-class Expression:
-    """A number at every instant: arithmetic over signals. Comparing one gives a `Formula`.
+class Term(abc.ABC):
+    """A number at every instant, which predicates compare; made as an `Expression`."""
 
-    `==` compares expressions as trees; the predicate "equal" is `x.equals(3)`, "unequal"
-    `x.differs(3)`.
-    """
+    @abc.abstractmethod
+    def text(self, outer: int = 0) -> str:
+        """Return the text, in parentheses if its operator binds weaker than `outer`."""
 
-    def __add__(self, other: "Expression | float") -> "Expression":
-        return Arithmetic("+", (self, expression(other)))
+    @property
+    def is_signal(self) -> bool:
+        """True for a signal or one component of it."""
+        return False
 
-    def __radd__(self, other: float) -> "Expression":
-        return Arithmetic("+", (expression(other), self))
-
-    def __sub__(self, other: "Expression | float") -> "Expression":
-        return Arithmetic("-", (self, expression(other)))
-
-    def __rsub__(self, other: float) -> "Expression":
-        return Arithmetic("-", (expression(other), self))
-
-    def __mul__(self, other: "Expression | float") -> "Expression":
-        return Arithmetic("*", (self, expression(other)))
-
-    def __rmul__(self, other: float) -> "Expression":
-        return Arithmetic("*", (expression(other), self))
-
-    def __truediv__(self, other: "Expression | float") -> "Expression":
-        return Arithmetic("/", (self, expression(other)))
-
-    def __rtruediv__(self, other: float) -> "Expression":
-        return Arithmetic("/", (expression(other), self))
-
-    def __neg__(self) -> "Expression":
-        return Arithmetic("neg", (self,))
-
-    def __abs__(self) -> "Expression":
-        return Arithmetic("abs", (self,))
-
-    def __getitem__(self, index: int) -> "Expression":
-        return Component(self, index)
-
-    def abs(self) -> "Expression":
-        """Absolute value."""
-        return abs(self)
-
-    def sqrt(self) -> "Expression":
-        """Square root; NaN where negative."""
-        return Arithmetic("sqrt", (self,))
-
-    def sin(self) -> "Expression":
-        """Sine of an angle in radians."""
-        return Arithmetic("sin", (self,))
-
-    def cos(self) -> "Expression":
-        """Cosine of an angle in radians."""
-        return Arithmetic("cos", (self,))
-
-    def norm(self) -> "Expression":
-        """Euclidean norm of a vector signal `[time, k]` at every instant."""
-        return Arithmetic("norm", (self,))
-
-    def min(self, *others: "Expression | float") -> "Expression":
-        """The least of this and the others, at every instant."""
-        return Arithmetic("min", (self, *map(expression, others)))
-
-    def max(self, *others: "Expression | float") -> "Expression":
-        """The greatest of this and the others, at every instant."""
-        return Arithmetic("max", (self, *map(expression, others)))
-
-    def __ge__(self, other: "Expression | float") -> "Formula":
-        return Predicate(">=", self, expression(other))
-
-    def __gt__(self, other: "Expression | float") -> "Formula":
-        return Predicate(">", self, expression(other))
-
-    def __le__(self, other: "Expression | float") -> "Formula":
-        return Predicate("<=", self, expression(other))
-
-    def __lt__(self, other: "Expression | float") -> "Formula":
-        return Predicate("<", self, expression(other))
-
-    def equals(self, other: "Expression | float") -> "Formula":
-        """The predicate `self == other`, of robustness `-|self - other|`."""
-        return Predicate("==", self, expression(other))
-
-    def differs(self, other: "Expression | float") -> "Formula":
-        """The predicate `self != other`, of robustness `|self - other|`."""
-        return Predicate("!=", self, expression(other))
-
-    def __and__(self, other: Formulaic) -> "Formula":
-        return formula(self) & other
-
-    def __or__(self, other: Formulaic) -> "Formula":
-        return formula(self) | other
-
-    def __rshift__(self, other: Formulaic) -> "Formula":
-        return formula(self) >> other
-
-    def __invert__(self) -> "Formula":
-        return ~formula(self)
+    def signals(self) -> tuple[str, ...]:
+        """Return the names of the signals in it, in order of appearance."""
+        return ()
 
     def __str__(self) -> str:
-        from verifai_jax.mtl.printing import show_expression
-
-        return show_expression(self)
+        return self.text()
 
 
-@dataclass(frozen=True)
-class Number(Expression):
-    """A constant."""
-
-    value: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "value", float(self.value))
-        if not math.isfinite(self.value):
-            raise ValueError(f"a number in a formula must be finite; got {self.value}")
-
-    def __neg__(self) -> "Expression":
-        return Number(-self.value)
-
-
-@dataclass(frozen=True)
-class Signal(Expression):
-    """A signal of the trace, by name. A boolean signal counts as +1 (true) and -1 (false)."""
-
-    name: str
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not re.fullmatch(r'[^"\n]+', self.name):
-            raise ValueError(
-                f"a signal's name is a non-empty text without quotes or line breaks; "
-                f"got {self.name!r}"
-            )
-
-
-@dataclass(frozen=True)
-class Component(Expression):
-    """One component of a vector signal `[time, k]`, counted from 0."""
-
-    vector: Expression
-    index: int
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.vector, Signal):
-            raise ValueError(f"only a signal has components; got ({self.vector})[{self.index}]")
-        if not isinstance(self.index, int) or self.index < 0:
-            raise ValueError(
-                f"a component's index is an integer, at least 0; got {self.vector}[{self.index}]"
-            )
-
-
-@dataclass(frozen=True)
-class Arithmetic(Expression):
-    """An operator (`+ - * / neg`) or a function (see `FUNCTIONS`) of expressions."""
-
-    name: str
-    arguments: tuple[Expression, ...]
-
-    def __post_init__(self) -> None:
-        n, least = len(self.arguments), FUNCTIONS.get(self.name)
-        if least is not None and (n != 1 if least == 1 else n < least):
-            wanted = "one argument" if least == 1 else "two arguments or more"
-            raise ValueError(f"{self.name} takes {wanted}; got {n}")
+Formulaic: TypeAlias = Union["Formula", Term]
+"""What stands for a formula: a formula, or an expression that is its own robustness."""
 
 
 @dataclass(frozen=True)
@@ -205,16 +61,15 @@ class Interval:
 
     @property
     def everything(self) -> bool:
-        """Whether this is `[0, inf]`, which the text leaves out."""
+        """True for `[0, inf]`, which the text leaves out."""
         return self.start == 0 and self.end == math.inf
 
     def __str__(self) -> str:
-        from verifai_jax.mtl.printing import show_number
-
-        return f"[{show_number(self.start)},{show_number(self.end)}]"
+        return f"[{number_text(self.start)},{number_text(self.end)}]"
 
 
 EVERYTHING = Interval()
+"""The interval of an operator that is written without one."""
 
 
 class Formula:
@@ -247,47 +102,74 @@ class Formula:
         return Not(self.iff(other))
 
     def implies(self, other: Formulaic) -> "Formula":
-        """`self -> other`, also written `self >> other`."""
+        """Return `self -> other`, also written `self >> other`."""
         return self >> other
 
     def iff(self, other: Formulaic) -> "Formula":
-        """`self <-> other`; its negation is `self ^ other`."""
+        """Return `self <-> other`; its negation is `self ^ other`."""
         other = formula(other)
         return Or((And((self, other)), And((Not(self), Not(other)))))
 
     def until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """`self` holds until `other` does, `a` to `b` seconds ahead; not needed at the witness."""
+        """Require `self` until `other` holds, `a` to `b` seconds ahead, not at the witness."""
         return Until(self, formula(other), Interval(a, b))
 
     def weak_until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """`self` until `other`, or `self` throughout `[0, b]`."""
+        """Require `self` until `other` holds, or `self` throughout `[0, b]`."""
         return Or((self.until(other, a, b), Always(self, Interval(0.0, b))))
 
     def release(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """`other` holds up to and including the instant where `self` does: the dual of until."""
+        """Require `other` up to and including the instant where `self` holds: the dual of until."""
         return Not(Until(Not(self), Not(formula(other)), Interval(a, b)))
 
     def since(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """`other` held, `a` to `b` seconds ago, and `self` ever since."""
+        """Require `other` at some instant from `a` to `b` seconds ago, and `self` ever since."""
         return Since(self, formula(other), Interval(a, b))
 
     def signals(self) -> tuple[str, ...]:
-        """Names of the signals it speaks of, in order of appearance."""
-        from verifai_jax.mtl.rewriting import signals
+        """Return the names of the signals that it speaks of, in order of appearance."""
+        return tuple(
+            dict.fromkeys(
+                name
+                for part in self.subformulas()
+                for term in part.terms()
+                for name in term.signals()
+            )
+        )
 
-        return signals(self)
+    def terms(self) -> tuple[Term, ...]:
+        """Return the expressions that a leaf compares; none for an operator."""
+        return ()
 
     def horizon(self, dt: float = 0.0) -> float:
-        """Seconds of trace beyond an instant on which its truth there depends; may be infinite.
+        """Return the seconds of trace beyond an instant on which its truth there depends.
 
-        `next` reaches one sampling period `dt` ahead.
+        Infinite for an unbounded future operator. Past operators look back, so they never add (and
+        are not subtracted, which keeps the bound simple).
+
+        **Arguments:**
+
+        - `dt`: sampling period in seconds, by which `next` looks ahead.
         """
-        from verifai_jax.mtl.rewriting import horizon
+        below = max((part.horizon(dt) for part in self.operands()), default=0.0)
+        return below + self._reach(dt)[1]
 
-        return horizon(self, dt)
+    def history(self, dt: float = 0.0) -> float:
+        """Return the seconds of trace before an instant on which its truth there depends.
+
+        **Arguments:**
+
+        - `dt`: sampling period in seconds, by which `prev` looks back.
+        """
+        below = max((part.history(dt) for part in self.operands()), default=0.0)
+        return below + self._reach(dt)[0]
+
+    def _reach(self, dt: float) -> tuple[float, float]:
+        """Return how many seconds the operator itself looks back and ahead."""
+        return 0.0, 0.0
 
     def operands(self) -> tuple["Formula", ...]:
-        """The formulas it is made of, left to right."""
+        """Return the formulas that it is made of, left to right."""
         parts: list[Formula] = []
         for name in self.children:
             value = getattr(self, name)
@@ -295,7 +177,7 @@ class Formula:
         return tuple(parts)
 
     def subformulas(self) -> Iterator["Formula"]:
-        """Itself and everything below, parents first, left to right, with repetitions."""
+        """Yield itself and everything below, parents first, left to right, with repetitions."""
         yield self
         for part in self.operands():
             yield from part.subformulas()
@@ -306,10 +188,14 @@ class Formula:
             "& | ~ instead of and, or, not, and write a < x < b as (a < x) & (x < b)"
         )
 
-    def __str__(self) -> str:
-        from verifai_jax.mtl.printing import show
+    def text(self) -> Text:
+        """Return its text and what kind of text that is; `parse(str(f)) == f`."""
+        word, operands, interval = surface(self)
+        span = "" if interval is None or interval.everything else str(interval)
+        return operator_text(word, span, [part.text() for part in operands])
 
-        return show(self)
+    def __str__(self) -> str:
+        return self.text().text
 
 
 @dataclass(frozen=True)
@@ -318,21 +204,43 @@ class Constant(Formula):
 
     value: bool
 
+    def text(self) -> Text:
+        """Return `TRUE` or `FALSE`."""
+        return Text("TRUE" if self.value else "FALSE", "name")
+
 
 @dataclass(frozen=True)
 class Predicate(Formula):
     """A comparison; its robustness is the margin by which it holds."""
 
     comparison: str
-    left: Expression
-    right: Expression
+    left: Term
+    right: Term
+
+    def terms(self) -> tuple[Term, ...]:
+        """Return both sides."""
+        return self.left, self.right
+
+    def text(self) -> Text:
+        """Return both sides with the comparison between them."""
+        return Text(f"{self.left} {self.comparison} {self.right}", "leaf")
 
 
 @dataclass(frozen=True)
 class Atom(Formula):
     """A bare expression that is its own robustness; it holds where it is positive."""
 
-    expression: Expression
+    expression: Term
+
+    def terms(self) -> tuple[Term, ...]:
+        """Return the expression."""
+        return (self.expression,)
+
+    def text(self) -> Text:
+        """Return the text of the expression."""
+        text = str(self.expression)
+        # A signal or one of its components ends where it ends, whatever comes behind.
+        return Text(text, "name" if self.expression.is_signal else "leaf")
 
 
 @dataclass(frozen=True)
@@ -367,6 +275,9 @@ class Always(Formula):
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("operand",)
 
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return 0.0, self.interval.end
+
 
 @dataclass(frozen=True)
 class Eventually(Formula):
@@ -375,6 +286,9 @@ class Eventually(Formula):
     operand: Formula
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("operand",)
+
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return 0.0, self.interval.end
 
 
 @dataclass(frozen=True)
@@ -385,6 +299,9 @@ class Historically(Formula):
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("operand",)
 
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return self.interval.end, 0.0
+
 
 @dataclass(frozen=True)
 class Once(Formula):
@@ -394,6 +311,9 @@ class Once(Formula):
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("operand",)
 
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return self.interval.end, 0.0
+
 
 @dataclass(frozen=True)
 class Next(Formula):
@@ -401,6 +321,9 @@ class Next(Formula):
 
     operand: Formula
     children: ClassVar[tuple[str, ...]] = ("operand",)
+
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return 0.0, dt
 
 
 @dataclass(frozen=True)
@@ -410,6 +333,9 @@ class Prev(Formula):
     operand: Formula
     weak: bool = False
     children: ClassVar[tuple[str, ...]] = ("operand",)
+
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return dt, 0.0
 
 
 @dataclass(frozen=True)
@@ -421,6 +347,9 @@ class Until(Formula):
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("left", "right")
 
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return 0.0, self.interval.end
+
 
 @dataclass(frozen=True)
 class Since(Formula):
@@ -431,96 +360,86 @@ class Since(Formula):
     interval: Interval = field(default=EVERYTHING)
     children: ClassVar[tuple[str, ...]] = ("left", "right")
 
+    def _reach(self, dt: float) -> tuple[float, float]:
+        return self.interval.end, 0.0
+
+
+def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
+    """Return how a formula reads: its operator's word, the operands, and the interval if any.
+
+    Sugar that was rewritten away (`->`, `<->`, `^`, weak until, release) is recognised.
+    """
+    match f:
+        case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:
+            return "xor", (p, q), None
+        case Not(Until(Not(p), Not(q), interval)):
+            return "release", (p, q), interval
+        case Or((And((p, q)), And((Not(r), Not(s))))) if p == r and q == s:
+            return "iff", (p, q), None
+        case Or((Until(p, q, interval), Always(r, Interval(0.0, end)))) if (
+            p == r and end == interval.end
+        ):
+            return "weak_until", (p, q), interval
+        case Or((Not(p), q)):
+            return "implies", (p, q), None
+        case Not(p):
+            return "not", (p,), None
+        case And(parts):
+            return "and", parts, None
+        case Or(parts):
+            return "or", parts, None
+        case Next(p):
+            return "next", (p,), None
+        case Prev(p, weak):
+            return "weak_prev" if weak else "prev", (p,), None
+        case Until(p, q, interval):
+            return "until", (p, q), interval
+        case Since(p, q, interval):
+            return "since", (p, q), interval
+        case (
+            Always(p, interval)
+            | Eventually(p, interval)
+            | Historically(p, interval)
+            | Once(p, interval)
+        ):
+            return type(f).__name__.lower(), (p,), interval
+    raise TypeError(f"not an operator: {f!r}")
+
 
 TRUE = Constant(True)
+"""The formula that always holds."""
+
 FALSE = Constant(False)
-
-
-def expression(value: "Expression | float") -> Expression:
-    """`value` as an expression. **Raises:** `TypeError` if it is neither one nor a number."""
-    if isinstance(value, Expression):
-        return value
-    if isinstance(value, Formula):
-        raise TypeError(f"a number or a signal is needed here, not the formula {value}")
-    if isinstance(value, bool) or not hasattr(value, "__float__"):
-        raise TypeError(f"a number or a signal is needed here; got {value!r}")
-    return Number(float(value))
+"""The formula that never holds."""
 
 
 def formula(value: Formulaic) -> Formula:
-    """`value` as a formula; an expression is its own robustness.
+    """Return `value` as a formula; an expression is its own robustness.
 
     **Raises:** `TypeError` if it is neither.
     """
     if isinstance(value, Formula):
         return value
-    if isinstance(value, Expression):
+    if isinstance(value, Term):
         return Atom(value)
     raise TypeError(f"a formula is needed here; got {value!r}")
 
 
-def signal(name: str) -> Signal:
-    """The signal called `name`, to build expressions and predicates from."""
-    return Signal(name)
-
-
 def conjunction(*parts: Formulaic) -> Formula:
-    """`f & g & ...`; one part alone is itself."""
+    """Return `f & g & ...`; one part alone is itself."""
     return _joined(And, "and", parts)
 
 
 def disjunction(*parts: Formulaic) -> Formula:
-    """`f | g | ...`; one part alone is itself."""
+    """Return `f | g | ...`; one part alone is itself."""
     return _joined(Or, "or", parts)
 
 
 def _joined(kind: type[And] | type[Or], word: str, parts: tuple[Formulaic, ...]) -> Formula:
-    from verifai_jax.mtl.printing import sugared
-
     first, *rest = map(formula, parts)
     if not rest:
         return first
     # `a & b & c` is one node, but an implication within `|` must stay readable as one.
-    if isinstance(first, And | Or) and isinstance(first, kind) and sugared(first)[0] == word:
+    if isinstance(first, And | Or) and isinstance(first, kind) and surface(first)[0] == word:
         return kind((*first.parts, *rest))
     return kind((first, *rest))
-
-
-def always(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`operand` holds at every instant from `a` to `b` seconds ahead, both included."""
-    return Always(formula(operand), Interval(a, b))
-
-
-def eventually(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`operand` holds at some instant from `a` to `b` seconds ahead, both included."""
-    return Eventually(formula(operand), Interval(a, b))
-
-
-def historically(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`operand` held at every instant from `a` to `b` seconds ago, both included."""
-    return Historically(formula(operand), Interval(a, b))
-
-
-def once(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`operand` held at some instant from `a` to `b` seconds ago, both included."""
-    return Once(formula(operand), Interval(a, b))
-
-
-def until(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`left` holds until `right` does, `a` to `b` seconds ahead; not needed at the witness."""
-    return formula(left).until(right, a, b)
-
-
-def since(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """`right` held, `a` to `b` seconds ago, and `left` ever since."""
-    return formula(left).since(right, a, b)
-
-
-def next_(operand: Formulaic) -> Formula:
-    """`operand` holds at the next sample."""
-    return Next(formula(operand))
-
-
-def prev(operand: Formulaic, weak: bool = False) -> Formula:
-    """`operand` held at the previous sample; false at the first one (true, if `weak`)."""
-    return Prev(formula(operand), weak)

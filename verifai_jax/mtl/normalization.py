@@ -1,7 +1,7 @@
 """One temperature for signals of different units: predicates in units of their own scale.
 
-normalised(f, {"x": 2.4, "theta": 0.2095})        # abs(x) / 2.4 <= 1 & abs(theta) / 0.2095 <= 1
-normalised(f, trace)                              # scales from how far each margin spreads
+normalize(f, {"x": 2.4, "theta": 0.2095})        # abs(x) / 2.4 <= 1 & abs(theta) / 0.2095 <= 1
+normalize(f, trace)                              # scales from how far each margin spreads
 anneal(step, steps=100)                           # temperatures of 0.3 down to 0.02
 """
 
@@ -14,15 +14,16 @@ from jaxtyping import Array, Float
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl._robustness import prepared
 from verifai_jax.mtl.evaluate import Evaluator
-from verifai_jax.mtl.formula import Expression, Formula
-from verifai_jax.mtl.rewriting import rebuilt, signals
+from verifai_jax.mtl.expression import Expression, Number, expression
+from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.rewriting import rebuild
 from verifai_jax.mtl.semantics import hard
+from verifai_jax.mtl.setting import prepare
 
 
-def normalised(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
-    """The formula with each predicate divided by its scale: the same truth, a relative robustness.
+def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
+    """Divide each predicate of a formula by its scale: the same truth, a relative robustness.
 
     **Arguments:**
 
@@ -35,7 +36,7 @@ def normalised(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula
     """
     if isinstance(scales, Trace):
         return _mapped(formula, _spreads(formula, scales))
-    names = signals(formula)
+    names = formula.signals()
     check_names("signal", scales, names)
     missing = [name for name in names if name not in scales]
     if missing:
@@ -44,7 +45,7 @@ def normalised(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula
         if not (scale > 0 and np.isfinite(scale)):
             raise ValueError(f"the scale of {name!r} must be positive and finite; got {scale}")
     leaves: dict[Formula, float] = {
-        leaf: max((float(scales[name]) for name in signals(leaf)), default=1.0)
+        leaf: max((float(scales[name]) for name in leaf.signals()), default=1.0)
         for leaf in formula.subformulas()
         if isinstance(leaf, ast.Predicate | ast.Atom)
     }
@@ -54,9 +55,9 @@ def normalised(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula
 def anneal(
     step: Float[Array, ""] | int, steps: int, start: float = 0.3, end: float = 0.02
 ) -> Float[Array, ""]:
-    """The temperature at a step of an optimisation of `steps`: geometric from `start` to `end`.
+    """Return the temperature at a step of an optimisation: geometric from `start` to `end`.
 
-    In units of the predicates' scale (see `normalised`). `step` may be traced.
+    In units of the predicates' scale (see `normalize`). `step` may be traced.
 
     **Raises:** `ValueError` for fewer than one step, or temperatures that are not positive.
     """
@@ -69,7 +70,7 @@ def anneal(
 
 
 def _spreads(formula: Formula, trace: Trace) -> dict[Formula, float]:
-    setting, arrays, _, _ = prepared(formula, trace.trim(), hard, "hold", None)
+    setting, arrays, _, _ = prepare(formula, trace.trim(), hard, "hold", None)
     evaluator = Evaluator(arrays, setting.length, setting.dt)
     spreads = {}
     for leaf in formula.subformulas():
@@ -87,8 +88,8 @@ def _mapped(f: Formula, scales: Mapping[Formula, float]) -> Formula:
             return ast.Predicate(comparison, _over(left, scales[f]), _over(right, scales[f]))
         case ast.Atom(e):
             return ast.Atom(_over(e, scales[f]))
-    return rebuilt(f, tuple(_mapped(part, scales) for part in f.operands()))
+    return rebuild(f, tuple(_mapped(part, scales) for part in f.operands()))
 
 
-def _over(e: Expression, scale: float) -> Expression:
-    return ast.Number(e.value / scale) if isinstance(e, ast.Number) else e / scale
+def _over(e: Term, scale: float) -> Expression:
+    return Number(e.value / scale) if isinstance(e, Number) else expression(e) / scale

@@ -16,9 +16,10 @@ import numpy as np
 from verifai_jax.core.figure import new_figure
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
-from verifai_jax.mtl._robustness import prepared, seconds
 from verifai_jax.mtl.evaluate import Evaluator
+from verifai_jax.mtl.formula import Term
 from verifai_jax.mtl.semantics import hard
+from verifai_jax.mtl.setting import prepare, seconds
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
 _MOST_ROWS = 14
@@ -111,7 +112,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Any:
 
 
 def _rows(tree: Node) -> list[tuple[int, Node]]:
-    """The nodes to show: all, or the deciding path with its immediate neighbours if too many."""
+    """Choose the nodes to show: all, or the deciding path with its neighbours if too many."""
     rows = tree.flat()
     if len(rows) <= _MOST_ROWS:
         return rows
@@ -171,7 +172,7 @@ def _edges(clock: np.ndarray) -> np.ndarray:
 
 
 def _runs(good: np.ndarray) -> list[tuple[int, int, bool]]:
-    """Stretches of equal truth as `(first, after, truth)`."""
+    """Split into stretches of equal truth, `(first, after, truth)`."""
     changes = np.flatnonzero(np.diff(good.astype(int))) + 1
     starts, ends = np.r_[0, changes], np.r_[changes, len(good)]
     return [(int(a), int(b), bool(good[a])) for a, b in zip(starts, ends, strict=True)]
@@ -195,12 +196,12 @@ def _strip(axis: Any, node: Node, clock: np.ndarray) -> float:
 
 
 def _predicate(axis: Any, explanation: Explanation, node: Node, clock: np.ndarray) -> float:
-    """Plots the two sides of a predicate; returns the height at the deciding instant."""
-    setting, signals, _, _ = prepared(node.formula, explanation.trace, hard, "hold", None)
+    """Draw the two sides of a predicate; return the height at the deciding instant."""
+    setting, signals, _, _ = prepare(node.formula, explanation.trace, hard, "hold", None)
     evaluator = Evaluator(signals, setting.length, setting.dt)
     last = setting.length - 1
 
-    def side(e: ast.Expression) -> np.ndarray:
+    def side(e: Term) -> np.ndarray:
         values = np.asarray(evaluator.expression(e, 0, last), float)
         return np.broadcast_to(values, (last + 1,))
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl._robustness import seconds
+from verifai_jax.mtl.setting import seconds
 
 Method = Literal["hold", "linear"]
 
 
 def resample(trace: Trace, dt: float, method: Method) -> Trace:
-    """The same signals on an even clock, from the first sample time to the last.
+    """Resample signals on an even clock, from the first sample time to the last.
 
     **Arguments:**
 
@@ -68,7 +68,7 @@ def read(
     resample_to: float | None = None,
     method: Method | None = None,
 ) -> Trace:
-    """A recorded trace from a CSV or Parquet file, one column a signal, one row a sample.
+    """Read a trace from a CSV or Parquet file, one column a signal, one row a sample.
 
     Columns `p[0]`, `p[1]`, ... make one vector signal `p`. Columns that hold no numbers are left
     out, unless named in `columns`.
@@ -120,7 +120,7 @@ def _check_increasing(times: np.ndarray) -> None:
 
 
 def _columns(path: Path) -> dict[str, Any]:
-    """Columns by name, as Arrow arrays."""
+    """Read columns by name, as Arrow arrays."""
     import pyarrow
     from pyarrow import csv, parquet
 

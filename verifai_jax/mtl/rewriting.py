@@ -1,65 +1,19 @@
-"""Questions about a formula that need no trace, and rewritings that keep its value.
+"""Rewritings that keep a formula's value.
 
-signals(f), horizon(f)                            # also f.signals(), f.horizon()
 nnf(f)                                            # negations only at the leaves
 simplify(f)                                       # fewer nodes, the same robustness
 """
 
-import math
 from decimal import Decimal
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.formula import FALSE, TRUE, Expression, Formula, Interval
-
-
-def signals(f: Formula) -> tuple[str, ...]:
-    """Names of the signals a formula speaks of, in order of appearance."""
-    names: dict[str, None] = {}
-    for part in f.subformulas():
-        for e in expressions(part):
-            _collect(e, names)
-    return tuple(names)
-
-
-def expressions(f: Formula) -> tuple[Expression, ...]:
-    """The expressions a leaf compares; none for an operator."""
-    match f:
-        case ast.Predicate(_, left, right):
-            return left, right
-        case ast.Atom(e):
-            return (e,)
-    return ()
-
-
-def _collect(e: Expression, names: dict[str, None]) -> None:
-    match e:
-        case ast.Signal(name):
-            names[name] = None
-        case ast.Component(vector, _):
-            _collect(vector, names)
-        case ast.Arithmetic(_, arguments):
-            for argument in arguments:
-                _collect(argument, names)
-
-
-def horizon(f: Formula, dt: float = 0.0) -> float:
-    """Seconds of trace beyond an instant on which a formula's truth there depends.
-
-    Infinite for an unbounded future operator. `next` reaches one sampling period `dt` ahead. Past
-    operators look back, so they never add (and are not subtracted, which keeps the bound simple).
-    """
-    below = max((horizon(part, dt) for part in f.operands()), default=0.0)
-    match f:
-        case ast.Always(_, interval) | ast.Eventually(_, interval) | ast.Until(_, _, interval):
-            return below + interval.end
-        case ast.Next():
-            return below + dt
-    return below
+from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
 
 
 def nnf(f: Formula) -> Formula:
-    """Negation normal form: `!` only on equalities and bare signals. Keeps the robustness.
+    """Return the negation normal form: `!` only on equalities and bare signals.
 
+    It has the same robustness.
     Inequalities absorb their negation (`!(x > 1)` is `x <= 1`). The dual of until has no node of
     its own, so that one case stays `!(f until g)` with `f` and `g` in normal form; the same for
     since.
@@ -108,13 +62,13 @@ def _nnf(f: Formula, positive: bool) -> Formula:
 
 
 def simplify(f: Formula) -> Formula:
-    """A formula of the same robustness on every trace under `hold`, with fewer nodes.
+    """Return a formula of the same robustness on every trace under `hold`, with fewer nodes.
 
     Folds constants, double negations, duplicates in `&` and `|`, nested `always always` and
     `eventually eventually`, and operators over `[0,0]`. Windows cut at the end of a trace
     (`end="truncate"`) may tell the nested windows apart where one is empty.
     """
-    f = rebuilt(f, tuple(simplify(part) for part in f.operands()))
+    f = rebuild(f, tuple(simplify(part) for part in f.operands()))
     match f:
         case ast.Not(ast.Not(inner)):
             return inner
@@ -170,8 +124,8 @@ def _simplified_join(parts: tuple[Formula, ...], neutral: Formula, absorbing: Fo
     return kept[0] if len(kept) == 1 else kind(kept)
 
 
-def rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
-    """The same operator over other operands."""
+def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
+    """Return the same operator over other operands."""
     match f:
         case ast.And():
             return ast.And(operands)
@@ -188,19 +142,3 @@ def rebuilt(f: Formula, operands: tuple[Formula, ...]) -> Formula:
         case ast.Not():
             return ast.Not(operands[0])
     return f
-
-
-def history(f: Formula, dt: float = 0.0) -> float:
-    """Seconds of trace before an instant on which a formula's truth there depends."""
-    below = max((history(part, dt) for part in f.operands()), default=0.0)
-    match f:
-        case ast.Once(_, interval) | ast.Historically(_, interval) | ast.Since(_, _, interval):
-            return below + interval.end
-        case ast.Prev():
-            return below + dt
-    return below
-
-
-def unbounded(f: Formula) -> bool:
-    """Whether a future operator in it has no end."""
-    return math.isinf(horizon(f))

@@ -1,4 +1,4 @@
-"""What a formula's operators mean as numbers: hard, boolean, or smooth at a temperature.
+"""The meaning of a formula's operators as numbers: hard, boolean, or smooth at a temperature.
 
     robustness(f, trace)                              # hard: min and max
     robustness(f, trace, smooth(0.1))                 # log-sum-exp at temperature 0.1
@@ -27,7 +27,7 @@ Bound = Literal["none", "lower", "upper"]
 )
 @dataclass(frozen=True)
 class Semantics:
-    """How to give a formula its value; made by `hard`, `boolean` and `smooth`."""
+    """The way to give a formula its value; made by `hard`, `boolean` and `smooth`."""
 
     kind: Kind
     tau: Any = None
@@ -49,7 +49,7 @@ def smooth(
     error: float | None = None,
     bound: Bound = "none",
 ) -> Semantics:
-    """Quantitative semantics by log-sum-exp, differentiable everywhere.
+    """Return quantitative semantics by log-sum-exp, differentiable everywhere.
 
     **Arguments:**
 

@@ -25,7 +25,7 @@ Series = Float[Array, "time *lanes"]
 
 
 def _starts(n: int, length: int, reverse: bool) -> np.ndarray:
-    """Where the blocks begin, in the order of the scan that runs against `reverse`.
+    """Mark where the blocks begin, in the order of the scan that runs against `reverse`.
 
     Blocks are aligned so that no window that is cut at the end of the array spans two of them.
     """
@@ -34,13 +34,13 @@ def _starts(n: int, length: int, reverse: bool) -> np.ndarray:
 
 
 def _ends(n: int, length: int, reverse: bool) -> np.ndarray:
-    """Where the blocks end, seen the same way."""
+    """Mark where the blocks end, in the same order."""
     k = np.arange(length)
     return (length - 1 - k) % n == 0 if reverse else k % n == 0
 
 
 def _far(by: int, length: int, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The instants `by` samples later (earlier, if not `reverse`), and whether they exist."""
+    """Return the instants `by` samples later (earlier, if not `reverse`), and which exist."""
     k = np.arange(length, dtype=np.int32) + (by if reverse else -by)
     return np.clip(k, 0, length - 1), (k >= 0) & (k < length)
 
@@ -55,12 +55,12 @@ def _row(x: Series, k: Array) -> Array:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
-    """Maximum (minimum, for `sign` -1) of the `n` samples from each instant on (up to it)."""
+    """Compute the maximum (minimum, for `sign` -1) of `n` samples from (up to) each instant."""
     return _windowed(n, reverse, sign, x, keep=False)[0]
 
 
 def _windowed(n: int, reverse: bool, sign: int, x: Series, keep: bool) -> tuple[Series, Any]:
-    """The windows, and if `keep` what the way back needs: three truth values a sample.
+    """Compute windows, and if `keep` what the way back needs: three truth values a sample.
 
     `newest` says whether the newest sample is a running maximum, in each of the scans; `near`
     whether a window's value comes from the scan that began there.
@@ -140,7 +140,7 @@ windowed.defvjp(_windowed_forward, _windowed_backward)
 
 
 def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Array]:
-    """The pair with one more value, of a `weight`; one exponential instead of two."""
+    """Add one more value, of a `weight`, to the pair; one exponential instead of two."""
     top = jnp.maximum(m, x)
     fade = jnp.exp((jnp.minimum(m, x) - top) / tau)
     grows = x > m
@@ -148,7 +148,7 @@ def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Ar
 
 
 def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
-    """`finish(m, s)` of the pairs over the windows of `weight * exp(sign * x / tau)`."""
+    """Compute `finish(m, s)` of the pairs over windows of `weight * exp(sign * x / tau)`."""
     length = x.shape[0]
     nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))
     given = weight is not None
@@ -187,7 +187,7 @@ def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, f
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> Series:
-    """The same with `tau log sum exp(x / tau)` for the maximum."""
+    """Compute the same with `tau log sum exp(x / tau)` for the maximum."""
     return _pairs(n, reverse, sign, x, None, tau, lambda m, s: sign * (m + tau * jnp.log(s)))
 
 
@@ -213,7 +213,7 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 
 
 def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: str) -> tuple[Array, Any]:
-    """The last value of the recursion, and what to `keep` of each step.
+    """Compute the last value of the recursion, and what to `keep` of each step.
 
     `"u"` keeps the values, `"v"` what the way back needs: the smaller of `f` and the value before,
     or in the hard case where a value comes from: `g` at once, or else `f`.
@@ -239,7 +239,7 @@ def _greater(a: Array, b: Array, tau: Any) -> Array:
 
 
 def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, Series]:
-    """`pull` is the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
+    """Pull back the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
     f, g, v, tau = residuals
     lanes = jnp.ndim(v if tau is not None else v[0]) - 1
     whole = pull.ndim > lanes
@@ -266,7 +266,7 @@ def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, S
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def until(reverse: bool, f: Series, g: Series) -> Series:
-    """`u[t] = max(g[t], min(f[t], u[t+1]))` (`u[t-1]`, if not `reverse`)."""
+    """Compute `u[t] = max(g[t], min(f[t], u[t+1]))` (`u[t-1]`, if not `reverse`)."""
     return _until(reverse, f, g, None, "u")[1]
 
 
@@ -280,7 +280,7 @@ until.defvjp(_until_forward, _until_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
-    """The same with smooth maxima and minima."""
+    """Compute the same with smooth maxima and minima."""
     return _until(reverse, f, g, tau, "u")[1]
 
 
@@ -298,7 +298,7 @@ until_smooth.defvjp(_until_smooth_forward, _until_smooth_backward)
 
 @jax.custom_vjp
 def until_first(f: Series, g: Series) -> Array:
-    """The first value of `until`, without storing the others."""
+    """Compute the first value of `until`, without storing the others."""
     return _until(True, f, g, None, "")[0]
 
 
@@ -316,7 +316,7 @@ until_first.defvjp(_until_first_forward, _until_first_backward)
 
 @jax.custom_vjp
 def until_first_smooth(f: Series, g: Series, tau: Array) -> Array:
-    """The first value of `until_smooth`, without storing the others."""
+    """Compute the first value of `until_smooth`, without storing the others."""
     return _until(True, f, g, tau, "")[0]
 
 

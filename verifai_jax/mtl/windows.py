@@ -29,7 +29,7 @@ def _form() -> Any:
 def extreme(
     x: Float[Array, "time *lanes"], sign: int = 1, tau: Tau = None
 ) -> Float[Array, " *lanes"]:
-    """Greatest value along time (least, for sign -1); smooth at temperature `tau` if given."""
+    """Compute the greatest value along time (least, for sign -1); smooth at a temperature `tau`."""
     m = jnp.max(x, axis=0) if sign > 0 else jnp.min(x, axis=0)
     if tau is None or x.shape[0] == 1:
         return m
@@ -38,7 +38,7 @@ def extreme(
 
 
 def join(values: list[Array], sign: int = 1, tau: Tau = None) -> Array:
-    """The greatest of several arrays (the least, for sign -1), element by element."""
+    """Compute the greatest of several arrays (the least, for sign -1), element by element."""
     m = values[0]
     for value in values[1:]:
         m = jnp.maximum(m, value) if sign > 0 else jnp.minimum(m, value)
@@ -57,7 +57,7 @@ def windowed(
     reverse: bool = True,
     form: Any = None,
 ) -> Float[Array, "time *lanes"]:
-    """Maximum of the `n` samples that begin at each instant; that end there, if not `reverse`.
+    """Compute the maximum of `n` samples that begin at each instant; end there, if not `reverse`.
 
     The minimum, for sign -1. Windows are cut at the ends of the array. Time `O(time)` on a CPU.
 
@@ -80,7 +80,7 @@ def until(
     reverse: bool = True,
     form: Any = None,
 ) -> Float[Array, "time *lanes"]:
-    """`u[t] = max(g[t], min(f[t], u[t+1]))`, and `u = g` at the last sample.
+    """Compute `u[t] = max(g[t], min(f[t], u[t+1]))`, and `u = g` at the last sample.
 
     Backwards, if not `reverse`: `u[t] = max(g[t], min(f[t], u[t-1]))`, which is since.
     """
@@ -96,7 +96,7 @@ def until_first(
     tau: Tau = None,
     form: Any = None,
 ) -> Float[Array, " *lanes"]:
-    """The first sample of `until(f, g)`."""
+    """Compute the first sample of `until(f, g)`."""
     form = form or _form()
     if form is sequential and g.shape[0] > 1:
         if tau is None:

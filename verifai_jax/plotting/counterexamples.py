@@ -15,7 +15,8 @@ from verifai_jax.counterexamples._explain import Explained, Influence
 from verifai_jax.counterexamples._shrink import Shrunk
 from verifai_jax.counterexamples.description import format_apart, format_number
 from verifai_jax.mtl import Explanation, robustness_signal
-from verifai_jax.mtl.formula import Arithmetic, Atom, Number, Predicate
+from verifai_jax.mtl.expression import Arithmetic, Number
+from verifai_jax.mtl.formula import Atom, Predicate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 QUIET = "#8d99ae"

@@ -24,7 +24,7 @@ from jaxtyping import Float, UInt8
 
 from verifai_jax.core.errors import require, unknown_name
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.waveform import bound
+from verifai_jax.core.waveform import set_durations
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.replay import decisive_instant
 from verifai_jax.systems.mujoco.system import MuJoCo
@@ -83,7 +83,7 @@ def record(replay: Replay) -> Motion:
     system: Any = replay.problem.system
     if not can_draw(system):
         raise ValueError(f"the system of problem {replay.problem.name!r} is no MuJoCo model")
-    features, loop = bound(replay.features, system.duration), system.loop
+    features, loop = set_durations(replay.features, system.duration), system.loop
     # Kept with the problem, as they are compiled once.
     simulate, placed = replay.problem.programs.get(RECORDERS, None, lambda: _recorder(system))
     clock = np.asarray(replay.trace.clock(), np.float64)

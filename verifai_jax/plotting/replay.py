@@ -12,7 +12,8 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Formula, explain, robustness_signal
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.formula import Arithmetic, Component, Number, Predicate, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.formula import Predicate
 from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
 
 MOST_PANELS = 6

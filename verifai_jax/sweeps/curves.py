@@ -17,7 +17,7 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval
 from verifai_jax.mtl.recording import resample
-from verifai_jax.mtl.rewriting import rebuilt
+from verifai_jax.mtl.rewriting import rebuild
 
 SIGNALS = ("return",)
 """Signals of a learning curve: the mean return of the episodes that ended in each update."""
@@ -112,7 +112,7 @@ def curve_robustness(
 
 def _in_updates(formula: Formula, period: float) -> Formula:
     """Rescale the bounds of a formula to updates, rounded down to whole ones."""
-    changed = rebuilt(formula, tuple(_in_updates(part, period) for part in formula.operands()))
+    changed = rebuild(formula, tuple(_in_updates(part, period) for part in formula.operands()))
     interval = getattr(changed, "interval", None)
     if interval is None:
         return changed

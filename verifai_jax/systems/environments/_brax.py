@@ -24,7 +24,7 @@ from verifai_jax.core.errors import (
     unknown_name,
 )
 from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import bound
+from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.environments.brax_model import (
     Env,
@@ -119,7 +119,7 @@ class Brax(System):
 
     def _episode(self, features: Features) -> Episode:
         """Return the environment under these features, with the policy in the loop."""
-        features = bound(features, self.duration)
+        features = set_durations(features, self.duration)
         self.check(features)
         fixed = None if has_waveforms(features) else self._configure(features, 0.0)
 

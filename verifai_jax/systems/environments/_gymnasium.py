@@ -19,7 +19,7 @@ import numpy as np
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import bound, is_waveform
+from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.environments.episode import (
     Moment,
@@ -73,7 +73,7 @@ class EpisodeFunction:
 
     def __call__(self, features: Mapping[str, Any], seed: int) -> Trace:
         env, dt = self.environment, self.period
-        features = bound(features, self.steps * dt)
+        features = set_durations(features, self.steps * dt)
         self._set(features, 0.0)
         if self.configure is not None:
             self.configure(env, features)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Key, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.trace import Trace
-from verifai_jax.core.waveform import bound
+from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
@@ -120,11 +120,11 @@ class MuJoCo(System):
 
         **Raises:** `ValueError`.
         """
-        self.loop.check(bound(features, self.duration))
+        self.loop.check(set_durations(features, self.duration))
 
     def abstract(self, features: Features) -> Trace:
         """Return the trace of one simulation, as shapes alone."""
-        loop, features = self.loop, bound(features, self.duration)
+        loop, features = self.loop, set_durations(features, self.duration)
 
         def trace(features: Features) -> Trace:
             zeros = {name: jnp.zeros(shape) for name, shape in loop.shapes.items()}
@@ -147,7 +147,7 @@ class MuJoCo(System):
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once: traced by JAX unless the backend is native."""
-        features = bound(features, self.duration)
+        features = set_durations(features, self.duration)
         if not self.black_box:
             self.loop.check(features)
             return rollout(self.loop, features, key)
@@ -159,7 +159,7 @@ class MuJoCo(System):
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         """Simulate a batch natively; every leaf has a leading axis `[n]`."""
-        return self._native.simulate(bound(features, self.duration), keys)
+        return self._native.simulate(set_durations(features, self.duration), keys)
 
     @cached_property
     def _native(self) -> Native:

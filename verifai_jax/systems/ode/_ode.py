@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.waveform import bound
+from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
@@ -76,7 +76,7 @@ class Ode(System):
 
         Only a waveform without a duration is given that of the simulation.
         """
-        features = bound(features, self.duration)
+        features = set_durations(features, self.duration)
         return _Rollout(self, features).trace(as_floating(self.initial(features, key), "initial"))
 
     def fold(
@@ -92,7 +92,7 @@ class Ode(System):
 
         **Returns:** the last carry, and the status.
         """
-        features = bound(features, self.duration)
+        features = set_durations(features, self.duration)
         rollout = _Rollout(self, features)
         return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
 

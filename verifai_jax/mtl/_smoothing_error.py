@@ -1,20 +1,27 @@
-"""How far the smooth robustness can be from the hard one, in temperatures.
+"""The greatest distance of the smooth robustness from the hard one, in temperatures.
 
 A smooth maximum of n values exceeds the hard one by at most tau log n, a smooth minimum falls short
 of it by as much. Along a path of sub-formulas these add up; adjacent maxima count as one.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import Evaluator
+from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.semantics import hard
+from verifai_jax.mtl.setting import Setting, evaluator_of, prepare
 
 
-class Certificate(NamedTuple):
-    """`smooth - tau * above <= hard <= smooth + tau * below`."""
+class SmoothingError(NamedTuple):
+    """Bounds of the hard robustness: `smooth - tau * above <= hard <= smooth + tau * below`.
+
+    - `above`, `below`: in temperatures.
+    """
 
     above: float
     below: float
@@ -23,6 +30,26 @@ class Certificate(NamedTuple):
     def total(self) -> float:
         """The greater of both: `|smooth - hard| <= tau * total`."""
         return max(self.above, self.below)
+
+
+def smoothing_error(
+    formula: Formula | str, trace: Trace, end: End = "hold", compat: str | None = None
+) -> SmoothingError:
+    """Bound the distance of the smooth robustness of such a trace from the hard one.
+
+    **Arguments:** as `robustness`; only the trace's length and period matter, not its values.
+
+    **Returns:** `above` and `below`, in temperatures: `smooth - tau * above <= hard <= smooth + tau
+    * below`.
+    """
+    setting, _, _, _ = prepare(formula, trace, hard, end, compat)
+    return error_of_setting(setting)
+
+
+@functools.lru_cache(maxsize=1024)
+def error_of_setting(setting: Setting, last: int = 0) -> SmoothingError:
+    """Bound the distance at any of the instants 0 to `last`."""
+    return slack(evaluator_of(setting, {}, None, None, 0), setting.formula, 0, last)
 
 
 @dataclass(frozen=True)
@@ -47,13 +74,13 @@ class _Slack:
         return _Slack(self.below, self.above, kind, self.log_count)
 
 
-def slack(evaluator: Evaluator, f: Formula, first: int, last: int) -> Certificate:
-    """The certificate of `f`'s smooth value at any of the instants `first` to `last`."""
-    return Certificate(*_slack(evaluator, f, first, last).settled())
+def slack(evaluator: Evaluator, f: Formula, first: int, last: int) -> SmoothingError:
+    """Return the bounds of `f`'s smooth value at any of the instants `first` to `last`."""
+    return SmoothingError(*_slack(evaluator, f, first, last).settled())
 
 
 def _joined(kind: str, parts: list[_Slack], repeats: float = 1.0) -> _Slack:
-    """A join of the `parts`, each of them `repeats` times."""
+    """Join the `parts`, each of them `repeats` times."""
     above = below = 0.0
     logs = []
     for part in parts:

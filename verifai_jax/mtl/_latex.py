@@ -1,0 +1,72 @@
+r"""Formulas in LaTeX.
+
+latex(eventually(signal("x") <= 2, 0, 4))    # \Diamond_{[0, 4]} \left(\mathit{x} \leq 2\right)
+"""
+
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.formula import Formula, Term, surface
+from verifai_jax.mtl.words import number_text
+
+_LATEX = {
+    "and": r"\land", "or": r"\lor", "implies": r"\rightarrow", "iff": r"\leftrightarrow",
+    "xor": r"\oplus", "not": r"\lnot", "always": r"\Box", "eventually": r"\Diamond",
+    "historically": r"\boxminus", "once": r"\diamondminus", "next": r"\bigcirc",
+    "prev": r"\ominus", "weak_prev": r"\widetilde{\ominus}",
+    "until": r"\mathbin{\mathcal{U}}", "since": r"\mathbin{\mathcal{S}}",
+    "weak_until": r"\mathbin{\mathcal{W}}", "release": r"\mathbin{\mathcal{R}}",
+}  # fmt: skip
+
+_COMPARISON_LATEX = {">=": r"\geq", "<=": r"\leq", "==": "=", "!=": r"\neq"}
+
+
+def latex(f: Formula) -> str:
+    """Write a formula in LaTeX math mode; its temporal symbols need `amssymb`."""
+    match f:
+        case ast.Constant(value):
+            return r"\top" if value else r"\bot"
+        case ast.Predicate(comparison, left, right):
+            symbol = _COMPARISON_LATEX.get(comparison, comparison)
+            return f"{_expression_latex(left)} {symbol} {_expression_latex(right)}"
+        case ast.Atom(e):
+            return _expression_latex(e)
+    word, operands, interval = surface(f)
+    symbol = _LATEX[word]
+    if interval is not None and not interval.everything:
+        end = r"\infty" if interval.end == float("inf") else number_text(interval.end)
+        symbol += f"_{{[{number_text(interval.start)}, {end}]}}"
+    parts = [
+        latex(p) if not p.operands() and len(operands) > 1 else rf"\left({latex(p)}\right)"
+        for p in operands
+    ]
+    return f"{symbol} {parts[0]}" if len(parts) == 1 else f" {symbol} ".join(parts)
+
+
+def _expression_latex(e: Term, outer: int = 0) -> str:
+    match e:
+        case Number(value):
+            return f"({number_text(value)})" if value < 0 and outer > 0 else number_text(value)
+        case Signal(name):
+            return rf"\mathit{{{name.replace('_', chr(92) + '_')}}}"
+        case Component(vector, index):
+            return f"{_expression_latex(vector)}_{{{index}}}"
+        case Arithmetic("neg", (argument,)):
+            level, text = 3, f"-{_expression_latex(argument, 4)}"
+        case Arithmetic("/", (left, right)):
+            return rf"\frac{{{_expression_latex(left)}}}{{{_expression_latex(right)}}}"
+        case Arithmetic(("+" | "-" | "*") as name, (left, right)):
+            level = PRECEDENCE[name]
+            symbol = r"\cdot" if name == "*" else name
+            right = _expression_latex(right, level + 1)
+            text = f"{_expression_latex(left, level)} {symbol} {right}"
+        case Arithmetic("abs", (argument,)):
+            return rf"\left|{_expression_latex(argument)}\right|"
+        case Arithmetic("norm", (argument,)):
+            return rf"\left\lVert{_expression_latex(argument)}\right\rVert"
+        case Arithmetic("sqrt", (argument,)):
+            return rf"\sqrt{{{_expression_latex(argument)}}}"
+        case Arithmetic(name, arguments):
+            return rf"\{name}\left({', '.join(map(_expression_latex, arguments))}\right)"
+        case _:
+            raise TypeError(f"not an expression: {e!r}")
+    return rf"\left({text}\right)" if level < outer else text

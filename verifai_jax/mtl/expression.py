@@ -1,0 +1,244 @@
+"""Expressions over signals: arithmetic whose comparisons are formulas.
+
+x, theta = signal("x"), signal("theta")
+2 * x + theta.abs() <= 2.4                                    # a Formula
+"""
+
+import math
+import re
+from dataclasses import dataclass
+
+from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
+from verifai_jax.mtl.words import FUNCTIONS, name_text, number_text
+
+PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
+"""Binding strength of the operators."""
+
+
+class Expression(Term):
+    """A number at every instant: arithmetic over signals. Comparing one gives a `Formula`.
+
+    `==` compares expressions as trees; the predicate "equal" is `x.equals(3)`, "unequal"
+    `x.differs(3)`.
+    """
+
+    def __add__(self, other: "Expression | float") -> "Expression":
+        return Arithmetic("+", (self, expression(other)))
+
+    def __radd__(self, other: float) -> "Expression":
+        return Arithmetic("+", (expression(other), self))
+
+    def __sub__(self, other: "Expression | float") -> "Expression":
+        return Arithmetic("-", (self, expression(other)))
+
+    def __rsub__(self, other: float) -> "Expression":
+        return Arithmetic("-", (expression(other), self))
+
+    def __mul__(self, other: "Expression | float") -> "Expression":
+        return Arithmetic("*", (self, expression(other)))
+
+    def __rmul__(self, other: float) -> "Expression":
+        return Arithmetic("*", (expression(other), self))
+
+    def __truediv__(self, other: "Expression | float") -> "Expression":
+        return Arithmetic("/", (self, expression(other)))
+
+    def __rtruediv__(self, other: float) -> "Expression":
+        return Arithmetic("/", (expression(other), self))
+
+    def __neg__(self) -> "Expression":
+        return Arithmetic("neg", (self,))
+
+    def __abs__(self) -> "Expression":
+        return Arithmetic("abs", (self,))
+
+    def __getitem__(self, index: int) -> "Expression":
+        return Component(self, index)
+
+    def abs(self) -> "Expression":
+        """Return the absolute value."""
+        return abs(self)
+
+    def sqrt(self) -> "Expression":
+        """Return the square root; NaN where negative."""
+        return Arithmetic("sqrt", (self,))
+
+    def sin(self) -> "Expression":
+        """Return the sine of an angle in radians."""
+        return Arithmetic("sin", (self,))
+
+    def cos(self) -> "Expression":
+        """Return the cosine of an angle in radians."""
+        return Arithmetic("cos", (self,))
+
+    def norm(self) -> "Expression":
+        """Return the Euclidean norm of a vector signal `[time, k]` at every instant."""
+        return Arithmetic("norm", (self,))
+
+    def min(self, *others: "Expression | float") -> "Expression":
+        """Return the least of this and the others, at every instant."""
+        return Arithmetic("min", (self, *map(expression, others)))
+
+    def max(self, *others: "Expression | float") -> "Expression":
+        """Return the greatest of this and the others, at every instant."""
+        return Arithmetic("max", (self, *map(expression, others)))
+
+    def __ge__(self, other: "Expression | float") -> Formula:
+        return Predicate(">=", self, expression(other))
+
+    def __gt__(self, other: "Expression | float") -> Formula:
+        return Predicate(">", self, expression(other))
+
+    def __le__(self, other: "Expression | float") -> Formula:
+        return Predicate("<=", self, expression(other))
+
+    def __lt__(self, other: "Expression | float") -> Formula:
+        return Predicate("<", self, expression(other))
+
+    def equals(self, other: "Expression | float") -> Formula:
+        """Return the predicate `self == other`, of robustness `-|self - other|`."""
+        return Predicate("==", self, expression(other))
+
+    def differs(self, other: "Expression | float") -> Formula:
+        """Return the predicate `self != other`, of robustness `|self - other|`."""
+        return Predicate("!=", self, expression(other))
+
+    def __and__(self, other: Formula | Term) -> Formula:
+        return formula(self) & other
+
+    def __or__(self, other: Formula | Term) -> Formula:
+        return formula(self) | other
+
+    def __rshift__(self, other: Formula | Term) -> Formula:
+        return formula(self) >> other
+
+    def __invert__(self) -> Formula:
+        return ~formula(self)
+
+
+@dataclass(frozen=True)
+class Number(Expression):
+    """A constant."""
+
+    value: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", float(self.value))
+        if not math.isfinite(self.value):
+            raise ValueError(f"a number in a formula must be finite; got {self.value}")
+
+    def __neg__(self) -> "Expression":
+        return Number(-self.value)
+
+    def text(self, outer: int = 0) -> str:
+        """Return the number, in parentheses if it is negative within an operator."""
+        text = number_text(self.value)
+        return f"({text})" if self.value < 0 and outer > 0 else text
+
+
+@dataclass(frozen=True)
+class Signal(Expression):
+    """A signal of the trace, by name. A boolean signal counts as +1 (true) and -1 (false)."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not re.fullmatch(r'[^"\n]+', self.name):
+            raise ValueError(
+                f"a signal's name is a non-empty text without quotes or line breaks; "
+                f"got {self.name!r}"
+            )
+
+    @property
+    def is_signal(self) -> bool:
+        """True."""
+        return True
+
+    def signals(self) -> tuple[str, ...]:
+        """Return its name."""
+        return (self.name,)
+
+    def text(self, outer: int = 0) -> str:
+        """Return its name, in quotes where the grammar needs them."""
+        return name_text(self.name)
+
+
+@dataclass(frozen=True)
+class Component(Expression):
+    """One component of a vector signal `[time, k]`, counted from 0."""
+
+    vector: Expression
+    index: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.vector, Signal):
+            raise ValueError(f"only a signal has components; got ({self.vector})[{self.index}]")
+        if not isinstance(self.index, int) or self.index < 0:
+            raise ValueError(
+                f"a component's index is an integer, at least 0; got {self.vector}[{self.index}]"
+            )
+
+    @property
+    def is_signal(self) -> bool:
+        """True."""
+        return True
+
+    def signals(self) -> tuple[str, ...]:
+        """Return the name of the vector."""
+        return self.vector.signals()
+
+    def text(self, outer: int = 0) -> str:
+        """Return the vector with its index in brackets."""
+        return f"{self.vector}[{self.index}]"
+
+
+@dataclass(frozen=True)
+class Arithmetic(Expression):
+    """An operator (`+ - * / neg`) or a function (see `FUNCTIONS`) of expressions."""
+
+    name: str
+    arguments: tuple[Expression, ...]
+
+    def __post_init__(self) -> None:
+        n, least = len(self.arguments), FUNCTIONS.get(self.name)
+        if least is not None and (n != 1 if least == 1 else n < least):
+            wanted = "one argument" if least == 1 else "two arguments or more"
+            raise ValueError(f"{self.name} takes {wanted}; got {n}")
+
+    def signals(self) -> tuple[str, ...]:
+        """Return the names of the signals in it, in order of appearance."""
+        return tuple(dict.fromkeys(name for part in self.arguments for name in part.signals()))
+
+    def text(self, outer: int = 0) -> str:
+        """Return the text, in parentheses if its operator binds weaker than `outer`."""
+        if self.name not in PRECEDENCE:
+            return f"{self.name}({', '.join(map(str, self.arguments))})"
+        level = PRECEDENCE[self.name]
+        if self.name == "neg":
+            text = f"-{self.arguments[0].text(level + 1)}"
+        else:
+            left, right = self.arguments
+            text = f"{left.text(level)} {self.name} {right.text(level + 1)}"
+        return f"({text})" if level < outer else text
+
+
+def expression(value: "Term | float") -> Expression:
+    """Return `value` as an expression.
+
+    **Raises:** `TypeError` if it is neither one nor a number.
+    """
+    if isinstance(value, Expression):
+        return value
+    if isinstance(value, Formula):
+        raise TypeError(f"a number or a signal is needed here, not the formula {value}")
+    if isinstance(value, bool) or not hasattr(value, "__float__"):
+        raise TypeError(f"a number or a signal is needed here; got {value!r}")
+    return Number(float(value))  # pyright: ignore[reportArgumentType]
+
+
+def signal(name: str) -> Signal:
+    """Return the signal called `name`, to build expressions and predicates from.
+
+    **Raises:** `ValueError` for an empty name, or one with quotes or line breaks.
+    """
+    return Signal(name)

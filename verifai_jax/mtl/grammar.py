@@ -1,0 +1,154 @@
+"""The text grammar of formulas: its parser, and what its errors say."""
+
+import functools
+from typing import Any
+
+from verifai_jax.mtl.words import NAME, WORDS
+
+UNARY = ("always", "eventually", "historically", "once", "next", "prev", "weak_prev")
+"""Operators in front of one operand."""
+
+BINARY = ("until", "weak_until", "release", "since")
+"""Operators between two operands."""
+
+
+class FormulaSyntaxError(ValueError):
+    """A text that is not a formula; the message shows the place and what to write instead.
+
+    `position` is the offset of the place in the text.
+    """
+
+    def __init__(self, reason: str, text: str, position: int, width: int = 1) -> None:
+        self.position = position
+        before = text[:position]
+        line = before.count("\n")
+        shown = text.split("\n")[line]
+        column = position - (before.rfind("\n") + 1)
+        carets = "^" * max(1, min(width, len(shown) - column))
+        super().__init__(f"{reason}\n  {shown}\n  {' ' * column}{carets}")
+
+
+@functools.cache
+def parser() -> Any:
+    """Return the LALR parser, made once."""
+    import lark
+
+    def keyword(word: str) -> str:
+        # An underscore may join an operator to its interval: `alw_[0,10]`.
+        joint = r"(?:(?![\w.])|_(?=\s*\[))"
+        alternatives = []
+        for option in sorted(WORDS[word], key=len, reverse=True):
+            if NAME.fullmatch(option):
+                alternatives.append(option + joint)
+            else:
+                escaped = "".join("\\" + c for c in option)
+                alternatives.append(escaped + r"(?:_(?=\s*\[))?")
+        return f"/{'|'.join(alternatives)}/"
+
+    unary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in UNARY)
+    binary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in BINARY)
+    # XOR, IFF and IMPLIES come before the comparisons that start like them.
+    joints = "\n".join(
+        f"{w.upper()}.4: {keyword(w)}" for w in ("iff", "xor", "implies", "or", "and")
+    )
+    grammar = rf"""
+        ?start: iff
+        ?iff: impl ((IFF | XOR) impl)*
+        ?impl: or_ (IMPLIES or_)*
+        ?or_: and_ (OR and_)*
+        ?and_: bin (AND bin)*
+        ?bin: unary (_binary unary)*
+        _binary: ({" | ".join(w.upper() for w in BINARY)}) [interval]
+        ?unary: NOT unary -> negation
+              | ({" | ".join(w.upper() for w in UNARY)}) [interval] unary -> temporal
+              | cmp
+        ?cmp: sum (COMPARISON sum)*
+        ?sum: product ((PLUS | MINUS) product)*
+        ?product: factor ((STAR | SLASH) factor)*
+        ?factor: MINUS factor -> minus
+               | postfix
+        ?postfix: atom
+                | atom "[" NUMBER "]" -> component
+        ?atom: NUMBER -> number
+             | NAME -> name
+             | QUOTED -> quoted
+             | TRUE -> true
+             | FALSE -> false
+             | NAME "(" iff ("," iff)* ")" -> call
+             | "(" iff ")" -> parens
+        interval: "[" bound ("," | ":") bound "]"
+        bound: [MINUS] NUMBER [UNIT] | NAME
+
+        {unary}
+        {binary}
+        {joints}
+        NOT.2: {keyword("not")}
+        TRUE.3: {keyword("TRUE")}
+        FALSE.3: {keyword("FALSE")}
+        COMPARISON.3: />=|<=|==|!=|>|</
+        PLUS: "+"
+        MINUS: "-"
+        STAR: "*"
+        SLASH: "/"
+        UNIT.5: /(?:min|ms|us|ns|s)(?!\w)/
+        NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
+        NAME: /{NAME.pattern}/
+        QUOTED: /"[^"\n]+"/
+        %ignore /\s+/
+    """
+    return lark.Lark(
+        grammar,
+        parser="lalr",
+        lexer="contextual",
+        propagate_positions=True,
+        maybe_placeholders=True,
+    )
+
+
+_GROUPS = (
+    ({"NUMBER", "NAME", "QUOTED"}, "a signal or a number"),
+    ({"NOT"}, "'!'"),
+    ({"ALWAYS"}, "a temporal operator (always, eventually, ...)"),
+    ({"LPAR"}, "'('"),
+    ({"AND", "OR"}, "'&', '|', '->'"),
+    ({"UNTIL"}, "until"),
+    ({"COMPARISON"}, "a comparison (<=, >, ...)"),
+    ({"PLUS"}, "arithmetic"),
+    ({"UNIT"}, "a unit (s, ms, us, ns, min)"),
+    ({"COMMA"}, "','"),
+    ({"COLON"}, "':'"),
+    ({"RPAR"}, "')'"),
+    ({"LSQB"}, "'['"),
+    ({"RSQB"}, "']'"),
+    ({"$END"}, "the end"),
+)
+
+
+def explain_error(error: Any, text: str) -> FormulaSyntaxError:
+    """Turn an error of the parser into one that shows the place and the words expected there."""
+    import lark
+
+    if not text.strip():
+        return FormulaSyntaxError("a formula is needed; got an empty text", text, 0)
+    at_end = isinstance(error, lark.UnexpectedEOF) or (
+        isinstance(error, lark.UnexpectedToken) and error.token.type == "$END"
+    )
+    if at_end:
+        position, width, found = len(text.rstrip()), 1, "the end of the text"
+    elif isinstance(error, lark.UnexpectedToken):
+        position = error.token.start_pos or 0
+        width, found = len(error.token), f"{str(error.token)!r}"
+    else:
+        position = error.pos_in_stream or 0
+        width, found = 1, f"{text[position]!r}"
+    if found == "'='":
+        return FormulaSyntaxError(
+            "'=' is no comparison: write == for equal, >= or <=", text, position
+        )
+    if found == "')'" and text[:position].count("(") == text[:position].count(")"):
+        return FormulaSyntaxError("there is no '(' for this ')'", text, position)
+    expected = set(getattr(error, "accepts", None) or getattr(error, "expected", None) or ())
+    expected |= set(getattr(error, "allowed", None) or ())
+    words = [word for names, word in _GROUPS if names & expected]
+    wanted = " or ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
+    return FormulaSyntaxError(f"expected {wanted}, but found {found}", text, position, width)

@@ -1,0 +1,60 @@
+"""Temporal operators as functions; times are in seconds, and an interval's ends belong to it.
+
+always(abs(signal("x")) <= 2.4, 0, 4)
+until(signal("request") > 0, signal("grant") > 0, 0.2, 0.6)
+"""
+
+import math
+
+from verifai_jax.mtl.formula import (
+    Always,
+    Eventually,
+    Formula,
+    Formulaic,
+    Historically,
+    Interval,
+    Next,
+    Once,
+    Prev,
+    formula,
+)
+
+
+def always(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `operand` at every instant from `a` to `b` seconds ahead."""
+    return Always(formula(operand), Interval(a, b))
+
+
+def eventually(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `operand` at some instant from `a` to `b` seconds ahead."""
+    return Eventually(formula(operand), Interval(a, b))
+
+
+def historically(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `operand` at every instant from `a` to `b` seconds ago."""
+    return Historically(formula(operand), Interval(a, b))
+
+
+def once(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `operand` at some instant from `a` to `b` seconds ago."""
+    return Once(formula(operand), Interval(a, b))
+
+
+def until(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `left` until `right` holds, `a` to `b` seconds ahead; not needed at the witness."""
+    return formula(left).until(right, a, b)
+
+
+def since(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+    """Require `right` at some instant from `a` to `b` seconds ago, and `left` ever since."""
+    return formula(left).since(right, a, b)
+
+
+def next_(operand: Formulaic) -> Formula:
+    """Require `operand` at the next sample."""
+    return Next(formula(operand))
+
+
+def prev(operand: Formulaic, weak: bool = False) -> Formula:
+    """Require `operand` at the previous sample; false at the first one (true, if `weak`)."""
+    return Prev(formula(operand), weak)
