@@ -145,7 +145,7 @@ def trained(configurations):
 
 def policies(configurations, runs, heavy):
     from specs.cartpole import balance_with
-    from verifai_jax.certification.blocks import Pieces
+    from verifai_jax.certification.blocks import Blocks
 
     some = trained(configurations)
     for kind in ("first", "again"):
@@ -153,7 +153,7 @@ def policies(configurations, runs, heavy):
         found = certify(balance_with, some[:32])
         print(f"certify, {kind}: {time.perf_counter() - started:.1f} s")
     print(found)
-    pieces = Pieces(balance_with, some, seed=1, lanes=64)
+    pieces = Blocks(balance_with, some, seed=1, lanes=64)
     asked = [(i, block) for i in range(len(some)) for block in range(heavy // 64)]
     failing = np.zeros((len(some), heavy), bool)
     started = time.perf_counter()

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import beta
 
 from verifai_jax.certification import race
-from verifai_jax.certification.allocation import Allocation, standing
+from verifai_jax.certification.allocation import Allocation, find_leader
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 # Failure rates of 64 policies: the six of `facts` that reached full return, the others worse.
@@ -59,10 +59,10 @@ def test_names_the_safest_in_200_runs(rates):
 
 def test_standing_is_the_posterior_probability():
     failures, simulations = np.array([1, 4, 30]), np.array([300, 400, 200])
-    found = standing(failures, simulations, tie=0.002)
+    found = find_leader(failures, simulations, tie=0.002)
     random = np.random.default_rng(0)
     draws = beta(failures + 0.5, simulations - failures + 0.5).rvs((200_000, 3), random)
-    assert found.leader == 0
+    assert found.number == 0
     best = draws[:, 1:].min(axis=1)
     assert found.chance == pytest.approx(np.mean(draws[:, 0] <= best + 0.002), abs=0.01)
     expected = np.mean(draws < draws[:, :1] - 0.002, axis=0)
@@ -71,8 +71,8 @@ def test_standing_is_the_posterior_probability():
 
 def test_of_equals_the_larger_margin_leads():
     counts = np.array([0, 0, 0]), np.array([64, 64, 64])
-    assert standing(*counts, 0.001).leader == 0
-    assert standing(*counts, 0.001, np.array([0.1, 0.3, np.nan])).leader == 1
+    assert find_leader(*counts, 0.001).number == 0
+    assert find_leader(*counts, 0.001, np.array([0.1, 0.3, np.nan])).number == 1
 
 
 def certified(rates, run, p, budget=40_000):

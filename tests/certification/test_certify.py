@@ -10,8 +10,8 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.certification import certify
 from verifai_jax.certification import simulators as programs
-from verifai_jax.certification.blocks import Pieces
-from verifai_jax.certification.policy_groups import digest, families, padded
+from verifai_jax.certification.blocks import Blocks
+from verifai_jax.certification.policy_groups import digest, group_policies, padded
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.rl import Continuous, Policy
 
@@ -76,7 +76,7 @@ def test_verdicts_of_known_rates(certificates):
 
 
 def test_failures_are_those_of_the_samples(certificates):
-    pieces = Pieces(problem_of, POLICIES, seed=3, lanes=64)
+    pieces = Blocks(problem_of, POLICIES, seed=3, lanes=64)
     for row, t in zip(certificates.rows, THRESHOLDS, strict=True):
         x = np.concatenate([pieces.points(b)[:, 0] for b in range(row.simulations // 64)])
         assert row.failures == np.sum(x > np.float32(t))
@@ -138,14 +138,14 @@ def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
 
 
 def test_policies_of_one_structure_share_a_program():
-    (one,) = families(POLICIES)
+    (one,) = group_policies(POLICIES)
     assert one.numbers == (0, 1, 2, 3, 4)
-    wider = families([*POLICIES, threshold(0.5, 65), threshold(0.5, 128)])
+    wider = group_policies([*POLICIES, threshold(0.5, 65), threshold(0.5, 128)])
     assert [family.numbers for family in wider] == [(0, 1, 2, 3, 4), (5, 6)]
     tanh = Policy(
         *(getattr(POLICIES[0], n) for n in ("layers", "mean", "scale", "log_std", "action"))
     )
-    assert len(families([POLICIES[0], tanh])) == 2
+    assert len(group_policies([POLICIES[0], tanh])) == 2
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])

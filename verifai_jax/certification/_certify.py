@@ -1,4 +1,4 @@
-"""How safe many policies are: an attack that may refute, and a certificate from fresh samples.
+"""Certificates of the safety of many policies: an attack first, then bounds from fresh samples.
 
 certificates = certify(problem_of, policies, p=0.01)
 print(certificates)
@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from verifai_jax.certification.allocation import Allocation, standing
-from verifai_jax.certification.attack import Seen, refute, usable_search
-from verifai_jax.certification.blocks import Pieces, Remember
+from verifai_jax.certification.allocation import Allocation, find_leader
+from verifai_jax.certification.attack import PolicyRecord, attack_policies, check_attack
+from verifai_jax.certification.blocks import Blocks, Remember
 from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
@@ -90,20 +90,20 @@ def certify(
     budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
     lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
     enable_compile_cache()  # Before the search compiles, too.
-    pieces = Pieces(
+    pieces = Blocks(
         problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
     )
-    attacker = usable_search(pieces.problem, attack)
+    attacker = check_attack(pieces.problem, attack)
     rounds = -(-attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
-    sampled = [Seen() for _ in policies]
-    attacked = [Seen() for _ in policies]
+    sampled = [PolicyRecord() for _ in policies]
+    attacked = [PolicyRecord() for _ in policies]
     report = _Report(progress, len(policies) * rounds * lanes, budget)
     stopped, margins = "decided", np.full(len(policies), np.nan)
     try:
-        refute(pieces, attacked, attacker, rounds, report.attacked)
+        attack_policies(pieces, attacked, attacker, rounds, report.attacked)
         margins = np.array([one.least for one in attacked])
         stopped = _sample(pieces, sampled, allocation, margins, report)
     except KeyboardInterrupt:
@@ -113,13 +113,13 @@ def certify(
         for number in range(len(policies))
     )
     known = all(row.simulations for row in rows)
-    now = standing(*_counts(sampled), tie, margins) if known else None
+    now = find_leader(*_counts(sampled), tie, margins) if known else None
     return Certificates(
         rows=rows,
         problem=pieces.problem.name,
         p=p,
         confidence=confidence,
-        safest=None if now is None else now.leader,
+        safest=None if now is None else now.number,
         chance=None if now is None else now.chance,
         tie=tie,
         seed=seed,
@@ -132,8 +132,8 @@ def certify(
 
 
 def _sample(
-    pieces: Pieces,
-    sampled: list[Seen],
+    pieces: Blocks,
+    sampled: list[PolicyRecord],
     allocation: Allocation,
     margins: np.ndarray,
     report: "_Report",
@@ -154,24 +154,29 @@ def _sample(
             sampled[number].add(pieces.points(block), outcome)
             report.sampled(pieces.lanes, undecided)
     open_ = allocation.undecided(failures, simulations).any()
-    named = standing(failures, simulations, allocation.tie, margins).chance >= allocation.sure
+    named = find_leader(failures, simulations, allocation.tie, margins).chance >= allocation.sure
     return "decided" if named and not open_ else "budget"
 
 
-def _counts(seen: list[Seen]) -> tuple[np.ndarray, np.ndarray]:
-    """Failures of each policy, those without a verdict included, and simulations."""
+def _counts(seen: list[PolicyRecord]) -> tuple[np.ndarray, np.ndarray]:
+    """Count the failures of each policy, those without a verdict included, and simulations."""
     failures = np.array([one.failures + one.not_finite for one in seen])
     return failures, np.array([one.simulations for one in seen])
 
 
 def _certificate(
-    number: int, sampled: Seen, attacked: Seen, allocation: Allocation, among: int, pieces: Pieces
+    number: int,
+    sampled: PolicyRecord,
+    attacked: PolicyRecord,
+    allocation: Allocation,
+    among: int,
+    pieces: Blocks,
 ) -> Certificate:
     rate = None
     if sampled.simulations:
         failing = sampled.failures + sampled.not_finite
         rate = simultaneous_interval(failing, sampled.simulations, allocation.confidence, among)
-    worst, features, counterexamples = _met(pieces.space, (sampled, attacked))
+    worst, features, counterexamples = _worst_rows(pieces.space, (sampled, attacked))
     return Certificate(
         number=number,
         failures=sampled.failures,
@@ -187,8 +192,10 @@ def _certificate(
     )
 
 
-def _met(space: FeatureSpace, both: Sequence[Seen]) -> tuple[float, Any, dict[str, np.ndarray]]:
-    """The least robustness, the features where it was met, and the worst failing rows."""
+def _worst_rows(
+    space: FeatureSpace, both: Sequence[PolicyRecord]
+) -> tuple[float, Any, dict[str, np.ndarray]]:
+    """Return the least robustness, its features, and the worst failing rows."""
     points = [u for seen in both for u in seen.points]
     if not points:
         return float("nan"), None, {}
@@ -208,7 +215,7 @@ def _met(space: FeatureSpace, both: Sequence[Seen]) -> tuple[float, Any, dict[st
 
 
 def _columns(space: FeatureSpace, u: np.ndarray) -> dict[str, np.ndarray]:
-    """The table columns of these points."""
+    """Return the table columns of these points."""
     parts = []
     for start in range(0, len(u), ROWS):
         part = u[start : start + ROWS]
@@ -225,18 +232,18 @@ def _features(space: FeatureSpace) -> Any:
 
 
 class _Report:
-    """Tells the progress."""
+    """Progress of both stages, counted in simulations."""
 
     def __init__(self, progress: ProgressReport | None, attacks: int, budget: int) -> None:
         self._progress, self._total, self._done = progress, attacks + budget, 0
 
     def attacked(self, simulations: int) -> None:
-        self._tell(simulations, "attacking")
+        self._call(simulations, "attacking")
 
     def sampled(self, simulations: int, undecided: int) -> None:
-        self._tell(simulations, f"sampling, {undecided} undecided")
+        self._call(simulations, f"sampling, {undecided} undecided")
 
-    def _tell(self, simulations: int, text: str) -> None:
+    def _call(self, simulations: int, text: str) -> None:
         self._done += simulations
         if self._progress is not None:
             self._progress(self._done, self._total, text)
@@ -252,7 +259,7 @@ def _check(
     attack_simulations: int,
     tie: float | None,
 ) -> int:
-    """Refuse what makes no sense; returns the budget."""
+    """Refuse values out of range, and return the budget."""
     if not policies:
         raise ValueError("there is no policy to certify")
     for name, value in (("p", p), ("confidence", confidence)):

@@ -1,4 +1,4 @@
-"""Who is simulated next: policies whose verdict is open, and those that could be the safest.
+"""Allocation of simulations to policies with an open verdict and to those that may be the safest.
 
     allocation = Allocation(p=0.01, samples=512, budget=65_536)
     while (blocks := allocation.next(failures, simulations)).any():
@@ -41,26 +41,26 @@ GROWTH = 8
 """A policy's samples grow by this part of them in one round, at least by a block."""
 
 
-class Standing(NamedTuple):
-    """Who leads, and how surely.
+class Leader(NamedTuple):
+    """The policy that is likeliest to be the safest.
 
-    - `leader`: the number with the least posterior mean.
+    - `number`: the policy with the least posterior mean.
     - `chance`: posterior probability that no rate is below the leader's by more than `tie`.
     - `rivals`: of each policy the probability that its rate is.
     """
 
-    leader: int
+    number: int
     chance: float
     rivals: Float[np.ndarray, " n"]
 
 
-def standing(
+def find_leader(
     failures: Int[np.ndarray, " n"],
     simulations: Int[np.ndarray, " n"],
     tie: float,
     margins: Float[np.ndarray, " n"] | None = None,
-) -> Standing:
-    """Who leads; see `Standing`.
+) -> Leader:
+    """Find the policy that is likeliest to be the safest.
 
     Of equal means the one with more samples, then the one with the larger of the `margins`, such as
     the least robustness in an attack, then the first.
@@ -77,12 +77,12 @@ def standing(
     better = betainc(k + 0.5, n - k + 0.5, below)
     better[:, leader] = 0.0
     chance = float(np.mean(np.prod(1 - better, axis=1)))
-    return Standing(leader, chance, np.mean(better, axis=0))
+    return Leader(leader, chance, np.mean(better, axis=0))
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """What to simulate next; see the module's docstring.
+    """A rule that says how many blocks of each policy to simulate next.
 
     - `p`, `confidence`: of the verdicts. The safest is named at half the error that `confidence`
       leaves: among near ties its posterior chance is a little too high.
@@ -113,9 +113,9 @@ class Allocation:
         simulations: Int[np.ndarray, " n"],
         margins: Float[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Blocks to simulate of each policy; all zero once everything is decided, or can't be.
+        """Return the blocks to simulate of each policy; all zero once nothing more can be decided.
 
-        - `margins`: what decides between equals who leads; see `standing`.
+        - `margins`: what decides between equals who leads; see `find_leader`.
         """
         k, n = np.asarray(failures), np.asarray(simulations)
         least = np.maximum(-(-(self.samples - n) // self.block), 0)
@@ -134,7 +134,7 @@ class Allocation:
     def undecided(
         self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Which verdicts are open; that of a policy without samples is."""
+        """Return the policies whose verdict is open, as it is of one without samples."""
         simulations = np.maximum(simulations, 1)
         limit = required_evidence(self.confidence, len(failures))
         p = np.full(len(failures), self.p)
@@ -142,35 +142,35 @@ class Allocation:
         return ~(safe | (evidence_above(failures, simulations, p) > limit))
 
     def _grown(self, n: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-        """Blocks of a round for policies with `n` samples."""
+        """Return the blocks of a round for policies with `n` samples."""
         return np.maximum(n // (GROWTH * self.block), 1)
 
     def _rivals(
         self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int, margins: Any
     ) -> Int[np.ndarray, " n"]:
-        """Blocks of the leader and of its likeliest rivals."""
+        """Return the blocks of the leader and of its likeliest rivals."""
         blocks = np.zeros(len(n), np.int64)
-        now = standing(k, n, self.tie, margins)
+        now = find_leader(k, n, self.tie, margins)
         if now.chance >= self.sure:
             return blocks
         rivals = np.flatnonzero(now.rivals >= 0.5 * now.rivals.max())
-        if k[now.leader] == 0:
+        if k[now.number] == 0:
             # Nothing sets two without a failure apart: the leader alone is played until it fails,
             # or is known to be as good as any.
             rivals = rivals[k[rivals] > 0]
         # Few at a time, the likeliest first: what they show may settle it.
         rivals = rivals[np.argsort(-now.rivals[rivals], kind="stable")][:4]
         each = self._grown(n)
-        if n[now.leader] <= n[rivals].sum() or not len(rivals):
-            blocks[now.leader] = each[now.leader]
-        if not blocks.any() or (len(rivals) and n[now.leader] >= n[rivals].max()):
+        if n[now.number] <= n[rivals].sum() or not len(rivals):
+            blocks[now.number] = each[now.number]
+        if not blocks.any() or (len(rivals) and n[now.number] >= n[rivals].max()):
             blocks[rivals] = each[rivals]
         return _within(blocks, left)
 
     def _open(
         self, k: Int[np.ndarray, " n"], n: Int[np.ndarray, " n"], left: int
     ) -> Int[np.ndarray, " n"]:
-        """Blocks of policies whose verdict is open and within reach."""
+        """Return the blocks of policies whose verdict is open and within reach."""
         blocks = np.zeros(len(n), np.int64)
         where = np.flatnonzero(self.undecided(k, n))
         if not len(where):
@@ -189,7 +189,7 @@ class Allocation:
     def _missing(
         self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"], among: int
     ) -> Float[np.ndarray, " n"]:
-        """How many more samples may well decide; infinite where the budget could not.
+        """Estimate how many more samples decide; infinite where the budget is too small.
 
         If the rate is the lower quartile of its posterior, or the upper one, whichever is sooner.
         """
@@ -209,13 +209,13 @@ class Allocation:
 
 
 def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:
-    """The same blocks, the first ones only where they are more than are left."""
+    """Return the first of these blocks, as many as are left."""
     before = np.concatenate([[0], np.cumsum(blocks)[:-1]])
     return np.clip(left - before, 0, blocks)
 
 
-class Raced(NamedTuple):
-    """What `race` found: the safest arm, its chance to be it, and the counts of all arms."""
+class RaceResult(NamedTuple):
+    """The safest arm, its chance to be the safest, and the counts of all arms."""
 
     arm: int
     chance: float
@@ -232,7 +232,7 @@ def race(
     first: int = 16,
     block: int = 16,
     budget: int = 1_000_000,
-) -> Raced:
+) -> RaceResult:
     """Name the arm that fails least often.
 
     - `draw(arm, n)`: how many of the next `n` samples of an arm fail.
@@ -249,5 +249,5 @@ def race(
             count = int(blocks[arm]) * block
             failures[arm] += draw(int(arm), count)
             simulations[arm] += count
-    now = standing(failures, simulations, tie)
-    return Raced(now.leader, now.chance, failures, simulations)
+    now = find_leader(failures, simulations, tie)
+    return RaceResult(now.number, now.chance, failures, simulations)

@@ -1,7 +1,8 @@
-"""The attack: an active search against every policy, which may only refute.
+"""The attack: an active search for failures of every policy, before the certificate.
 
-    attacks = refute(pieces, policies=8, search=CrossEntropy(), rounds=4)
-    attacks[3].worst                                    # the least robustness that it met
+    records = [PolicyRecord() for _ in policies]
+    attack_policies(blocks, records, CrossEntropy(), rounds=4, report=report)
+    records[3].least                                    # the least robustness that it met
 
 Each policy has a search of its own; their simulations go through one program. What a search finds
 says that a policy can fail, never how likely it is: points that it chose are no samples.
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.certification.blocks import Pieces
+from verifai_jax.certification.blocks import Blocks
 from verifai_jax.certification.simulators import Outcome
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.problem.problem import Problem
@@ -23,8 +24,8 @@ from verifai_jax.search.proposals import Proposals
 
 
 @dataclass(eq=False)
-class Seen:
-    """What was simulated of one policy: its points, what came of them, and the counts.
+class PolicyRecord:
+    """The simulations of one policy: points, outcomes and counts.
 
     `failures` ended properly and break a formula; `not_finite` have no verdict.
     """
@@ -36,7 +37,7 @@ class Seen:
     not_finite: int = 0
 
     def add(self, points: Float[np.ndarray, "n d"], outcome: Outcome) -> None:
-        """Take in one block."""
+        """Add one block."""
         self.points.append(points)
         self.outcomes.append(outcome)
         self.simulations += len(points)
@@ -50,15 +51,15 @@ class Seen:
         return float(min((np.min(rho) for rho in values if len(rho)), default=np.nan))
 
 
-def usable_search(problem: Problem, search: str | Search) -> Search:
-    """The search, if it can attack many policies.
+def check_attack(problem: Problem, search: str | Search) -> Search:
+    """Return the search, if it can attack many policies.
 
     **Raises:** `ValueError` for an unknown name, one that the space does not suit, or one that
     follows gradients; `TypeError` for what is no search.
     """
     found = searches.named(search) if isinstance(search, str) else search
     if isinstance(found, Search) and (found.wants_gradient or found.wants_clauses):
-        known = (name for name in searches.names() if not _slopes(name))
+        known = (name for name in searches.names() if not _needs_gradients(name))
         raise ValueError(
             f"attack {search!r} follows gradients, which are not computed for many policies at "
             f"once; use one of {', '.join(known)}"
@@ -66,23 +67,27 @@ def usable_search(problem: Problem, search: str | Search) -> Search:
     return check_search(problem, found)
 
 
-def _slopes(name: str) -> bool:
+def _needs_gradients(name: str) -> bool:
     found = searches.named(name)
     return found.wants_gradient or found.wants_clauses
 
 
-def refute(
-    pieces: Pieces, seen: list[Seen], search: Search, rounds: int, told: Callable[[int], None]
+def attack_policies(
+    pieces: Blocks,
+    records: list[PolicyRecord],
+    search: Search,
+    rounds: int,
+    report: Callable[[int], None],
 ) -> None:
-    """Attack every policy in so many rounds of one block each; what is met goes into `seen`.
+    """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
-    - `told(simulations)`: called after each block, for the progress.
+    - `report(simulations)`: called after each block, for the progress.
     """
     attackers = [
         Proposals(
             search, pieces.space.cube, pieces.lanes, pieces.attack_key, pieces.space.constraint
         )
-        for _ in seen
+        for _ in records
     ]
     for round_ in range(rounds):
         asked = []
@@ -96,6 +101,6 @@ def refute(
                 attacker.tell_refused()
         for place, outcome in pieces.attack(asked, round_, repr(search)):
             number, points = asked[place]
-            seen[number].add(points, outcome)
+            records[number].add(points, outcome)
             attackers[number].tell(outcome.rho, outcome.proper, None)
-            told(len(points))
+            report(len(points))

@@ -1,6 +1,6 @@
 """Blocks of simulations by name: computed together, remembered one by one.
 
-    pieces = Pieces(problem_of, policies, seed=0, lanes=64, remember=store.remember)
+    pieces = Blocks(problem_of, policies, seed=0, lanes=64, remember=store.remember)
     for (policy, block), outcome in pieces.certificate([(0, 0), (0, 1), (5, 0)]):
         ...
 
@@ -16,13 +16,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.certification.policy_groups import digest, families
+from verifai_jax.certification.policy_groups import digest, group_policies
 from verifai_jax.certification.simulators import (
-    Alone,
     Outcome,
+    SeparateSimulators,
     Simulator,
     problem_with,
-    traced,
+    shared_simulator,
 )
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
@@ -39,13 +39,13 @@ MOST_BARREN = 1000
 """Such draws in a row without one that the constraint accepts, after which it is given up."""
 
 
-def just_compute(key: str, compute: Callable[[], dict[str, np.ndarray]]) -> Arrays:
-    """The memo that remembers nothing."""
+def compute_without_memo(key: str, compute: Callable[[], dict[str, np.ndarray]]) -> Arrays:
+    """Compute a block without remembering it."""
     return compute()
 
 
-class Asked(NamedTuple):
-    """One piece: a policy by its number, points `[m, d]` with `m <= lanes`, and its name.
+class Block(NamedTuple):
+    """One block: a policy by its number, points `[m, d]` with `m <= lanes`, and its name.
 
     - `first`: number of its first sample, which the random keys come from.
     """
@@ -56,8 +56,8 @@ class Asked(NamedTuple):
     name: str
 
 
-class Pieces:
-    """See the module's docstring. `simulated` counts blocks that were not remembered.
+class Blocks:
+    """Blocks of simulations of many policies; `simulated` counts those that were computed.
 
     **Arguments:**
 
@@ -84,34 +84,34 @@ class Pieces:
         self.lanes = lanes
         self._notes: list[str] = []
         self.simulated = 0
-        self._remember = just_compute if remember is None else remember
+        self._remember = compute_without_memo if remember is None else remember
         self._simulators: list[tuple[Simulator, dict[int, int]]] = []
         self._owner: dict[int, int] = {}
         first: Problem | None = None
         plans = []
-        for family in families(policies):
-            numbers, together = family.numbers, family.traced
-            problem = _checked(problem_of, policies[numbers[0]], numbers[0])
+        for group in group_policies(policies):
+            numbers, together = group.numbers, group.traced
+            problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
             first = problem if first is None else first
             _check_same(first, problem, numbers[0])
             problems = [problem]
             if together and not problem.black_box:
-                together = self._traceable(problem_of, family.weights[0], numbers)
+                together = self._traceable(problem_of, group.weights[0], numbers)
             if not together or problem.black_box:
-                others = [_checked(problem_of, policies[n], n) for n in numbers[1:]]
+                others = [_checked_problem(problem_of, policies[n], n) for n in numbers[1:]]
                 for number, other in zip(numbers[1:], others, strict=True):
                     _check_same(first, other, number)
                 plans.append((numbers, None, [problem, *others]))
             else:
-                plans.append((numbers, family, problems))
+                plans.append((numbers, group, problems))
         if first is None:
             raise ValueError("there is no policy to certify")
         self.problem, self.space = first, first.space
-        for numbers, family, problems in plans:
+        for numbers, group, problems in plans:
             simulator: Simulator = (
-                Alone(problems, lanes)
-                if family is None
-                else traced(problem_of, family, lanes, self.space.dim, devices)
+                SeparateSimulators(problems, lanes)
+                if group is None
+                else shared_simulator(problem_of, group, lanes, self.space.dim, devices)
             )
             for number in numbers:
                 self._owner[number] = len(self._simulators)
@@ -123,14 +123,14 @@ class Pieces:
         )
         self._samples = _Samples(self.space, points_key)
         self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
-        self._about = _about(first, seed, lanes)
+        self._about = _common_digest(first, seed, lanes)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was decided, or went wrong, and would surprise."""
+        """Decisions and errors that a user should know of."""
         notes = list(self._notes)
         for simulator, places in self._simulators:
-            if isinstance(simulator, Alone):
+            if isinstance(simulator, SeparateSimulators):
                 told = simulator.messages
                 notes += [
                     f"a simulation of policy {number} raised {told[place]}"
@@ -142,22 +142,22 @@ class Pieces:
     def certificate(
         self, asked: Sequence[tuple[int, int]]
     ) -> Iterator[tuple[tuple[int, int], Outcome]]:
-        """Outcomes of `(policy, block)` pairs: fresh samples of the prior, the same for all."""
+        """Yield outcomes of `(policy, block)` pairs, in fresh samples of the prior."""
         pieces = []
         for policy, block in asked:
             first = block * self.lanes
             points = self.points(block)
             name = f"{self._about}/sample/{self._digests[policy]}/{block}"
-            pieces.append(Asked(policy, points, first, name))
+            pieces.append(Block(policy, points, first, name))
         for i, outcome in self._outcomes(pieces, self._simulation_key):
             yield asked[i], outcome
 
     def attack(
         self, asked: Sequence[tuple[int, np.ndarray]], round_: int, search: str
     ) -> Iterator[tuple[int, Outcome]]:
-        """Outcomes of points that a search chose for each policy; yields places in `asked`."""
+        """Yield outcomes of points that a search chose for each policy, by places in `asked`."""
         pieces = [
-            Asked(
+            Block(
                 policy, points, round_ * self.lanes,
                 f"{self._about}/attack/{search}/{self._digests[policy]}/{round_}",
             )
@@ -166,10 +166,10 @@ class Pieces:
         yield from self._outcomes(pieces, self._attacked_key)
 
     def points(self, block: int) -> Float[np.ndarray, "lanes d"]:
-        """The samples of one block of the held-out stream, which all policies share."""
+        """Return the samples of one block of the held-out stream, which all policies share."""
         return self._samples(block * self.lanes, self.lanes)
 
-    def _outcomes(self, pieces: list[Asked], key: Any) -> Iterator[tuple[int, Outcome]]:
+    def _outcomes(self, pieces: list[Block], key: Any) -> Iterator[tuple[int, Outcome]]:
         # Those of one program after another.
         order = sorted(range(len(pieces)), key=lambda i: self._owner[pieces[i].policy])
         ready: dict[int, Outcome] = {}
@@ -180,7 +180,7 @@ class Pieces:
                 if i not in ready:
                     owner = self._owner[pieces[i].policy]
                     simulator, _ = self._simulators[owner]
-                    most = simulator.together()
+                    most = simulator.blocks_per_call()
                     some = [
                         j
                         for j in order[place : place + most]
@@ -199,16 +199,16 @@ class Pieces:
             )
             yield i, outcome
 
-    def _simulate(self, owner: int, pieces: list[Asked], key: Any) -> list[Outcome]:
+    def _simulate(self, owner: int, pieces: list[Block], key: Any) -> list[Outcome]:
         simulator, places = self._simulators[owner]
         self.simulated += len(pieces)
-        u = np.stack([_filled(piece.points, self.lanes) for piece in pieces])
+        u = np.stack([_fill_block(piece.points, self.lanes) for piece in pieces])
         members = [places[piece.policy] for piece in pieces]
         first = np.array([piece.first for piece in pieces], np.int32)
         return simulator(members, u, first, key)
 
     def _traceable(self, problem_of: Any, policy: Any, numbers: tuple[int, ...]) -> bool:
-        """Whether the problem can be made of weights that JAX traces; abstract evaluation."""
+        """Check by abstract evaluation that JAX can trace the problem in the policy's numbers."""
 
         def simulated(policy: Any, u: Any, key: Any) -> Any:
             problem = problem_with(problem_of, policy)
@@ -223,8 +223,8 @@ class Pieces:
             # With the numbers themselves it worked.
             told = str(error).strip().split("\n")[0]
             self._notes.append(
-                f"compiled one by one: {_listed(numbers)}; JAX could not trace problem_of in the "
-                f"policy's numbers ({type(error).__name__}: {told[:120]})"
+                f"compiled one by one: {_list_policies(numbers)}; JAX could not trace problem_of in "
+                f"the policy's numbers ({type(error).__name__}: {told[:120]})"
             )
             return False
         return True
@@ -257,8 +257,8 @@ class _Samples:
         return np.asarray(self._space.accepts_points(u))
 
 
-def _checked(problem_of: Callable[[Any], Problem], policy: Any, number: int) -> Problem:
-    """The problem of one policy, refused before anything compiles if its parts do not fit."""
+def _checked_problem(problem_of: Callable[[Any], Problem], policy: Any, number: int) -> Problem:
+    """Return the problem of one policy, once its parts are checked."""
     problem = problem_with(problem_of, policy)
     try:
         problem.check()
@@ -282,17 +282,17 @@ def _check_same(first: Problem, problem: Problem, number: int) -> None:
         )
 
 
-def _about(problem: Problem, seed: int, lanes: int) -> str:
-    """A hash of what all pieces depend on but the policy and the samples; code is not in it."""
+def _common_digest(problem: Problem, seed: int, lanes: int) -> str:
+    """Hash all that blocks depend on but the policy and the samples; code is not in it."""
     told = [problem.name, str(dict(problem.formulas)), problem.end, str(problem.space.columns)]
     told += [str(problem.space.levels), str(seed), str(lanes), "float32"]
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
 
 
-def _filled(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "lanes d"]:
+def _fill_block(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "lanes d"]:
     return np.pad(points, ((0, lanes - len(points)), (0, 0)), mode="edge")
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def _list_policies(numbers: Sequence[int]) -> str:
     shown = ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")
     return f"{'policy' if len(numbers) == 1 else 'policies'} {shown}"

@@ -1,6 +1,6 @@
 """Policies of one structure: their weights are arguments of one compiled program.
 
-    families(policies)              # [Family(numbers=(0, 2, 3), ...), Family(numbers=(1,), ...)]
+    group_policies(policies)        # [PolicyGroup(numbers=(0, 2, 3), ...), ...]
     digest(policy)                  # what names a policy in a memo: a hash of its arrays
 
 Hidden layers are padded with units whose weights are zero, up to a width that depends on the policy
@@ -24,7 +24,7 @@ LEAST_WIDTH = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Family:
+class PolicyGroup:
     """Policies that one program can simulate.
 
     - `numbers`: their places in the list that was given.
@@ -39,31 +39,31 @@ class Family:
     traced: bool = True
 
 
-def families(policies: Sequence[Any]) -> list[Family]:
+def group_policies(policies: Sequence[Any]) -> list[PolicyGroup]:
     """Sort policies by structure, in the order in which the structures first appear."""
     found: dict[str, tuple[list[int], list[Any], bool]] = {}
     for number, policy in enumerate(policies):
-        traced = is_numbers(policy)
+        traced = is_numeric(policy)
         whole = padded(policy) if traced else policy
         structure = structure_of(whole) if traced else f"policy {number}"
         numbers, weights, _ = found.setdefault(structure, ([], [], traced))
         numbers.append(number)
         weights.append(whole)
     return [
-        Family(tuple(numbers), tuple(weights), structure, traced)
+        PolicyGroup(tuple(numbers), tuple(weights), structure, traced)
         for structure, (numbers, weights, traced) in found.items()
     ]
 
 
-def is_numbers(policy: Any) -> bool:
-    """Whether JAX can have all that a policy is made of as arguments."""
+def is_numeric(policy: Any) -> bool:
+    """Check that a policy is made of numbers alone, which JAX can take as arguments."""
     leaves = jax.tree.leaves(policy)
     plain = (np.ndarray, np.generic, jax.Array, int, float)
     return bool(leaves) and all(isinstance(leaf, plain) for leaf in leaves)
 
 
 def padded(policy: Any) -> Any:
-    """The policy with NumPy leaves; if it is a `Policy`, with hidden layers of the shared width."""
+    """Return a policy with NumPy leaves, hidden layers of a `Policy` at the shared width."""
     policy = jax.tree.map(_on_host, policy)
     if not isinstance(policy, Policy):
         return policy
@@ -80,20 +80,20 @@ def padded(policy: Any) -> Any:
 
 
 def shared_width(width: int) -> int:
-    """The width that a hidden layer of `width` units is padded to."""
+    """Return the width that a hidden layer of `width` units is padded to."""
     return max(LEAST_WIDTH, 1 << (width - 1).bit_length())
 
 
 def structure_of(policy: Any) -> str:
-    """Text that is equal for policies which one program can simulate."""
+    """Return text that is equal for policies which one program can simulate."""
     leaves, form = jax.tree.flatten(policy)
     shapes = [f"{np.dtype(leaf.dtype).str}{list(np.shape(leaf))}" for leaf in leaves]
     return f"{form} {' '.join(shapes)}"
 
 
 def digest(policy: Any, number: int = 0) -> str:
-    """A hash of a policy's structure and numbers; of its `number` where it has no numbers."""
-    if not is_numbers(policy):
+    """Hash a policy's structure and numbers; of its `number` where it has no numbers."""
+    if not is_numeric(policy):
         return f"policy-{number}"
     policy = jax.tree.map(_on_host, policy)
     told = hashlib.sha256(structure_of(policy).encode())

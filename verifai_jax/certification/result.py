@@ -1,4 +1,4 @@
-"""What a certification returns: for each policy how often it fails, and how sure that is."""
+"""Results of a certification: the failure rate of each policy, with an interval and a verdict."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """What is known of one policy.
+    """The certificate of one policy.
 
     - `simulations`: independent samples of the prior; `failures` and `not_finite` among them.
       Samples without a verdict (`not_finite`) count as failures in the `rate`.
@@ -47,9 +47,9 @@ class Certificate:
         return self.simulations + self.attacks
 
     def __str__(self) -> str:
-        return f"policy {self.number}: {self.verdict}, {self._told()}"
+        return f"policy {self.number}: {self.verdict}, {self._summary()}"
 
-    def _told(self) -> str:
+    def _summary(self) -> str:
         if self.rate is None:
             text = "no sample yet"
         else:
@@ -65,7 +65,7 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Certificates:
-    """What `certify` returns; `certificates[i]` is the `Certificate` of policy i.
+    """The certificates of all policies; `certificates[i]` is the `Certificate` of policy i.
 
     **Fields:** `p` and `confidence` of the verdicts: with this probability no interval of any
     policy, and so no verdict, is wrong; `safest`: number of the policy that fails least often, None
@@ -121,7 +121,7 @@ class Certificates:
         return len(self.rows) * max((row.simulations for row in self.rows), default=0)
 
     def table(self) -> "pd.DataFrame":
-        """One row a policy, in the order they were given."""
+        """Return one row a policy, in the order they were given."""
         import pandas as pd
 
         def bound(row: Certificate, name: str) -> float:
@@ -145,7 +145,7 @@ class Certificates:
         )
 
     def counterexamples(self, number: int) -> "pd.DataFrame":
-        """Failing features of a policy with their robustness `rho`, worst first."""
+        """Return failing features of a policy with their robustness `rho`, worst first."""
         import pandas as pd
 
         return pd.DataFrame(dict(self.rows[number].counterexamples))

@@ -1,7 +1,7 @@
 """The compiled simulation of (policy, block of samples) pairs.
 
-    simulator = simulator_for(problem_of, family, lanes=64)
-    simulator([0, 0, 1], points, first)         # three blocks: policies 0, 0, 1 of the family
+    simulator = shared_simulator(problem_of, group, lanes=64, dim=3)
+    simulator([0, 0, 1], points, first)         # three blocks: policies 0, 0, 1 of the group
 
 A block is one policy in some tens of samples, side by side, so that its weights are shared by one
 matrix product. Blocks are worked through one after another (on an accelerator all at once), spread
@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.certification.policy_groups import Family
+from verifai_jax.certification.policy_groups import PolicyGroup
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.trace import Status
@@ -40,7 +40,7 @@ SLICE_SECONDS = 1.0
 
 
 class Outcome(NamedTuple):
-    """What came of one block, on the host.
+    """The outcome of one block, on the host.
 
     - `rho`: the least formula's hard robustness; NaN where there is no verdict.
     - `failing`: ended properly and breaks a formula; `proper`: ended properly.
@@ -52,7 +52,7 @@ class Outcome(NamedTuple):
 
 
 class Simulator(Protocol):
-    """Simulates blocks of a family's policies."""
+    """Simulates blocks of a group's policies."""
 
     lanes: int
 
@@ -65,18 +65,18 @@ class Simulator(Protocol):
     ) -> list[Outcome]:
         """Outcomes of the blocks, in order.
 
-        - `members`: of each block the policy, by its place in the family.
+        - `members`: of each block the policy, by its place in the group.
         - `first`: of each block the number of its first sample, which its random keys come from.
         """
         ...
 
-    def together(self) -> int:
-        """How many blocks one call should have, so that it does not last too long."""
+    def blocks_per_call(self) -> int:
+        """Return the number of blocks of one call, so that it does not last too long."""
         ...
 
 
 def problem_with(problem_of: Callable[[Any], Problem], policy: Any) -> Problem:
-    """The problem of one policy, whose weights JAX may be tracing."""
+    """Return the problem of one policy, whose weights JAX may be tracing."""
     # What does not depend on the weights is computed now, so that checks of it can be made.
     with jax.ensure_compile_time_eval():
         problem = problem_of(policy)
@@ -87,15 +87,15 @@ def problem_with(problem_of: Callable[[Any], Problem], policy: Any) -> Problem:
     return problem
 
 
-class Traced:
-    """All policies of a family in one program; see the module's docstring."""
+class SharedSimulator:
+    """All policies of a group in one program; see the module's docstring."""
 
-    def __init__(self, program: "_Program", family: Family) -> None:
+    def __init__(self, program: "_Program", group: PolicyGroup) -> None:
         self.lanes = program.lanes
-        self._program, self._family = program, family
+        self._program, self._family = program, group
 
-    def together(self) -> int:
-        return self._program.together()
+    def blocks_per_call(self) -> int:
+        return self._program.blocks_per_call()
 
     def __call__(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -123,20 +123,20 @@ class Traced:
         return [Outcome(*block) for block in zip(least, violated, proper, strict=True)]
 
 
-def traced(
+def shared_simulator(
     problem_of: Callable[[Any], Problem],
-    family: Family,
+    group: PolicyGroup,
     lanes: int,
     dim: int,
     devices: Sequence[Any] | None = None,
-) -> Traced:
-    """The simulator of a family; what it compiles is kept as long as `problem_of` is in use."""
+) -> SharedSimulator:
+    """The simulator of a group; what it compiles is kept as long as `problem_of` is in use."""
     where = tuple(jax.local_devices() if devices is None else devices)
     try:
-        program = _known_program(problem_of, family.structure, lanes, dim, where)
+        program = _known_program(problem_of, group.structure, lanes, dim, where)
     except TypeError:  # It cannot be hashed.
         program = _Program(problem_of, lanes, dim, where)
-    return Traced(program, family)
+    return SharedSimulator(program, group)
 
 
 @lru_cache(maxsize=16)
@@ -161,7 +161,7 @@ class _Program:
         self._seconds: float | None = None  # Of a block, on one device.
         self._executables: dict[str, Any] = {}
 
-    def together(self) -> int:
+    def blocks_per_call(self) -> int:
         """Blocks in a call that lasts about `SLICE_SECONDS`; few at first."""
         if not _one_by_one(self.devices):
             return self.capacity * len(self.devices)
@@ -259,7 +259,7 @@ def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
     return spread
 
 
-class Alone:
+class SeparateSimulators:
     """Each policy by itself: for systems out of JAX's sight, and code that needs the numbers."""
 
     def __init__(self, problems: Sequence[Problem], lanes: int) -> None:
@@ -268,7 +268,7 @@ class Alone:
         self._problems = problems
         self._evaluators: dict[int, Evaluator] = {}
 
-    def together(self) -> int:
+    def blocks_per_call(self) -> int:
         return 1
 
     def __call__(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:

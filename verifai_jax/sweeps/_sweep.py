@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from verifai_jax._version import __version__
-from verifai_jax.certification.attack import usable_search
+from verifai_jax.certification.attack import check_attack
 from verifai_jax.certification.result import Certificates
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
@@ -116,7 +116,7 @@ def sweep(
         max_seconds=max_seconds,
     )
     study.check()
-    usable_search(study.untrained_problem(), attack)
+    check_attack(study.untrained_problem(), attack)
     proposer = make_proposer(
         search, study.space, configurations=configurations, seed=seed, batch=batch
     )
