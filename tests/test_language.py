@@ -13,10 +13,10 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 QUESTIONS = {"What", "Which", "Whether", "How", "Who", "Of", "That", "Whose"}
 """First words of a sentence that names neither an act nor a thing."""
 
-QUESTIONING_DOCSTRINGS = 154
+QUESTIONING_DOCSTRINGS = 112
 """Public docstrings that begin with one of them, at most. Aim: 0."""
 
-SHARE_OF_ANY = 0.104
+SHARE_OF_ANY = 0.073
 """Argument annotations that are `Any`, at most. Aim: 0.05."""
 
 SHADOWED_MODULES = 10
