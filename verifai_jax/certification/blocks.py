@@ -223,8 +223,8 @@ class Blocks:
             # With the numbers themselves it worked.
             told = str(error).strip().split("\n")[0]
             self._notes.append(
-                f"compiled one by one: {_list_policies(numbers)}; JAX could not trace problem_of in "
-                f"the policy's numbers ({type(error).__name__}: {told[:120]})"
+                f"compiled one by one: {_list_policies(numbers)}; JAX could not trace "
+                f"problem_of in the policy's numbers ({type(error).__name__}: {told[:120]})"
             )
             return False
         return True
