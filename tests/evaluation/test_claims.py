@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.falsification.validation import usable
+from verifai_jax.falsification.validation import adapt_search
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.search import Portfolio
 
@@ -78,7 +78,7 @@ def test_slopes_are_left_out_where_there_are_none():
     counted = vj.Problem("gears", space, count, "gear < 9")
     assert not has_gradient(counted)
     assert has_gradient(vj.Problem("slopes", space, count, "gear < 9 & a < 9.5"))
-    search, notes = usable(counted, Portfolio())
+    search, notes = adapt_search(counted, Portfolio())
     assert search == Portfolio(gradients=False)
     assert notes == ("portfolio without gradients: the robustness is constant almost everywhere",)
     run = vj.falsify(counted, budget=64, batch=8, stop_after=1)

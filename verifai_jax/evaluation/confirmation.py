@@ -1,4 +1,4 @@
-"""Whether counterexamples are real: each is replayed more finely than it was found.
+"""Confirmation of counterexamples: each is replayed more finely than it was found.
 
     confirmer = Confirmer(problem, precision="float32", seed=0)
     checked = confirmer(rows, numbers)                  # columns [n] of the table, row numbers [n]
@@ -11,7 +11,7 @@ quarter of the step, there in single precision too, and with features that are o
 and if it fails by more than the finer step has moved it, and by far more than rounding has.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,26 +22,28 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
+from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.replays import HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import System
 
 VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
-"""See `Checked`."""
+"""Verdicts of closer replays; see `Checked`."""
 FINER = {"half_step": 2, "quarter_step": 4}
 """Checks at a finer step, and how many times finer."""
 SINGLE = "quarter_step_float32"
+"""Name of the check at the finest step in single precision."""
 AMPLIFIED = 4.0
-"""A row must fail by so many times what rounding has moved it: a chaotic system turns roundings
-into any of its outcomes, and two or three programs may agree by chance."""
+"""Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
+roundings into any of its outcomes, and two or three programs may agree by chance."""
 MOST = 256
-"""Rows that are examined whatever comes; each costs as much as 15 simulations of the run,"""
+"""Rows that are examined in any case; each costs as much as 15 simulations of the run."""
 SAFE = 10.0
-"""Others are left out only if so many times farther from zero than replays have moved any row,"""
+"""Further rows stay unexamined if they are so many times farther from zero than replays have moved
+any row."""
 BLOCK = 64
-"""and that is looked at after so many rows."""
-
-
+"""Rows examined between two looks at whether the rest may stay unexamined."""
 IN_WORDS = {
     "float64": "in float64",
     "again": "simulated again",
@@ -51,10 +53,11 @@ IN_WORDS = {
     "nudged": "one rounding of the features away",
     "simulator": "in the other simulator",
 }
+"""Each check as people read it."""
 
 
 class Checked(NamedTuple):
-    """What came of checking rows, `[n]` each.
+    """Verdicts of closer replays of `n` rows.
 
     - `verdict`: `confirmed`: it fails in every check, and by more than replays move it; `fragile`:
       the checks disagree, one of them gave no robustness, or it fails by less than that;
@@ -104,7 +107,7 @@ class Confirmer:
         precision: str = "float32",
         seed: int = 0,
         *,
-        simulator: Any = None,
+        simulator: System | Callable[..., Trace] | Problem | str | None = None,
         most: int = MOST,
     ) -> None:
         if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
@@ -118,6 +121,8 @@ class Confirmer:
     def __call__(self, rows: Mapping[str, Any], numbers: Sequence[int] | np.ndarray) -> Checked:
         """Check these rows of the table.
 
+        **Arguments:**
+
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
 
@@ -129,7 +134,7 @@ class Confirmer:
             return Checked(np.empty(0, object), {}, np.zeros(0), [], ())
         run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
         order = np.arange(len(numbers)) if run is None else np.argsort(np.abs(run), kind="stable")
-        parts: list[tuple[np.ndarray, _Found]] = []
+        parts: list[tuple[np.ndarray, _Decision]] = []
         while len(order):
             free = self.most - self.examined
             if run is None:
@@ -138,14 +143,14 @@ class Confirmer:
                 break
             block, order = np.split(order, [max(free, BLOCK)])
             taken = {name: column[block] for name, column in rows.items()}
-            parts.append((block, self._examined(taken, numbers[block], taken.get("rho"))))
+            parts.append((block, self._examine(taken, numbers[block], taken.get("rho"))))
             self.examined += len(block)
             self.band = max(self.band, float(np.max(parts[-1][1].band)))
-        return self._together(parts, order, run)
+        return self._join(parts, order, run)
 
     @property
     def finer(self) -> bool:
-        """Whether there is more to do for a black box than to simulate it once more.
+        """True where more can be done for a black box than to simulate it once more.
 
         What JAX traces can always be looked at in double precision.
         """
@@ -155,17 +160,17 @@ class Confirmer:
         return replays.refiner.why_not(FINER.values()) is None
 
     def far(self, rho: float) -> bool:
-        """Whether a robustness is so far from zero that no replay will have another sign.
+        """Return whether a robustness is so far from zero that no replay will have another sign.
 
         That is ten times as far as any replay has moved a row so far.
         """
         return bool(abs(rho) > SAFE * self.band)
 
-    def _examined(
+    def _examine(
         self, rows: Mapping[str, np.ndarray], numbers: np.ndarray, run: np.ndarray | None
-    ) -> "_Found":
+    ) -> "_Decision":
         if self._plan is None:
-            self._plan = _planned(self, rows)
+            self._plan = _make_plan(self, rows)
         features: dict[str, Any] = {}
         found = {}
         for name, check in self._plan.checks.items():
@@ -175,12 +180,12 @@ class Confirmer:
             if name == "nudged":
                 values = self.problem.space.nudged(values)
             found[name] = check.replays(check.factor, values, numbers)
-        return _decided(len(numbers), found, run, self._plan)
+        return _decide(len(numbers), found, run, self._plan)
 
-    def _together(
-        self, parts: list[tuple[np.ndarray, "_Found"]], rest: np.ndarray, run: Any
+    def _join(
+        self, parts: list[tuple[np.ndarray, "_Decision"]], rest: np.ndarray, run: np.ndarray | None
     ) -> Checked:
-        """The rows of all parts in their order, and those that were left out."""
+        """Join the rows of all parts in their order, and those that were left out."""
         count = sum(len(block) for block, _ in parts) + len(rest)
         assert self._plan is not None
         verdict = np.full(count, "unexamined", object)
@@ -193,6 +198,7 @@ class Confirmer:
             for place, reason in zip(block.tolist(), found.why, strict=True):
                 why[place] = reason
         if len(rest):
+            assert run is not None
             nearest = np.min(np.abs(run[rest]))
             note = (
                 f"{len(rest)} of {count} were not replayed: {nearest:.3g} or more from zero, where "
@@ -205,7 +211,7 @@ class Confirmer:
 
 
 class _Check(NamedTuple):
-    """One kind of replay: of features in this precision, with a so many times smaller step."""
+    """One kind of replay: of features in one precision, with a `factor` times smaller step."""
 
     replays: Any
     factor: int
@@ -213,14 +219,14 @@ class _Check(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """The checks by name, what was decided, and whether any says more than the run itself did."""
+    """The checks by name, notes on those left out, and whether any says more than the run did."""
 
     checks: dict[str, _Check]
     notes: tuple[str, ...]
     independent: bool
 
 
-def _planned(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
+def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
     problem, run = confirmer.problem, confirmer.precision
     checks: dict[str, _Check] = {}
     base, precision, notes = _replays(problem, confirmer, rows)
@@ -254,7 +260,7 @@ def _planned(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
 def _replays(
     problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarray]
 ) -> tuple[Any, str, list[str]]:
-    """What replays a problem's rows, in which precision, and what there is to say about it."""
+    """Return the replays of a problem's rows, their precision, and notes on what is left out."""
     run, key = confirmer.precision, run_keys(confirmer.seed)[1]
     if problem.black_box:
         return HostReplays(problem, run, key), run, ["not checked in float64: a black box"]
@@ -276,8 +282,8 @@ def _replays(
         return None, run, [*notes, f"not simulated again: {format_error(error)}"]
 
 
-class _Found(NamedTuple):
-    """What was decided of some rows, and their replays by check."""
+class _Decision(NamedTuple):
+    """The verdicts of some rows, and their replays by check."""
 
     verdict: np.ndarray
     band: Float[np.ndarray, " n"]
@@ -285,7 +291,9 @@ class _Found(NamedTuple):
     replayed: dict[str, Verdicts]
 
 
-def _decided(count: int, found: dict[str, Verdicts], run: Any, plan: _Plan) -> _Found:
+def _decide(
+    count: int, found: dict[str, Verdicts], run: np.ndarray | None, plan: _Plan
+) -> _Decision:
     base = next((name for name in ("float64", "again") if name in found), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
     rho = {name: replayed.least for name, replayed in found.items()}
@@ -300,7 +308,7 @@ def _decided(count: int, found: dict[str, Verdicts], run: Any, plan: _Plan) -> _
     band = np.maximum(step, rounding)
     if not plan.independent:
         reason = "; ".join(plan.notes) or "the run was in float64 already"
-        return _Found(np.full(count, "unchecked", object), band, [reason] * count, found)
+        return _Decision(np.full(count, "unchecked", object), band, [reason] * count, found)
     deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
     deciding = [name for name in (*deciding, "simulator") if name in found]
     failing = {name: replayed.violated for name, replayed in found.items()}
@@ -312,11 +320,11 @@ def _decided(count: int, found: dict[str, Verdicts], run: Any, plan: _Plan) -> _
     why = [""] * count
     for i in np.flatnonzero(~confirmed).tolist():
         why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
-    return _Found(verdict.astype(object), band, why, found)
+    return _Decision(verdict.astype(object), band, why, found)
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """By how much a robustness moved: without end where one of the two is missing."""
+    """Return by how much a robustness moved: infinitely where one of the two is missing."""
     with np.errstate(invalid="ignore"):
         return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)
 
@@ -342,8 +350,8 @@ def _and(names: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _other(problem: Problem, simulator: Any) -> Problem:
-    """The problem with another system."""
+def _other(problem: Problem, simulator: System | Callable[..., Trace] | Problem | str) -> Problem:
+    """Return the problem with another system."""
     if isinstance(simulator, str):
         if not problem.system.backends:
             raise ValueError(
@@ -352,7 +360,7 @@ def _other(problem: Problem, simulator: Any) -> Problem:
             )
         other = problem.on_backend(simulator)
     else:
-        system = simulator.system if isinstance(simulator, Problem) else simulator
+        system: Any = simulator.system if isinstance(simulator, Problem) else simulator
         if isinstance(simulator, Problem):
             check_names("feature of the simulator", simulator.space.columns, problem.space.columns)
             check_names("feature", problem.space.columns, simulator.space.columns)

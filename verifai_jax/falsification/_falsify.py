@@ -22,16 +22,16 @@ from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.run import Run, load, write_record
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
+    adapt_search,
     check_gradient,
     check_options,
     check_rule,
     check_same_space,
     check_search,
-    described,
     earlier_rows,
-    needs_slopes,
+    needs_gradient,
     new_folder,
-    usable,
+    space_as_data,
     usual_batch,
     writing,
 )
@@ -102,6 +102,8 @@ def falsify(
 
     Ctrl-C ends the run and returns what is finished.
 
+    **Returns:** the run: its table, its statistics, and replays of its rows.
+
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
     work on the space, a folder that cannot be written; `RunError` with the finished part of the run
@@ -117,13 +119,13 @@ def falsify(
     usual = min(16, budget) if diverse else usual_batch(search, budget, stop_after)
     batch = min(usual if batch is None else batch, budget)
     choice = resolved(
-        problem, gradient=needs_slopes(search), batch=batch, budget=budget, precision=precision,
+        problem, gradient=needs_gradient(search), batch=batch, budget=budget, precision=precision,
         wanted=backend,
     )  # fmt: skip
     problem = choice.problem
     check_gradient(problem, search)
     problem.check()
-    search, notes = usable(problem, search)
+    search, notes = adapt_search(problem, search)
     if diverse:
         search = searches.Diverse(search, capacity=max(256, stop_after or 0))
     place = new_folder(folder)
@@ -134,8 +136,8 @@ def falsify(
         if earlier is not None:
             rounds.warm(earlier)
 
-    ends = _Ends(started, budget, max_seconds, stop_after, stop_when)
-    return _play(rounds, ends, seed, choice, progress, target, prepare, notes)
+    ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
+    return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes)
 
 
 @suggests_options
@@ -159,6 +161,8 @@ def simulate(
     - the others as in `falsify`.
 
     Features pass through the unit cube, which changes the last digit of some real ones.
+
+    **Returns:** the run, with a row of its table for each of these.
 
     **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
     """
@@ -199,6 +203,8 @@ def resume(
 
     The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
     of a search that learns does a larger one go on with a new batch.
+
+    **Returns:** the run with the earlier rows and the new ones.
 
     **Raises:** `ValueError` for a run without its problem or its state, or a budget that is spent;
     as `falsify` otherwise.
@@ -248,13 +254,13 @@ def resume(
         if snapshot:
             rounds.resume(snapshot)
 
-    ends = _Ends(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
-    told = [note for note in run.notes if note.startswith("portfolio ")]
-    return _play(rounds, ends, run.seed, choice, progress, run.target, prepare, told)
+    ends = _Ending(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
+    notes = [note for note in run.notes if note.startswith("portfolio ")]
+    return _run_rounds(rounds, ends, run.seed, choice, progress, run.target, prepare, notes)
 
 
-class _Ends(NamedTuple):
-    """What ends a run."""
+class _Ending(NamedTuple):
+    """The conditions that end a run."""
 
     started: float
     budget: int
@@ -268,7 +274,7 @@ class _Ends(NamedTuple):
         return time.perf_counter() - self.started
 
     def reached(self, rounds: Rounds) -> str | None:
-        """What ends the run after this round, if anything does."""
+        """Return the condition that ends the run after this round, if any does."""
         if self.stop_after is not None and rounds.distinct >= self.stop_after:
             return "stop_after"
         if self.stop_when is not None and self.stop_when.done(rounds.found, rounds.judged):
@@ -282,15 +288,15 @@ class _Ends(NamedTuple):
         return None
 
 
-def _play(
+def _run_rounds(
     rounds: Rounds,
-    ends: _Ends,
+    ends: _Ending,
     seed: int,
     choice: Choice,
     progress: bool | None,
     target: str | None,
     prepare: Callable[[], None],
-    told: Sequence[str] = (),
+    notes: Sequence[str] = (),
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -314,13 +320,13 @@ def _play(
             problem=problem,
             budget=int(ends.budget),
             search_data=searches.to_json(search),
-            space_data=described(problem),
+            space_data=space_as_data(problem),
             acceptance=rounds.acceptance,
             snapshot=rounds.snapshot,
             precision=rounds.precision,
             backend=choice.backend,
             confirm=rounds.confirms,
-            notes=(*chosen, *told, *rounds.notes),
+            notes=(*chosen, *notes, *rounds.notes),
         )
 
     if place is not None:
@@ -354,19 +360,19 @@ def _play(
         cause = cause or error
     if cause is not None:
         raise RunError(
-            _broke_down(problem.name, len(rounds.table), place, cause), result
+            _failure_message(problem.name, len(rounds.table), place, cause), result
         ) from cause
     return result
 
 
-def _broke_down(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
-    told = f"the run of {name!r} broke down after {simulations} simulations: {cause}. "
+def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
+    message = f"the run of {name!r} broke down after {simulations} simulations: {cause}. "
     if place is None:
-        return f"{told}They are in the .run of this error"
+        return f"{message}They are in the .run of this error"
     if isinstance(cause, OSError):
         return (
-            f"{told}All of them are in the .run of this error, and in {place} those up to the last "
-            "whole batch that could be written: make room there and resume it, or save the run "
+            f"{message}All of them are in the .run of this error, and in {place} those up to the "
+            "last whole batch that could be written: make room there and resume it, or save the run "
             "elsewhere"
         )
-    return f"{told}They are in the .run of this error and in {place}, which can be resumed"
+    return f"{message}They are in the .run of this error and in {place}, which can be resumed"

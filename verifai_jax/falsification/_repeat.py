@@ -26,7 +26,12 @@ from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import violations
 from verifai_jax.falsification.lockstep import lockstep
-from verifai_jax.falsification.validation import check_options, check_search, usable, usual_batch
+from verifai_jax.falsification.validation import (
+    adapt_search,
+    check_options,
+    check_search,
+    usual_batch,
+)
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
@@ -147,7 +152,7 @@ def repeat(
             )
     in_precision(precision)
     traced.check()
-    search, _ = usable(traced, search)
+    search, _ = adapt_search(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     if search.wants_clauses:
         with in_precision(precision):

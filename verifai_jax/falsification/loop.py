@@ -18,7 +18,7 @@ from verifai_jax.evaluation.confirmation import Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.checkpoint import write_snapshot
+from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.table import NOT_CLAIMED, ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
@@ -238,7 +238,7 @@ class Rounds:
         if self.folder is None or (seldom and now - self._saved < 1.0):
             return
         self._saved = now
-        write_snapshot(self.snapshot, self.folder)
+        write_checkpoint(self.snapshot, self.folder)
         if self._journal is not None:
             # Only now: rows of the table that the snapshot does not know are simulated again.
             self._journal.settle(int(self.snapshot.get("rows", 0)))

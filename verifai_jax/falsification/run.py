@@ -18,7 +18,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.evaluation.replay import Replay, replay
-from verifai_jax.falsification.checkpoint import read_snapshot, write_snapshot
+from verifai_jax.falsification.checkpoint import read_checkpoint, write_checkpoint
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
@@ -29,26 +29,36 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RECORD = "run.json"
-FORMAT = 1
+"""Name of the file with everything about a run but its table and its checkpoint."""
+FORMAT = 2
+"""Number of the format of a run's files; others are refused."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What `falsify` returns.
+    """The result of a falsification: its table, its record, and what follows from them.
 
-    **Fields:** `name` and `formulas` (texts) of the problem; `table`; `search` (its repr), `seed`
-    and `batch`; `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`,
-    `"exhausted"` (a finite search came to its end), `"interrupted"`, the error that ended it, or
-    `"running"` for one that was cut off;
-    `compile_seconds` and `run_seconds`; `version` of verifai_jax; `prior`: whether the rows are
-    independent samples of the feature space; `folder` on disk, if any; `target`: how the command
-    line names the problem; `problem` itself, None for a loaded run without one; `budget`;
-    `search_data` and `space_data`: the search and the space as plain data, None for one of the
-    user's own; `acceptance`: share of
-    proposed points that the constraint of the space let through, None without one; `snapshot`: what
-    `resume` goes on from; `precision` of the simulations; `backend` that simulated, None for a
-    system that has one only; `notes` on what was decided by itself, for people; `confirm`: whether
-    what violates the property was looked at closely before it was claimed.
+    - `name`: of the problem.
+    - `formulas`: their texts by name.
+    - `table`: one row a simulation.
+    - `search`: its repr.
+    - `seed`, `batch`, `budget`: as given to `falsify`.
+    - `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`, `"exhausted"` (a finite
+      search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
+      was cut off.
+    - `compile_seconds`, `run_seconds`: time spent compiling, and in everything else.
+    - `version`: of verifai_jax.
+    - `prior`: whether the rows are independent samples of the feature space.
+    - `folder`: on disk; None for a run in memory.
+    - `target`: the problem's name on the command line.
+    - `problem`: None for a run that was loaded without it.
+    - `search_data`, `space_data`: search and space as plain data; None for one of the user's own.
+    - `acceptance`: share of proposed points that the constraint accepted; None without one.
+    - `snapshot`: the checkpoint that `resume` goes on from.
+    - `precision`: `"float32"` or `"float64"`, of the simulations.
+    - `backend`: the engine that simulated; None for a system that has one only.
+    - `notes`: decisions that were made without the user.
+    - `confirm`: whether violations were replayed more finely before they were claimed.
     """
 
     name: str
@@ -136,7 +146,7 @@ class Run:
         return failing.loc[rulebook.front(broken)] if len(failing) else failing
 
     def analyze(self, **options: Any) -> Any:
-        """What the table says: rules, importance, clusters, coverage; see `analysis.analyze`."""
+        """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""
         return late("verifai_jax.analysis", "analyze")(self, **options)
 
     def replay(
@@ -167,7 +177,7 @@ class Run:
         return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
 
     def summary(self) -> str:
-        """What failed, how often, the worst case and how to see it again, for people."""
+        """Write what failed, how often, the worst case and how to see it again."""
         return _summary(self)
 
     def plot(self, path: str | Path | None = None) -> Any:
@@ -180,7 +190,7 @@ class Run:
         self.table.save(folder)
         write_record(self, folder)
         if self.snapshot:
-            write_snapshot(self.snapshot, folder)
+            write_checkpoint(self.snapshot, folder)
         return folder
 
     def __repr__(self) -> str:
@@ -237,7 +247,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     record = json.loads((folder / RECORD).read_text())
     if record.get("format") != FORMAT:
         raise ValueError(
-            f"{folder / RECORD} has format {record.get('format')!r}; this version reads {FORMAT}"
+            f"{folder / RECORD} has format {record.get('format')!r}, and this version of "
+            f"verifai_jax reads format {FORMAT}: load it with the version that wrote it, "
+            f"{record.get('version', 'unknown')}"
         )
     features = tuple(record["features"])
     if problem is not None:
@@ -260,7 +272,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         table=ErrorTable.load(folder, features) if begun else ErrorTable(features),
         folder=folder,
         problem=problem,
-        snapshot=read_snapshot(folder),
+        snapshot=read_checkpoint(folder),
         **{name: record[name] for name in _RECORDED},
         **{name: record[name] for name in _ADDED if name in record},
     )
@@ -271,7 +283,7 @@ def _summary(run: Run) -> str:
     lines = [f"{run.name}: {failures} of {run.simulations} simulations violate the property"]
     for name, text in run.formulas.items():
         lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
-    if verdicts := _verdicts(run):
+    if verdicts := _verdict_counts(run):
         lines.append(f"  confirmed    {verdicts}")
     rate = run.failure_rate
     if rate is not None:
@@ -312,8 +324,8 @@ def _summary(run: Run) -> str:
     return "\n".join(lines)
 
 
-def _verdicts(run: Run) -> str:
-    """What closer looks said of the rows that violate the property."""
+def _verdict_counts(run: Run) -> str:
+    """Count the verdicts of closer replays of the rows that violate the property."""
     table = run.table.all
     if "verdict" not in table:
         return ""

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STREAM = "rows.arrows"
+"""Name of the growing table on disk."""
 FINISHED = "table.parquet"
+"""Name of the finished table on disk."""
 RESERVED = (
     "row",
     "rho",
@@ -31,6 +33,7 @@ RESERVED = (
     "differentiated",
     "verdict",
 )
+"""Names of the table's own columns, which no feature may have."""
 NOT_CLAIMED = ("fragile", "refuted")
 """Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 
@@ -146,11 +149,11 @@ class ErrorTable:
 
     @staticmethod
     def exists(folder: Path) -> bool:
-        """Whether there is a table in `folder`, finished or growing."""
+        """Return whether there is a table in `folder`, finished or growing."""
         return (folder / FINISHED).exists() or (folder / STREAM).exists()
 
     def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
-        """A table with the first `rows` rows of this one, to which more can be appended.
+        """Return a table with the first `rows` rows of this one, to which more can be appended.
 
         With a `folder` it is kept there, in place of what the folder held.
         """

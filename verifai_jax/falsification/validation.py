@@ -1,9 +1,9 @@
-"""What `falsify` and `resume` are asked for, checked before anything compiles."""
+"""Checks of the options of `falsify` and `resume`, before anything compiles."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.stopping import StoppingRule
 from verifai_jax.systems.base import System
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @contextmanager
@@ -32,7 +35,9 @@ def writing(place: Path | None) -> Iterator[None]:
 
 
 def usual_batch(search: Search, budget: int, stop_after: int | None = None) -> int:
-    """Twenty rounds or more for a search that learns; a power of two, so that shapes are few.
+    """Return the default batch: twenty rounds or more for a search that learns.
+
+    A power of two, so that shapes are few.
 
     One that stops at few counterexamples gets small batches: it is likely to end in its first.
     """
@@ -42,11 +47,9 @@ def usual_batch(search: Search, budget: int, stop_after: int | None = None) -> i
     return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
 
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-
-
-def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_after: Any) -> None:
+def check_options(
+    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
+) -> None:
     """Refuse numbers out of range.
 
     **Raises:** `ValueError`.
@@ -55,14 +58,14 @@ def check_options(budget: Any, batch: Any, seed: Any, max_seconds: Any, stop_aft
         if name == "stop_after" and value is None:
             continue
         check_count(name, value)
-    if not _is_integer(seed) or not 0 <= seed < 2**63:
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
     if max_seconds is not None:
         check_positive("max_seconds", max_seconds)
 
 
-def check_search(problem: Any, search: Any) -> Search:
-    """The search, by its name or itself, if it can work on this problem.
+def check_search(problem: object, search: object) -> Search:
+    """Return the search, by its name or itself, if it can work on this problem.
 
     **Raises:** `TypeError` for what is no problem or no search; `ValueError` for one that cannot.
     """
@@ -80,14 +83,14 @@ def check_search(problem: Any, search: Any) -> Search:
 
 
 def _why_not_traced(system: System) -> str:
-    """What a system with several backends says of those that JAX could trace."""
+    """Return why a system with several backends has none that JAX can trace; often empty."""
     if not system.backends or "mjx" in system.backends:
         return ""
     return f". It does not run on mjx: {system.why_not('mjx')}"
 
 
-def needs_slopes(search: Search) -> bool:
-    """Whether this search can do nothing without derivatives; a portfolio can."""
+def needs_gradient(search: Search) -> bool:
+    """Return whether this search can do nothing without derivatives; a portfolio can."""
     clauses = search.wants_clauses and not isinstance(search, searches.Portfolio)
     return search.wants_gradient or clauses
 
@@ -97,7 +100,7 @@ def check_gradient(problem: Problem, search: Search) -> None:
 
     **Raises:** `ValueError`.
     """
-    wants = needs_slopes(search)
+    wants = needs_gradient(search)
     if wants and problem.rulebook is not None and search.wants_clauses:
         raise ValueError(
             f"search {search!r} descends on clauses, which have no order; problem "
@@ -111,8 +114,8 @@ def check_gradient(problem: Problem, search: Search) -> None:
         )
 
 
-def usable(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
-    """The search as it can work on this problem, and notes on what it does without.
+def adapt_search(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
+    """Return the search as it can work on this problem, and notes on what it does without.
 
     A portfolio does without gradients where there are none.
     """
@@ -147,8 +150,8 @@ def check_rule(search: Search, rule: StoppingRule | None) -> None:
         )
 
 
-def described(problem: Problem) -> dict[str, Any] | None:
-    """The feature space as plain data; None where it has no such form."""
+def space_as_data(problem: Problem) -> dict[str, Any] | None:
+    """Return the feature space as plain data; None where it has no such form."""
     try:
         return problem.space.to_json()
     except ValueError:
@@ -160,7 +163,7 @@ def check_same_space(run: Run, problem: Problem) -> None:
 
     **Raises:** `ValueError` that names the first difference.
     """
-    data = described(problem)
+    data = space_as_data(problem)
     if run.space_data is None or data is None or run.space_data == data:
         return
     was, now = dict(run.space_data["features"]), dict(data["features"])
@@ -176,20 +179,21 @@ def check_same_space(run: Run, problem: Problem) -> None:
         raise ValueError(f"the run of {run.name!r} was over a space of another order or constraint")
 
 
-def earlier_rows(warm_start: Any, problem: Problem) -> Any:
-    """The rows of an earlier table, as a DataFrame with the columns that are needed."""
+def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
+    """Return the rows of an earlier table, as a DataFrame with the columns that are needed."""
     if warm_start is None:
         return None
     table = warm_start.table if isinstance(warm_start, Run) else warm_start
     frame = table.all if isinstance(table, ErrorTable) else table
-    if not hasattr(frame, "columns"):
+    columns = getattr(frame, "columns", None)
+    if columns is None:
         raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
-    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, frame.columns))
-    return frame
+    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, columns))
+    return cast("pd.DataFrame", frame)
 
 
 def new_folder(folder: str | Path | None) -> Path | None:
-    """The folder for a new run, made now.
+    """Make the folder for a new run.
 
     **Raises:** `ValueError` for one that is not empty or cannot be made.
     """

@@ -17,7 +17,7 @@ import numpy as np
 from verifai_jax import search as searches
 from verifai_jax.core.cores import available_cores
 from verifai_jax.core.keys import run_keys
-from verifai_jax.falsification.validation import needs_slopes
+from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Portfolio, Search
 from verifai_jax.search.proposals import Proposals
@@ -94,7 +94,7 @@ def make_proposer(
         )
     if isinstance(search, Portfolio):
         search = replace(search, gradients=False)
-    if needs_slopes(search):
+    if needs_gradient(search):
         raise ValueError(
             f"search {search!r} needs gradients, which trainings do not have; "
             "use one that does not, such as 'halton' or 'bayes'"
