@@ -17,6 +17,7 @@ from jaxtyping import install_import_hook
 matplotlib.use("Agg")
 
 CHECKED_ROOMS: list[str] = [
+    "counterexamples",
     "estimation",
     "sweeps",
     "systems.base",

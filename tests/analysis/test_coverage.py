@@ -95,7 +95,7 @@ def test_the_prior_is_what_counts_where_the_space_is_known():
     assert x.value(0.25) == pytest.approx(0, abs=0.01)
     np.testing.assert_allclose(k.unit(samples), [0.125, 0.375, 0.625, 0.875])
     assert k.value(0.3) == 4
-    np.testing.assert_allclose(k.snapped(np.array([0, 0.3, 1])), [0.125, 0.375, 0.875])
+    np.testing.assert_allclose(k.snap(np.array([0, 0.3, 1])), [0.125, 0.375, 0.875])
     # A quarter of the range is never reached, which the table alone could not tell.
     g = np.random.default_rng(0)
     part = judged(x=g.uniform(-2, 4, 5000), k=g.integers(3, 7, 5000))

@@ -168,7 +168,7 @@ def test_refused(monkeypatch):
     with pytest.raises(ValueError, match="against must be 'auto', 'table' or 'prior'; got 'safe'"):
         frequent_patterns(frame, against="safe")  # pyright: ignore[reportArgumentType]
     # The package has a function of that name.
-    module = importlib.import_module("verifai_jax.analysis.frequent_patterns")
+    module = importlib.import_module("verifai_jax.analysis._frequent_patterns")
     monkeypatch.setattr(module, "MOST_COMBINATIONS", 5)
     with pytest.raises(ValueError, match=r"more than 5 combinations of up to 2 values .*raise min"):
         frequent_patterns(frame, minimum=0.01)

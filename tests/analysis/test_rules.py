@@ -175,7 +175,7 @@ def test_rounding_covers_the_same_rows():
     codes = np.zeros((300, 0), int)
     for low, high in g.random((50, 2)):
         region = Region((low / 2, 1.5), (0.6 + high / 3, 4.5), ())
-        rounded = region.rounded(values, codes, (False, True))
+        rounded = region.round(values, codes, (False, True))
         assert np.array_equal(region.covers(values, codes), rounded.covers(values, codes))
         assert rounded.above[1] == 1
         assert rounded.upto[1] == 4

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from click.testing import CliRunner
 
 import verifai_jax as vj
@@ -412,7 +413,7 @@ def test_errors_say_what_to_do(circles, tmp_path):
         confirm(circles, 999)
     with pytest.raises(UnknownNameError, match="did you mean 'simulator'"):
         confirm(circles, simulater="native")
-    with pytest.raises(TypeError, match="confirm needs a Run; got Problem"):
+    with unchecked(), pytest.raises(TypeError, match="confirm needs a Run; got Problem"):
         confirm(circles.problem)
     circles.save(tmp_path / "run")
     with pytest.raises(ValueError, match=r"was loaded without its problem.*vj.load\(path, problem"):
@@ -428,7 +429,7 @@ def test_a_run_without_failures():
 
 
 SPEC = """
-from tests.test_confirm import oscillator
+from tests.evaluation.test_confirm import oscillator
 circle = oscillator()
 """
 

@@ -193,7 +193,8 @@ def _one(
             raise IndexError(f"row {row} is not in the table of {len(run.table)} simulations")
         number, values = int(row), run.table.all.iloc[int(row)]
     else:
-        number, values = getattr(row, "name", None), row
+        name = getattr(row, "name", None)
+        number, values = int(name) if isinstance(name, int | np.integer) else None, row
     entries = {str(name): value for name, value in values.items()}
     _check_fails(number, entries)
     columns = {name: np.asarray([value]) for name, value in entries.items()}
