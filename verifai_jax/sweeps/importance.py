@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.analysis._pca import Components, pca
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import Constant, FeatureSpace
@@ -34,6 +33,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
     from sklearn.ensemble import ExtraTreesRegressor
+
+    from verifai_jax.analysis._pca import Components
 
 TARGETS = {"failure_rate": "failing", "nominal_return": "return"}
 """Columns that are explained, with their names in the summary."""
@@ -78,8 +79,8 @@ class HyperparameterImportance:
     scores: Mapping[str, float]
     chance: Mapping[str, float]
     missing: Mapping[str, str]
-    unsafe: Components | None
-    safe: Components | None
+    unsafe: "Components | None"
+    safe: "Components | None"
     configurations: int
     name: str
 
@@ -342,9 +343,11 @@ def _components(
     table: "pd.DataFrame",
     inputs: Sequence[_Input],
     which: Literal["counterexamples", "safe"],
-) -> Components | None:
+) -> "Components | None":
     """Compute principal components of the ordered hyper-parameters of unsafe or safe rows."""
     import pandas as pd
+
+    from verifai_jax.analysis._pca import pca
 
     ordered = [one for one in inputs if one.ordered and one.name != "steps"]
     verdicts = table["verdict"].astype(str)
