@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 Device: TypeAlias = jax.Device  # pyright: ignore[reportInvalidTypeForm]
 """A device of JAX; its own name of the class is a variable to type checkers."""
@@ -41,12 +41,24 @@ def spread_over_devices(
     part, whole = PartitionSpec("row"), PartitionSpec()
     return jax.shard_map(
         function,
-        mesh=Mesh(np.array(devices), ("row",)),
+        mesh=_mesh(devices),
         in_specs=tuple(part if each else whole for each in split),
         out_specs=part,
         # A user's scan need not say that its carry differs between devices.
         check_vma=False,
     )
+
+
+def split_sharding(devices: Sequence[Device]) -> NamedSharding:
+    """Return where arrays lie whose leading axis is split as `spread_over_devices` does.
+
+    An array that lies elsewhere would have a compiled program compiled again.
+    """
+    return NamedSharding(_mesh(devices), PartitionSpec("row"))
+
+
+def _mesh(devices: Sequence[Device]) -> Mesh:
+    return Mesh(np.array(devices), ("row",))
 
 
 def _setting(name: str) -> Any:

@@ -22,10 +22,14 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
 
-from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
+from verifai_jax.core.devices import (
+    Device,
+    enable_compile_cache,
+    split_sharding,
+    spread_over_devices,
+)
 from verifai_jax.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.rl.policy import Policy
 from verifai_jax.rl.task.task import Task
@@ -247,8 +251,7 @@ class BatchedTraining:
         )
         if len(devices) > 1:
             # Where the program expects them; it would be compiled again for another place.
-            spread = NamedSharding(Mesh(np.array(devices), ("lane",)), PartitionSpec("lane"))
-            return jax.device_put(selected, spread)
+            return jax.device_put(selected, split_sharding(devices))
         return selected
 
 
