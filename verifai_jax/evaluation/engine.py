@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
@@ -192,7 +192,13 @@ class Engine:
         return trace()
 
     def _run(
-        self, mode: Mode, rows: Any, key: Any, first: int, temperature: Any, shared: Any
+        self,
+        mode: Mode,
+        rows: PyTree,
+        key: Key[Array, ""] | Key[Array, " n"],
+        first: int,
+        temperature: ArrayLike,
+        shared: PyTree,
     ) -> Any:
         with in_precision(self.precision):
             count = len(jax.tree.leaves(rows)[0])
@@ -344,7 +350,7 @@ class Engine:
         return boolean_semantics(self.problem, system(features, key))
 
 
-def _pad(rows: Any, count: int) -> Any:
+def _pad(rows: np.ndarray | Array, count: int) -> np.ndarray | Array:
     if len(rows) == count:
         return rows
     # In NumPy: JAX would compile a program for each number of missing rows.
@@ -355,12 +361,12 @@ def _pad(rows: Any, count: int) -> Any:
 def _pad_keys(keys: Key[Array, " n"], count: int) -> Key[Array, " count"]:
     if len(keys) == count:
         return keys
-    data = _pad(np.asarray(jax.random.key_data(keys)), count)
+    data = jnp.asarray(_pad(np.asarray(jax.random.key_data(keys)), count))
     return jax.random.wrap_key_data(data, impl=IMPLEMENTATION)
 
 
 class EngineMode(NamedTuple):
-    """What makes an engine of one problem: see `Engine`."""
+    """The options of one problem's engine; see `Engine`."""
 
     batch: int
     gradient: bool

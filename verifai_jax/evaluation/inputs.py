@@ -19,7 +19,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class Inputs(abc.ABC):
-    """What one row is given, and what all rows share; both are pytrees that JAX traces."""
+    """The inputs of one row, and those that all rows share; both are pytrees that JAX traces."""
 
     row_form: PyTree
     """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 
 class _Slot(NamedTuple):
@@ -24,14 +24,14 @@ class _Slot(NamedTuple):
 
 
 class Packing:
-    """Where a pytree's leaves lie in one vector for each width; known once `pack` is traced."""
+    """The places of a pytree's leaves in one vector for each width; known once `pack` is traced."""
 
     def __init__(self) -> None:
         self._slots: list[_Slot] = []
         self._form: Any = None
 
-    def pack(self, row: Any) -> dict[str, Array]:
-        """One row's leaves, concatenated bit by bit: all of four bytes, all of eight."""
+    def pack(self, row: PyTree) -> dict[str, Array]:
+        """Concatenate one row's leaves bit by bit: all of four bytes, all of eight."""
         leaves, self._form = jax.tree.flatten(row)
         self._slots, parts, filled = [], {}, {}
         for leaf in map(jnp.asarray, leaves):
@@ -43,8 +43,8 @@ class Packing:
             filled[group] = start + leaf.size
         return {group: jnp.concatenate(vectors) for group, vectors in parts.items()}
 
-    def unpack(self, packed: dict[str, Array], n: int) -> Any:
-        """The first `n` rows of a batch of packed rows."""
+    def unpack(self, packed: dict[str, Array], n: int) -> PyTree:
+        """Return the first `n` rows of a batch of packed rows."""
         whole = {group: np.asarray(block)[:n] for group, block in packed.items()}
 
         def taken(slot: _Slot) -> np.ndarray:

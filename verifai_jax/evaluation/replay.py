@@ -3,14 +3,15 @@
 replay(problem, row, key, number).trace             # the trace behind a row of a table
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, ArrayLike, Key
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
@@ -19,6 +20,9 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ class Replay:
 
 def replay(
     problem: Problem,
-    row: Any,
+    row: "Mapping[str, Any] | pd.Series",
     key: Key[Array, ""],
     number: int | None = None,
     precision: str = "float32",
@@ -96,6 +100,6 @@ def replay(
         )
 
 
-def _cast(leaf: Any, precision: str) -> Any:
+def _cast(leaf: ArrayLike, precision: str) -> Array:
     leaf = jnp.asarray(leaf)
     return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf

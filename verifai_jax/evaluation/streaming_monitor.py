@@ -8,8 +8,7 @@ It needs a system with `fold` (see `systems.Ode`) and formulas whose online moni
 that holds a window of samples moves them all at every step.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
@@ -37,7 +36,7 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
     except ValueError:
         return None  # It looks ahead without end; or its clock is wrong, which `judge` says better.
 
-    def update(carry: Any, sample: Any) -> Any:
+    def update(carry: PyTree, sample: Mapping[str, Array]) -> PyTree:
         states, finite = carry
         for name in problem.monitored:
             signal = jnp.asarray(sample[name])

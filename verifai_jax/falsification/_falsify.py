@@ -372,7 +372,7 @@ def _failure_message(name: str, simulations: int, place: Path | None, cause: Exc
     if isinstance(cause, OSError):
         return (
             f"{message}All of them are in the .run of this error, and in {place} those up to the "
-            "last whole batch that could be written: make room there and resume it, or save the run "
-            "elsewhere"
+            "last whole batch that could be written: make room there and resume it, or save the "
+            "run elsewhere"
         )
     return f"{message}They are in the .run of this error and in {place}, which can be resumed"

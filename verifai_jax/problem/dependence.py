@@ -6,10 +6,9 @@ cost simulations and say nothing. JAX knows: what does not depend differentiably
 a derivative that does not depend on them either.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
@@ -26,12 +25,12 @@ def has_gradient(problem: Problem) -> bool:
 def _depends(problem: Problem) -> bool:
     key = jax.random.key(0)
 
-    def signals(u: Any) -> list[Any]:
+    def signals(u: Array) -> list[Array]:
         trace = problem.system(problem.space.unflatten(u), key)
         found = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
         return [signal for signal in found if jnp.issubdtype(signal.dtype, jnp.inexact)]
 
-    def along(u: Any, direction: Any) -> list[Any]:
+    def along(u: Array, direction: Array) -> list[Array]:
         return jax.jvp(signals, (u,), (direction,))[1]
 
     u = jnp.zeros(problem.space.dim)

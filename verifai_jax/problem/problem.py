@@ -197,7 +197,9 @@ BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""
 
 
-def _rulebook(priority: Any, formulas: Mapping[str, Formula]) -> Rulebook:
+def _rulebook(
+    priority: Sequence[str] | Sequence[tuple[str, str]], formulas: Mapping[str, Formula]
+) -> Rulebook:
     entries = [priority] if isinstance(priority, str) else list(priority)
     if all(isinstance(entry, str) for entry in entries):
         return Rulebook(formulas, list(pairwise(entries)))
