@@ -174,7 +174,7 @@ class Repair:
 
     @property
     def repaired(self) -> bool:
-        """Whether neither the last attack nor the check found a failure, and the check was made."""
+        """True where neither the last attack nor the check, which was made, found a failure."""
         return self.found and self.held_out_after is not None and self.held_out_after.passed
 
     @cached_property
