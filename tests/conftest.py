@@ -20,11 +20,7 @@ CHECKED_ROOMS: list[str] = [
     "counterexamples",
     "estimation",
     "sweeps",
-    "systems.base",
-    "systems.blackbox",
-    "systems.checkpointing",
-    "systems.ode",
-    "systems.remote",
+    "systems",
 ]
 """Rooms whose annotations, shapes included, are checked at run time in tests."""
 
