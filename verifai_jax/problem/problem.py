@@ -1,4 +1,4 @@
-"""A falsification problem: which inputs, which system, which property.
+"""A falsification problem: its inputs, its system and its property.
 
     Problem("balance", space={"x0": Box(-1, 1)}, system=simulate, spec="always[0, 4] x <= 2.4")
     Problem("drive", ..., spec={"safe": "always dist > 2", "arrives": "eventually x > 90"})
@@ -113,11 +113,11 @@ class Problem:
 
     @property
     def black_box(self) -> bool:
-        """Whether the system runs on the host, out of JAX's sight."""
+        """True where the system runs on the host, and JAX cannot trace it."""
         return self.system.black_box
 
     def draws(self) -> bool:
-        """Whether the system uses its random key; abstract evaluation, nothing compiles.
+        """Return whether the system uses its random key; abstract evaluation, nothing compiles.
 
         JAX draws other numbers in float64 than in float32, so a replay of such a system is only
         the same simulation in the precision of its run. A black box gets an integer seed.
@@ -131,7 +131,7 @@ class Problem:
         return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
 
     def on_backend(self, backend: str) -> "Problem":
-        """The same problem on one backend of its system, made once: it keeps what it compiles.
+        """Return the same problem on one backend of its system, made once: it keeps what it compiles.
 
         A problem whose system has no backends, or is on this one already, is itself.
 
@@ -145,7 +145,7 @@ class Problem:
         )
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
-        """The same problem with these features varied alone, all others at their nominal values.
+        """Return the same problem with these features varied alone, all others at their nominal values.
 
         - `nominal`: values to fix the others at, where they differ from the problem's own.
 
@@ -200,7 +200,7 @@ BACKENDS: Slot[str, Problem] = Slot("backends")
 def _rulebook(
     priority: Sequence[str] | Sequence[tuple[str, str]], formulas: Mapping[str, Formula]
 ) -> Rulebook:
-    entries = [priority] if isinstance(priority, str) else list(priority)
+    entries: list[Any] = [priority] if isinstance(priority, str) else list(priority)
     if all(isinstance(entry, str) for entry in entries):
         return Rulebook(formulas, list(pairwise(entries)))
     return Rulebook(formulas, entries)

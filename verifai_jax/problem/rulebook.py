@@ -1,4 +1,4 @@
-"""Which rules matter more than others: several formulas, compared where a sum would mislead.
+"""The order of several rules, compared where a sum would mislead.
 
     rulebook = Rulebook(("safe", "legal", "comfort"), [("safe", "comfort"), ("legal", "comfort")])
     rulebook.graver([1, 0, 0], [0, 0, 1])                    # True: breaking safety is worse
@@ -54,7 +54,7 @@ class Rulebook:
         object.__setattr__(self, "order", self._sorted())
 
     def graver(self, one: Sequence[Any], other: Sequence[Any]) -> bool:
-        """Whether `one` is a graver counterexample than `other`.
+        """Return whether `one` is a graver counterexample than `other`.
 
         Each says by how much every rule is broken, in the order of `names`: a number that is 0
         where the rule is kept, or a truth value. One is graver if they differ and wherever the
@@ -64,7 +64,7 @@ class Rulebook:
         return bool(self._outdone(second[None], first[None])[0, 0])
 
     def front(self, violations: Bool[Any, "n k"] | Float[Any, "n k"]) -> Bool[np.ndarray, " n"]:
-        """Which rows no other row outdoes: the Pareto set of counterexamples.
+        """Mark the rows that no other row outdoes: the Pareto set of counterexamples.
 
         Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
         """
@@ -78,7 +78,7 @@ class Rulebook:
         return kept[place.ravel()]
 
     def grade(self, violated: Bool[Any, "n k"]) -> Float[np.ndarray, " n"]:
-        """One number for what is broken: larger for a graver row, equal for equal rows.
+        """Return one number for what is broken: larger for a graver row, equal for equal rows.
 
         A linear extension of the order: of two rows that cannot be compared one is larger too.
         """
@@ -87,7 +87,7 @@ class Rulebook:
         return np.asarray(violated, np.float64)[..., places] @ weights
 
     def _outdone(self, rows: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, "n m"]:
-        """Whether row i is less grave than other row j."""
+        """Return whether row i is less grave than other row j."""
         more = others[None] > rows[:, None]  # Rules that the other breaks by more.
         less = others[None] < rows[:, None]
         excused = more.astype(np.float32) @ self._above.astype(np.float32).T > 0
@@ -125,12 +125,12 @@ class Rulebook:
 
 
 class Objective:
-    """What a search is told of simulations with several rules, in one number.
+    """The objective of a search over several rules, in one number.
 
     Positive for what is less grave than the gravest counterexample so far, negative for what is
     as grave: as soon as an important rule is broken, breaking lesser ones is no success any more.
     Within one grade the margins of the rules decide, weighed in the same order. `state` is all
-    that it remembers; keep it to go on later.
+    that it remembers; keep it to resume later.
     """
 
     def __init__(self, rulebook: Rulebook) -> None:
