@@ -72,7 +72,7 @@ class Analysis:
     samples: Samples | None
 
     def __getitem__(self, name: str) -> Any:
-        """The result of an analysis by name; None where it was skipped.
+        """Return the result of an analysis by name; None where it was skipped.
 
         **Raises:** `UnknownNameError` for a name that is not one of the parts'.
         """

@@ -130,7 +130,7 @@ def shared_simulator(
     dim: int,
     devices: Sequence[Any] | None = None,
 ) -> SharedSimulator:
-    """The simulator of a group; what it compiles is kept as long as `problem_of` is in use."""
+    """Return the simulator of a group; its programs live as long as `problem_of` is in use."""
     where = tuple(jax.local_devices() if devices is None else devices)
     try:
         program = _known_program(problem_of, group.structure, lanes, dim, where)
@@ -251,7 +251,7 @@ def _one_by_one(devices: Sequence[Any]) -> bool:
 
 
 def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
-    """The rows at these places of an array of `whole` rows, the first one elsewhere."""
+    """Return `whole` rows: the given ones at these places, the first of them elsewhere."""
     given = np.asarray(rows)
     spread = np.empty((whole, *given.shape[1:]), given.dtype)
     spread[:] = given[0]

@@ -1,4 +1,4 @@
-"""What there is to know of a counterexample: whether it is real, how little it takes, and why."""
+"""Studies of a counterexample: whether it is real, how little it takes, and why."""
 
 from verifai_jax.counterexamples._confirm import Confirmation as Confirmation
 from verifai_jax.counterexamples._confirm import Confirmations as Confirmations

@@ -181,7 +181,7 @@ def radial_score(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
 
 
 def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Standard normal numbers between two borders, exact in both tails."""
+    """Return standard normal numbers between two borders, exact in both tails."""
     from scipy.special import ndtr, ndtri
 
     mirrored = low > 0

@@ -180,7 +180,7 @@ def repeat(
 
 
 def _traced(problem: Problem, backend: str | None) -> Problem | None:
-    """The problem on a backend that JAX can trace."""
+    """Return the problem on a backend that JAX can trace; None where there is none."""
     names = (backend,) if backend is not None else problem.system.backends
     for candidate in (problem, *map(problem.on_backend, names)):
         if not candidate.black_box and (candidate.system.backend or backend) != "auto":

@@ -63,7 +63,7 @@ _NAMES = {"failing": "failing", "rho": "robustness"}
 
 
 def _mark_representatives(axes: Axes, analysis: Analysis, across: str, up: str) -> None:
-    """Number the rows that stand for the clusters of failures."""
+    """Mark with numbers the rows that stand for the clusters of failures."""
     samples = analysis.samples
     assert samples is not None
     rows = analysis.representatives[:MOST_MARKED]

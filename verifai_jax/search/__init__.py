@@ -11,6 +11,7 @@ from typing import Any
 
 from verifai_jax.core.cube import Cube as Cube
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.search._split import Split as Split
 from verifai_jax.search.annealing import Annealing as Annealing
 from verifai_jax.search.bandit import Bandit as Bandit
 from verifai_jax.search.base import Observations as Observations
@@ -30,7 +31,6 @@ from verifai_jax.search.mutation import Mutation as Mutation
 from verifai_jax.search.point_list import PointList as PointList
 from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
-from verifai_jax.search.split import Split as Split
 from verifai_jax.search.uniform import Uniform as Uniform
 
 __all__ = [

@@ -16,7 +16,7 @@ _MOST_PAIRS = 2**24
 
 
 def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
-    """Number the front of each point: 0 for those that none dominates, 1 once these are gone, ...
+    """Return each point's front: 0 where none dominates it, 1 once those are gone, and so on.
 
     **Arguments:**
 
@@ -39,7 +39,7 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
 
 
 def _fronts_of_distinct(points: Float[np.ndarray, "n objectives"]) -> Int[np.ndarray, " n"]:
-    """Number the fronts of points that differ and are sorted by their first objective."""
+    """Return the fronts of points that differ and are sorted by their first objective."""
     numbers = np.full(len(points), -1, np.int64)
     left, front = np.arange(len(points)), 0
     while len(left):

@@ -44,7 +44,7 @@ def dbscan(
 
 
 def knee(points: Float[np.ndarray, "n d"], k: int) -> float:
-    """The distance to the `k`-th nearest row (itself included) beyond which rows are lonely."""
+    """Return the distance to the `k`-th nearest row, itself included, that makes a row lonely."""
     from scipy.spatial import KDTree
 
     tree: Any = KDTree(points)

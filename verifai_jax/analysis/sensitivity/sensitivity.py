@@ -1,4 +1,4 @@
-"""How much each feature moves the robustness, from new simulations: what the methods share.
+"""The effect of each feature on the robustness, from new simulations: shared by the methods.
 
     sobol_indices(problem, samples=4096)         sobol.py: shares of the variance
     morris(problem, trajectories=32)             morris.py: cheap screening
@@ -109,7 +109,7 @@ class Coordinates(NamedTuple):
     def centres(
         self, cells: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]
     ) -> Float[np.ndarray, "n d"]:
-        """The middles of cells, of which coordinate `i` has `counts[i]`."""
+        """Return the middles of cells, of which coordinate `i` has `counts[i]`."""
         middles = (cells + 0.5) / counts
         for i, weights in enumerate(self.weights):
             if weights is not None:
