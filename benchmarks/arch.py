@@ -5,9 +5,9 @@
     python benchmarks/arch.py --instance 1
 
 For each requirement and search, from 50 seeds, one simulation a round: the falsification rate FR,
-and the mean number of simulations S of the seeds that falsify, where a simulation whose slopes were
-taken counts as one and as two; the median of the latter. `claimed`: how many of the first failures
-found are confirmed by replays in double precision, at half and at a quarter of the step
+and the mean number of simulations S of the seeds that falsify, where a simulation that was
+differentiated counts as one and as two; the median of the latter. `claimed`: how many of the first
+failures are confirmed by replays in double precision, at half and at a quarter of the step
 (`vj.confirm`), which is what `falsify` claims. Next to them the best published FR and mean S
 (ARCH-COMP reports 2020 to 2024; other models' solvers, other seeds).
 """
@@ -63,14 +63,14 @@ def requirements() -> dict[str, vj.Problem]:
 
 
 def claimed(problem: vj.Problem, trials: vj.Trials) -> str:
-    """How many of the first failures are confirmed."""
+    """Return how many of the first failures are confirmed, as text."""
     if trials.failures is None or not trials.falsified:
         return "-"
     points = trials.failures[np.isfinite(trials.first_failure)]
     features = jax.vmap(problem.space.unflatten)(jnp.asarray(points))
     rows = pd.DataFrame(problem.space.rows(features))
-    found = vj.confirm(vj.simulate(problem, rows, batch=64, progress=False))
-    return f"{found.counts.get('confirmed', 0)}/{len(points)}"
+    checked = vj.confirm(vj.simulate(problem, rows, batch=64, progress=False))
+    return f"{checked.counts.get('confirmed', 0)}/{len(points)}"
 
 
 def main() -> None:
@@ -87,7 +87,7 @@ def main() -> None:
         for name in INSTANCE_2
         if chosen.instance == 2 or not name.startswith("f16")
     ]
-    print("| requirement | search | FR | S, slopes as 1 | as 2 | median | claimed | published |")
+    print("| requirement | search | FR | S, gradients as 1 | as 2 | median | claimed | published |")
     print("|---|---|---|---|---|---|---|---|")
     for name in names:
         problem = problems[name]
@@ -96,17 +96,17 @@ def main() -> None:
             budget = chosen.budget or BUDGETS.get(name.removesuffix("_instance1"), 300)
             trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds)
             cost = trials.cost()
-            found = cost[np.isfinite(cost)]
-            told = ["-"] * 3
-            if len(found):
-                told = [f"{trials.mean_simulations:.1f}", f"{found.mean():.1f}"]
-                told.append(f"{np.median(found):.0f}")
-            sure = claimed(problem, trials)
+            finite = cost[np.isfinite(cost)]
+            counts = ["-"] * 3
+            if len(finite):
+                counts = [f"{trials.mean_simulations:.1f}", f"{finite.mean():.1f}"]
+                counts.append(f"{np.median(finite):.0f}")
+            confirmed = claimed(problem, trials)
             best = PUBLISHED.get(name, "") if search == "portfolio" else ""
             rate = f"{trials.falsified}/{chosen.seeds}"
-            line = " | ".join([name, search, rate, *told, sure, best])
+            line = " | ".join([name, search, rate, *counts, confirmed, best])
             print(f"| {line} |", flush=True)
-            # For whoever waits; not part of the table.
+            # Progress; not part of the table.
             print(f"<!-- {time.perf_counter() - began:.0f} s -->", flush=True)
 
 

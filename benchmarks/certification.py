@@ -1,4 +1,4 @@
-"""Certificates of many policies: how few samples name the safest, how often verdicts are wrong.
+"""Certificates of many policies: samples that name the safest, and the rate of wrong verdicts.
 
     python benchmarks/certification.py allocation [--runs 200]
     python benchmarks/certification.py verdicts [--runs 200]
@@ -35,7 +35,7 @@ TARGET = 0.95
 
 
 def uniform_need(rates, runs=4000, seed=1):
-    """Samples of each arm with which the least failures name a safest one in 95 % of runs."""
+    """Return the samples an arm with which the least failures name a safest one in 95 % of runs."""
     random = np.random.default_rng(seed)
 
     def success(n):
@@ -60,7 +60,7 @@ def bernoulli(rates, random):
 
 
 def races(rates, runs, draw_of=bernoulli, tie=0.001):
-    """How often the race named a safest arm, one within the tie, and its samples in each run."""
+    """Return how often the race named a safest arm, one within the tie, and its samples by run."""
     right, near, cost = [], [], []
     for run in range(runs):
         random = np.random.default_rng([7, run])
@@ -74,7 +74,7 @@ def races(rates, runs, draw_of=bernoulli, tie=0.001):
     return np.mean(right), np.mean(near), np.array(cost)
 
 
-def told(name, rates, runs, draw_of=bernoulli, tie=0.001):
+def compare(name, rates, runs, draw_of=bernoulli, tie=0.001):
     uniform = uniform_need(rates) * len(rates)
     right, near, cost = races(rates, runs, draw_of, tie)
     print(
@@ -86,7 +86,7 @@ def told(name, rates, runs, draw_of=bernoulli, tie=0.001):
 
 
 def verdicts_of(rates, random, p, budget, draw_of=bernoulli, samples=512):
-    """Verdicts of one run of the whole allocation, and its samples."""
+    """Return the verdicts of one run of the whole allocation, and its samples."""
     allocation, draw = Allocation(p=p, samples=samples, budget=budget), draw_of(rates, random)
     failures, simulations = np.zeros(len(rates), int), np.zeros(len(rates), int)
     while (blocks := allocation.next(failures, simulations)).any():
@@ -120,7 +120,7 @@ def count_wrong(name, rates, runs, p, draw_of=bernoulli):
 
 
 def trained(configurations):
-    """Policies of PPO with learning rates, discounts and seeds all over the place."""
+    """Train policies of PPO with many learning rates, discounts and seeds."""
     from envs.cartpole import CartPoleTask
     from verifai_jax.rl import PPO, BatchedTraining, Configuration
 
@@ -153,11 +153,11 @@ def policies(configurations, runs, heavy):
         found = certify(balance_with, some[:32])
         print(f"certify, {kind}: {time.perf_counter() - started:.1f} s")
     print(found)
-    pieces = Blocks(balance_with, some, seed=1, lanes=64)
-    asked = [(i, block) for i in range(len(some)) for block in range(heavy // 64)]
+    blocks = Blocks(balance_with, some, seed=1, lanes=64)
+    pairs = [(i, block) for i in range(len(some)) for block in range(heavy // 64)]
     failing = np.zeros((len(some), heavy), bool)
     started = time.perf_counter()
-    for (i, block), outcome in pieces.certificate(asked):
+    for (i, block), outcome in blocks.certificate(pairs):
         failing[i, block * 64 : (block + 1) * 64] = outcome.failing | ~outcome.proper
     seconds = time.perf_counter() - started
     print(f"{failing.size:,} samples in {seconds:.1f} s, {failing.size / seconds:,.0f} a second")
@@ -165,7 +165,7 @@ def policies(configurations, runs, heavy):
     print("rates, sorted:", np.round(np.sort(rates)[:16], 5), "...")
 
     def replayed(rates, random):
-        """What was sampled, in an order that is the same for all arms."""
+        """Return a draw from the samples, in an order that is the same for all arms."""
         order, taken = random.permutation(heavy), np.zeros(len(rates), int)
 
         def draw(arm, n):
@@ -176,7 +176,7 @@ def policies(configurations, runs, heavy):
         return draw
 
     for tie in (0.001, 0.0001):  # That of `certify` is the second, for 64 policies.
-        told("cart-pole", rates, runs, replayed, tie)
+        compare("cart-pole", rates, runs, replayed, tie)
     for p in (0.01, 0.05):
         count_wrong("cart-pole", rates, runs, p, replayed)
 
@@ -190,7 +190,7 @@ def main():
     given = parser.parse_args()
     if given.what == "allocation":
         for name, rates in PROFILES.items():
-            told(name, rates, given.runs)
+            compare(name, rates, given.runs)
     elif given.what == "verdicts":
         for name, rates in PROFILES.items():
             count_wrong(name, rates, given.runs, 0.01)

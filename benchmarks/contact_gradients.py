@@ -1,4 +1,4 @@
-"""How much the gradient of a simulation with contacts says about the simulation.
+"""The gradient of a simulation with contacts, compared with differences over finite steps.
 
     python -m benchmarks.contact_gradients
 

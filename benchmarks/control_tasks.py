@@ -58,7 +58,7 @@ class Pendulum:
 
 
 class Angles(NamedTuple):
-    """Of the inner link from hanging down, of the outer link from the inner one, and rates."""
+    """Angles of the inner link (0: hanging down) and of the outer one to it, and their rates."""
 
     inner: Scalar
     outer: Scalar
@@ -87,7 +87,7 @@ class Acrobot:
         """0.2 s, one step of Runge-Kutta."""
         torque = action.astype(jnp.float32) - 1.0
 
-        def slope(s: Angles) -> Angles:
+        def derivative(s: Angles) -> Angles:
             # Unit masses, lengths and moments of inertia; centres of mass in the middle.
             cos = jnp.cos(s.outer)
             d1 = 0.25 + (1 + 0.25 + cos) + 2.0
@@ -106,10 +106,10 @@ class Acrobot:
         def ahead(by: float, k: Angles) -> Angles:
             return jax.tree.map(lambda x, d: x + by * d, state, k)
 
-        k1 = slope(state)
-        k2 = slope(ahead(0.1, k1))
-        k3 = slope(ahead(0.1, k2))
-        k4 = slope(ahead(0.2, k3))
+        k1 = derivative(state)
+        k2 = derivative(ahead(0.1, k1))
+        k3 = derivative(ahead(0.1, k2))
+        k4 = derivative(ahead(0.2, k3))
         new = jax.tree.map(
             lambda x, a, b, c, d: x + 0.2 / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
         )

@@ -1,4 +1,4 @@
-"""What the engine does with real dynamics: speed, overhead, gradients, compile time.
+"""The engine on real dynamics: speed, overhead, gradients, compile time.
 
     python benchmarks/engine.py speed                   # physics steps/s, batch 1 to 4096
     python benchmarks/engine.py overhead                # over a bare jitted rollout and monitor
@@ -182,15 +182,15 @@ def cores():
         ratios = []
         for _ in range(5):
             all_cores, one = (
-                float(told(ONE_THROUGHPUT.format(cores=cores, problem=problem))[0])
+                float(printed_words(ONE_THROUGHPUT.format(cores=cores, problem=problem))[0])
                 for cores in (every, {min(every)})
             )
             ratios.append(all_cores / one)
         print(f"{problem:<18}{statistics.median(ratios):6.2f}", flush=True)
 
 
-def told(code, **environment):
-    """The words that a Python program prints, in a process of its own."""
+def printed_words(code, **environment):
+    """Return the words that a Python program prints, in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "PYTHONPATH": ".", **environment},
@@ -256,12 +256,12 @@ def compile_times():
     for name, (expression, gradient) in cases.items():
         with tempfile.TemporaryDirectory() as cache:
             code = ONE_COMPILE.format(name=expression, gradient=gradient)
-            cold, warm = (told(code, VERIFAI_JAX_CACHE=cache)[1] for _ in range(2))
+            cold, warm = (printed_words(code, VERIFAI_JAX_CACHE=cache)[1] for _ in range(2))
         print(f"{name:<36}cold {cold:>6}   warm {warm:>6}", flush=True)
 
 
 def native():
-    """A network 2 x 64 in the loop, against `mujoco.rollout` of the same steps without a policy."""
+    """Compare a network 2 x 64 in the loop with `mujoco.rollout` of the same steps without one."""
     from mujoco import rollout
 
     print("throughput of native simulations with a network 2 x 64 / of plain mujoco.rollout on the")
@@ -292,7 +292,7 @@ def native():
 
 
 def with_network(problem):
-    """The problem with a random tanh network of 2 x 64 in place of its controller; never ends."""
+    """Return the problem with a random tanh network of 2 x 64 as its controller; never ends."""
     import dataclasses
 
     system = problem.system
@@ -325,8 +325,8 @@ def backends():
             speeds[backend] = measured_speed(on, 1024) / physics_steps(on)
         choice = resolved(problem, batch=1024, budget=20_000)
         share = speeds[choice.backend] / max(speeds.values())
-        told = "  ".join(f"{backend} {figure:8,.0f}" for backend, figure in speeds.items())
-        print(f"{name:<12}{told}   auto: {choice.backend} {share:.2f}", flush=True)
+        columns = "  ".join(f"{backend} {figure:8,.0f}" for backend, figure in speeds.items())
+        print(f"{name:<12}{columns}   auto: {choice.backend} {share:.2f}", flush=True)
 
 
 PARTS = {

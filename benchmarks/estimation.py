@@ -1,4 +1,4 @@
-"""How right, and how sure, `estimate` is: closed forms through real problems, and AT6b.
+"""The accuracy of `estimate` and of its intervals: closed forms through real problems, and AT6b.
 
 python benchmarks/estimation.py                     # everything, 20 seeds: about 20 minutes
 python benchmarks/estimation.py --seeds 100 --dims 2 10 --levels 1e-6
@@ -135,7 +135,7 @@ def at6b(seeds: int, truth: int | None) -> None:
 
 
 def main() -> None:
-    """The table."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--budget", type=int, default=50_000)

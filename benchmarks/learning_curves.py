@@ -30,7 +30,7 @@ from verifai_jax.rl.task.task import Task
 
 @dataclass(frozen=True)
 class Curve:
-    """A task, an algorithm with settings that suit it, and what is to come of it.
+    """A task, an algorithm with settings that suit it, and the return to reach.
 
     - `steps`: of the environment, of each training.
     - `wanted`: the mean return over the seeds is to be at least this.

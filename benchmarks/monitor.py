@@ -1,4 +1,4 @@
-"""How fast the monitor is: beside `np.min` over the same array, and beside other monitors.
+"""The speed of the monitor, beside `np.min` over the same array, and beside other monitors.
 
     python benchmarks/monitor.py                      # T = 1000, batch 256: the goals
     python benchmarks/monitor.py --full               # T in 100, 1000, 10000; batch 1, 256, 4096
@@ -257,10 +257,10 @@ def main() -> None:
         for shape, semantics in itertools.product(SHAPES, SEMANTICS):
             m = measure(shape, semantics, length, batch, repeats)
             results.append(m)
-            judged = semantics == "hard" and (length, batch) == (1000, 256) and shape in GOALS
+            has_goal = semantics == "hard" and (length, batch) == (1000, 256) and shape in GOALS
             table.row(
                 shape, semantics, str(length), str(batch), f"{m.forward_ns:.2f}",
-                f"{m.to_min:.1f}", str(GOALS[shape]) if judged else "",
+                f"{m.to_min:.1f}", str(GOALS[shape]) if has_goal else "",
                 f"{m.gradient_ratio:.2f}", f"{m.compile_s:.2f}", f"{m.arrays:.1f}",
                 f"{m.gradient_arrays:.1f}",
             )  # fmt: skip

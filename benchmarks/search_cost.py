@@ -1,4 +1,4 @@
-"""What a search costs beside the simulations: microseconds of ask and tell for each point.
+"""The cost of a search beside the simulations: microseconds of ask and tell for each point.
 
     python benchmarks/search_cost.py [--searches bayes,bandit]
 
@@ -22,7 +22,7 @@ CUBE = Cube((0, 0, 0, 0))
 
 
 def rounds(search, batch, warm, count):
-    """Seconds of each round of ask and tell, after `warm` rounds."""
+    """Return the seconds of each round of ask and tell, after `warm` rounds."""
     init = jax.jit(search.init, static_argnums=(1, 2))
     ask = jax.jit(search.ask, static_argnums=(1, 2))
     tell = jax.jit(search.tell, static_argnums=1)
@@ -31,12 +31,13 @@ def rounds(search, batch, warm, count):
     for _ in range(warm + count):
         started = time.perf_counter()
         u, state = jax.block_until_ready(ask(state, CUBE, batch))
-        asked = time.perf_counter() - started
+        ask_seconds = time.perf_counter() - started
         gradient = 2 * (u - 0.3) if search.wants_gradient else None
-        told = jax.block_until_ready(Observations(u, rho(u), jnp.ones(batch, bool), gradient))
+        observations = Observations(u, rho(u), jnp.ones(batch, bool), gradient)
+        observations = jax.block_until_ready(observations)
         started = time.perf_counter()
-        state = jax.block_until_ready(tell(state, CUBE, told))
-        seconds.append(asked + time.perf_counter() - started)
+        state = jax.block_until_ready(tell(state, CUBE, observations))
+        seconds.append(ask_seconds + time.perf_counter() - started)
     return np.array(seconds[warm:])
 
 

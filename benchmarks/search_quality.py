@@ -56,8 +56,8 @@ def advance(search, rho, cube, batch, rounds, state):
         u, state = search.ask(state, cube, batch)
         value = jax.vmap(rho)(u)
         gradient = jax.vmap(jax.grad(rho))(u) if search.wants_gradient else None
-        told = Observations(u, value, jnp.ones(batch, bool), gradient)
-        return search.tell(state, cube, told), value
+        observations = Observations(u, value, jnp.ones(batch, bool), gradient)
+        return search.tell(state, cube, observations), value
 
     def one(state):
         state, values = jax.lax.scan(step, state, None, length=rounds)
@@ -83,7 +83,7 @@ def first_failures(search, landscape, batch, seeds):
 
 
 def on_landscapes(options):
-    """One line a search: how many times fewer simulations than uniform sampling, by landscape."""
+    """Print a line a search: how many times fewer simulations than uniform sampling it needs."""
     chosen = options.landscapes.split(",") if options.landscapes else list(LANDSCAPES)
     print(f"{options.seeds} seeds; median simulations to the first failure, and uniform / it")
     print(f"{'':<19}" + "".join(f"{name:>16}" for name in chosen))

@@ -63,7 +63,7 @@ def numpy_round(u, dtype, batch):
 
 
 def best_numpy_batch(u, dtype):
-    """The batch size at which NumPy is fastest here."""
+    """Return the batch size at which NumPy is fastest here."""
     sizes = [512, 1024, 2048, 4096, 8192, 16384, 32768]
     seconds = {
         size: min(numpy_round(u, dtype, size) for _ in range(3)) for size in sizes if size <= len(u)

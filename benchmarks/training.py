@@ -6,8 +6,8 @@
 
 Both have two hidden layers of 64 tanh units, 8 environments x 128 steps an update, 4 epochs of 4
 minibatches (256 rows). The two take turns; the ratio is the median over the rounds. Ours is
-measured with its program compiled (what compiling costs is told apart), theirs after a first call
-that warms it up. `--threads 1` holds torch to one thread, which takes it much less CPU time than
+measured with its program compiled (compiling is reported apart), theirs after a first call that
+warms it up. `--threads 1` holds torch to one thread, which takes it much less CPU time than
 its own choice of one a core. What each has learnt after the same number of steps is the mean return
 of the likeliest actions over 100 and over 20 episodes.
 """
@@ -29,7 +29,7 @@ Training = Callable[[int], tuple[float, float]]
 
 
 def ours(task_name: str) -> Training:
-    """A training by seed; returns CPU seconds and the mean return of what it learnt."""
+    """Return our training by seed, which gives CPU seconds and the mean return of its policy."""
     from envs.cartpole import CartPoleTask
     from verifai_jax.rl import PPO, evaluate, train
 
@@ -61,7 +61,7 @@ def ours(task_name: str) -> Training:
 
 
 def theirs(task_name: str, threads: int | None) -> Training:
-    """The same with stable-baselines3."""
+    """Return the same with stable-baselines3."""
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
