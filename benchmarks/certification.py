@@ -157,8 +157,8 @@ def policies(configurations, runs, heavy):
     pairs = [(i, block) for i in range(len(some)) for block in range(heavy // 64)]
     failing = np.zeros((len(some), heavy), bool)
     started = time.perf_counter()
-    for (i, block), outcome in blocks.certificate(pairs):
-        failing[i, block * 64 : (block + 1) * 64] = outcome.failing | ~outcome.proper
+    for (i, block), verdicts in blocks.certificate(pairs):
+        failing[i, block * 64 : (block + 1) * 64] = verdicts.violated | ~verdicts.proper
     seconds = time.perf_counter() - started
     print(f"{failing.size:,} samples in {seconds:.1f} s, {failing.size / seconds:,.0f} a second")
     rates = failing.mean(axis=1)

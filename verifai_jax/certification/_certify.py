@@ -90,10 +90,10 @@ def certify(
     budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
     lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
     enable_compile_cache()  # Before the search compiles, too.
-    pieces = Blocks(
+    blocks = Blocks(
         problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
     )
-    attacker = check_attack(pieces.problem, attack)
+    attacker = check_attack(blocks.problem, attack)
     rounds = -(-attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
@@ -103,20 +103,20 @@ def certify(
     report = _Report(progress, len(policies) * rounds * lanes, budget)
     stopped, margins = "decided", np.full(len(policies), np.nan)
     try:
-        attack_policies(pieces, attacked, attacker, rounds, report.attacked)
+        attack_policies(blocks, attacked, attacker, rounds, report.attacked)
         margins = np.array([one.least for one in attacked])
-        stopped = _sample(pieces, sampled, allocation, margins, report)
+        stopped = _sample(blocks, sampled, allocation, margins, report)
     except KeyboardInterrupt:
         stopped = "interrupted"
     rows = tuple(
-        _certificate(number, sampled[number], attacked[number], allocation, len(policies), pieces)
+        _certificate(number, sampled[number], attacked[number], allocation, len(policies), blocks)
         for number in range(len(policies))
     )
     known = all(row.simulations for row in rows)
     now = find_leader(*_counts(sampled), tie, margins) if known else None
     return Certificates(
         rows=rows,
-        problem=pieces.problem.name,
+        problem=blocks.problem.name,
         p=p,
         confidence=confidence,
         safest=None if now is None else now.number,
@@ -127,12 +127,12 @@ def certify(
         budget=budget,
         stopped=stopped,
         seconds=time.perf_counter() - started,
-        notes=pieces.notes,
+        notes=blocks.notes,
     )
 
 
 def _sample(
-    pieces: Blocks,
+    blocks: Blocks,
     sampled: list[PolicyRecord],
     allocation: Allocation,
     margins: np.ndarray,
@@ -141,27 +141,27 @@ def _sample(
     """Simulate what the allocation asks for until it asks for nothing; says why it ended."""
     while True:
         failures, simulations = _counts(sampled)
-        blocks = allocation.next(failures, simulations, margins)
-        if not blocks.any():
+        wanted = allocation.next(failures, simulations, margins)
+        if not wanted.any():
             break
         undecided = int(allocation.undecided(failures, simulations).sum())
-        asked = [
-            (number, len(sampled[number].outcomes) + block)
+        chosen = [
+            (number, len(sampled[number].verdicts) + block)
             for number in range(len(sampled))
-            for block in range(int(blocks[number]))
+            for block in range(int(wanted[number]))
         ]
-        for (number, block), outcome in pieces.certificate(asked):
-            sampled[number].add(pieces.points(block), outcome)
-            report.sampled(pieces.lanes, undecided)
+        for (number, block), verdicts in blocks.certificate(chosen):
+            sampled[number].add(blocks.points(block), verdicts)
+            report.sampled(blocks.lanes, undecided)
     open_ = allocation.undecided(failures, simulations).any()
     named = find_leader(failures, simulations, allocation.tie, margins).chance >= allocation.sure
     return "decided" if named and not open_ else "budget"
 
 
-def _counts(seen: list[PolicyRecord]) -> tuple[np.ndarray, np.ndarray]:
+def _counts(records: list[PolicyRecord]) -> tuple[np.ndarray, np.ndarray]:
     """Count the failures of each policy, those without a verdict included, and simulations."""
-    failures = np.array([one.failures + one.not_finite for one in seen])
-    return failures, np.array([one.simulations for one in seen])
+    failures = np.array([one.failures + one.not_finite for one in records])
+    return failures, np.array([one.simulations for one in records])
 
 
 def _certificate(
@@ -170,13 +170,13 @@ def _certificate(
     attacked: PolicyRecord,
     allocation: Allocation,
     among: int,
-    pieces: Blocks,
+    blocks: Blocks,
 ) -> Certificate:
     rate = None
     if sampled.simulations:
         failing = sampled.failures + sampled.not_finite
         rate = simultaneous_interval(failing, sampled.simulations, allocation.confidence, among)
-    worst, features, counterexamples = _worst_rows(pieces.space, (sampled, attacked))
+    worst, features, counterexamples = _worst_rows(blocks.space, (sampled, attacked))
     return Certificate(
         number=number,
         failures=sampled.failures,
@@ -196,13 +196,13 @@ def _worst_rows(
     space: FeatureSpace, both: Sequence[PolicyRecord]
 ) -> tuple[float, Any, dict[str, np.ndarray]]:
     """Return the least robustness, its features, and the worst failing rows."""
-    points = [u for seen in both for u in seen.points]
+    points = [u for record in both for u in record.points]
     if not points:
         return float("nan"), None, {}
     u = np.concatenate(points)
-    outcomes = [outcome for seen in both for outcome in seen.outcomes]
-    rho = np.concatenate([outcome.rho for outcome in outcomes])
-    failing = np.concatenate([outcome.failing for outcome in outcomes])
+    verdicts = [each for record in both for each in record.verdicts]
+    rho = np.concatenate([each.least for each in verdicts])
+    failing = np.concatenate([each.violated for each in verdicts])
     order = np.argsort(rho, kind="stable")  # NaN come last.
     kept = order[failing[order]][:MOST_KEPT]
     shown = np.concatenate([order[:1], kept])

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.certification.blocks import Blocks
-from verifai_jax.certification.simulators import Outcome
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -25,29 +25,32 @@ from verifai_jax.search.proposals import Proposals
 
 @dataclass(eq=False)
 class PolicyRecord:
-    """The simulations of one policy: points, outcomes and counts.
+    """The simulations of one policy: points, verdicts and counts.
 
-    `failures` ended properly and break a formula; `not_finite` have no verdict.
+    - `points`, `verdicts`: of each block.
+    - `simulations`: of all blocks.
+    - `failures`: simulations that violate the property.
+    - `not_finite`: simulations without a verdict.
     """
 
     points: list[Float[np.ndarray, "n d"]] = field(default_factory=list)
-    outcomes: list[Outcome] = field(default_factory=list)
+    verdicts: list[Verdicts] = field(default_factory=list)
     simulations: int = 0
     failures: int = 0
     not_finite: int = 0
 
-    def add(self, points: Float[np.ndarray, "n d"], outcome: Outcome) -> None:
+    def add(self, points: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
         """Add one block."""
         self.points.append(points)
-        self.outcomes.append(outcome)
+        self.verdicts.append(verdicts)
         self.simulations += len(points)
-        self.failures += int(np.sum(outcome.failing))
-        self.not_finite += int(np.sum(~outcome.proper))
+        self.failures += int(np.sum(verdicts.violated))
+        self.not_finite += int(np.sum(~verdicts.proper))
 
     @property
     def least(self) -> float:
         """The least robustness; NaN where nothing had a verdict."""
-        values = [outcome.rho[outcome.proper] for outcome in self.outcomes]
+        values = [verdicts.least[verdicts.proper] for verdicts in self.verdicts]
         return float(min((np.min(rho) for rho in values if len(rho)), default=np.nan))
 
 
@@ -73,7 +76,7 @@ def _needs_gradients(name: str) -> bool:
 
 
 def attack_policies(
-    pieces: Blocks,
+    blocks: Blocks,
     records: list[PolicyRecord],
     search: Search,
     rounds: int,
@@ -81,26 +84,32 @@ def attack_policies(
 ) -> None:
     """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
+    **Arguments:**
+
+    - `blocks`: simulates the policies.
+    - `records`: one of each policy.
+    - `search`: the search of each policy.
+    - `rounds`: blocks of each policy.
     - `report(simulations)`: called after each block, for the progress.
     """
     attackers = [
         Proposals(
-            search, pieces.space.cube, pieces.lanes, pieces.attack_key, pieces.space.constraint
+            search, blocks.space.cube, blocks.lanes, blocks.attack_key, blocks.space.constraint
         )
         for _ in records
     ]
     for round_ in range(rounds):
-        asked = []
+        chosen = []
         for number, attacker in enumerate(attackers):
             if attacker.exhausted:
                 continue
-            points = np.asarray(attacker.next(pieces.lanes), np.float32)
+            points = np.asarray(attacker.next(blocks.lanes), np.float32)
             if len(points):
-                asked.append((number, points))
+                chosen.append((number, points))
             else:
                 attacker.tell_refused()
-        for place, outcome in pieces.attack(asked, round_, repr(search)):
-            number, points = asked[place]
-            records[number].add(points, outcome)
-            attackers[number].tell(outcome.rho, outcome.proper, None)
+        for place, verdicts in blocks.attack(chosen, round_, repr(search)):
+            number, points = chosen[place]
+            records[number].add(points, verdicts)
+            attackers[number].tell(verdicts.least, verdicts.proper, None)
             report(len(points))

@@ -1,11 +1,11 @@
 """Blocks of simulations by name: computed together, remembered one by one.
 
-    pieces = Blocks(problem_of, policies, seed=0, lanes=64, remember=store.remember)
-    for (policy, block), outcome in pieces.certificate([(0, 0), (0, 1), (5, 0)]):
+    blocks = Blocks(problem_of, policies, seed=0, lanes=64, remember=store.remember)
+    for (policy, block), verdicts in blocks.certificate([(0, 0), (0, 1), (5, 0)]):
         ...
 
 A piece is one policy in one block of samples. Its name holds all that its numbers depend on, so
-whatever is asked for, in whatever order, a memo gives what a simulation would.
+whatever is chosen for, in whatever order, a memo gives what a simulation would.
 """
 
 import hashlib
@@ -18,12 +18,13 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.certification.policy_groups import digest, group_policies
 from verifai_jax.certification.simulators import (
-    Outcome,
     SeparateSimulators,
     Simulator,
     problem_with,
     shared_simulator,
 )
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.search.uniform import uniform_points
@@ -140,71 +141,64 @@ class Blocks:
         return tuple(notes)
 
     def certificate(
-        self, asked: Sequence[tuple[int, int]]
-    ) -> Iterator[tuple[tuple[int, int], Outcome]]:
-        """Yield outcomes of `(policy, block)` pairs, in fresh samples of the prior."""
-        pieces = []
-        for policy, block in asked:
-            first = block * self.lanes
-            points = self.points(block)
-            name = f"{self._about}/sample/{self._digests[policy]}/{block}"
-            pieces.append(Block(policy, points, first, name))
-        for i, outcome in self._outcomes(pieces, self._simulation_key):
-            yield asked[i], outcome
+        self, chosen: Sequence[tuple[int, int]]
+    ) -> Iterator[tuple[tuple[int, int], Verdicts]]:
+        """Yield verdicts of `(policy, block)` pairs, in fresh samples of the prior."""
+        blocks = []
+        for policy, number in chosen:
+            first = number * self.lanes
+            points = self.points(number)
+            name = f"{self._about}/sample/{self._digests[policy]}/{number}"
+            blocks.append(Block(policy, points, first, name))
+        for i, verdicts in self._verdicts(blocks, self._simulation_key):
+            yield chosen[i], verdicts
 
     def attack(
-        self, asked: Sequence[tuple[int, np.ndarray]], round_: int, search: str
-    ) -> Iterator[tuple[int, Outcome]]:
-        """Yield outcomes of points that a search chose for each policy, by places in `asked`."""
-        pieces = [
+        self, chosen: Sequence[tuple[int, np.ndarray]], round_: int, search: str
+    ) -> Iterator[tuple[int, Verdicts]]:
+        """Yield verdicts of points that a search chose for each policy, by places in `chosen`."""
+        blocks = [
             Block(
                 policy, points, round_ * self.lanes,
                 f"{self._about}/attack/{search}/{self._digests[policy]}/{round_}",
             )
-            for policy, points in asked
+            for policy, points in chosen
         ]  # fmt: skip
-        yield from self._outcomes(pieces, self._attacked_key)
+        yield from self._verdicts(blocks, self._attacked_key)
 
     def points(self, block: int) -> Float[np.ndarray, "lanes d"]:
         """Return the samples of one block of the held-out stream, which all policies share."""
         return self._samples(block * self.lanes, self.lanes)
 
-    def _outcomes(self, pieces: list[Block], key: Any) -> Iterator[tuple[int, Outcome]]:
+    def _verdicts(self, blocks: list[Block], key: Any) -> Iterator[tuple[int, Verdicts]]:
         # Those of one program after another.
-        order = sorted(range(len(pieces)), key=lambda i: self._owner[pieces[i].policy])
-        ready: dict[int, Outcome] = {}
+        order = sorted(range(len(blocks)), key=lambda i: self._owner[blocks[i].policy])
+        ready: dict[int, Verdicts] = {}
         for place, i in enumerate(order):
-            piece = pieces[i]
+            block = blocks[i]
 
             def compute(place: int = place, i: int = i) -> dict[str, np.ndarray]:
                 if i not in ready:
-                    owner = self._owner[pieces[i].policy]
+                    owner = self._owner[blocks[i].policy]
                     simulator, _ = self._simulators[owner]
                     most = simulator.blocks_per_call()
                     some = [
                         j
                         for j in order[place : place + most]
-                        if self._owner[pieces[j].policy] == owner and j not in ready
+                        if self._owner[blocks[j].policy] == owner and j not in ready
                     ]
-                    found = self._simulate(owner, [pieces[j] for j in some], key)
+                    found = self._simulate(owner, [blocks[j] for j in some], key)
                     ready.update(zip(some, found, strict=True))
-                return ready.pop(i)._asdict()
+                return _to_memo(ready.pop(i))
 
-            known = self._remember(piece.name, compute)
-            count = len(piece.points)
-            outcome = Outcome(
-                np.asarray(known["rho"], np.float32)[:count],
-                np.asarray(known["failing"], bool)[:count],
-                np.asarray(known["proper"], bool)[:count],
-            )
-            yield i, outcome
+            yield i, _from_memo(self._remember(block.name, compute), len(block.points))
 
-    def _simulate(self, owner: int, pieces: list[Block], key: Any) -> list[Outcome]:
+    def _simulate(self, owner: int, blocks: list[Block], key: Any) -> list[Verdicts]:
         simulator, places = self._simulators[owner]
-        self.simulated += len(pieces)
-        u = np.stack([_fill_block(piece.points, self.lanes) for piece in pieces])
-        members = [places[piece.policy] for piece in pieces]
-        first = np.array([piece.first for piece in pieces], np.int32)
+        self.simulated += len(blocks)
+        u = np.stack([_fill_block(block.points, self.lanes) for block in blocks])
+        members = [places[block.policy] for block in blocks]
+        first = np.array([block.first for block in blocks], np.int32)
         return simulator(members, u, first, key)
 
     def _traceable(self, problem_of: Any, policy: Any, numbers: tuple[int, ...]) -> bool:
@@ -255,6 +249,21 @@ class _Samples:
 
     def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         return np.asarray(self._space.accepts_points(u))
+
+
+def _to_memo(verdicts: Verdicts) -> dict[str, np.ndarray]:
+    least = np.where(verdicts.proper, verdicts.least, np.nan).astype(np.float32)
+    return {"rho": least, "failing": verdicts.violated, "proper": verdicts.proper}
+
+
+def _from_memo(known: Arrays, count: int) -> Verdicts:
+    """Return the verdicts of a block's first `count` rows, with the least formula's robustness."""
+    proper = np.asarray(known["proper"], bool)[:count]
+    return Verdicts(
+        rho=np.asarray(known["rho"], np.float32)[:count, None],
+        status=np.where(proper, Status.OK, Status.NONFINITE).astype(np.int32),
+        violated=np.asarray(known["failing"], bool)[:count],
+    )
 
 
 def _checked_problem(problem_of: Callable[[Any], Problem], policy: Any, number: int) -> Problem:

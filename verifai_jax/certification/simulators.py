@@ -13,42 +13,25 @@ not on the other blocks or the number of devices.
 import time
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.certification.policy_groups import PolicyGroup
-from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
-from verifai_jax.core.keys import simulation_key
-from verifai_jax.core.trace import Status
+from verifai_jax.core.devices import Device, enable_compile_cache, spread_over_devices
+from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.evaluation.engine import Engine, Mode
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.streaming_monitor import streaming_monitor
-from verifai_jax.evaluation.verdicts import (
-    boolean_semantics,
-    trace_verdict,
-    violations,
-)
+from verifai_jax.evaluation.verdicts import Verdicts, violations
 from verifai_jax.problem.problem import Problem
 
 MOST_BLOCKS = 64
 """Blocks of a device in one call at most."""
 SLICE_SECONDS = 1.0
-"""How long a call lasts at most, about: between calls one can stop."""
-
-
-class Outcome(NamedTuple):
-    """The outcome of one block, on the host.
-
-    - `rho`: the least formula's hard robustness; NaN where there is no verdict.
-    - `failing`: ended properly and breaks a formula; `proper`: ended properly.
-    """
-
-    rho: Float[np.ndarray, " lanes"]
-    failing: Bool[np.ndarray, " lanes"]
-    proper: Bool[np.ndarray, " lanes"]
+"""Seconds that a call lasts at most, about: between calls one can stop."""
 
 
 class Simulator(Protocol):
@@ -62,11 +45,15 @@ class Simulator(Protocol):
         points: Float[np.ndarray, "blocks lanes d"],
         first: Int[np.ndarray, " blocks"],
         key: Key[Array, ""],
-    ) -> list[Outcome]:
-        """Outcomes of the blocks, in order.
+    ) -> list[Verdicts]:
+        """Return the verdicts of the blocks, in order.
+
+        **Arguments:**
 
         - `members`: of each block the policy, by its place in the group.
+        - `points`: the samples of each block.
         - `first`: of each block the number of its first sample, which its random keys come from.
+        - `key`: of all simulations.
         """
         ...
 
@@ -75,7 +62,7 @@ class Simulator(Protocol):
         ...
 
 
-def problem_with(problem_of: Callable[[Any], Problem], policy: Any) -> Problem:
+def problem_with(problem_of: Callable[[Any], Problem], policy: PyTree) -> Problem:
     """Return the problem of one policy, whose weights JAX may be tracing."""
     # What does not depend on the weights is computed now, so that checks of it can be made.
     with jax.ensure_compile_time_eval():
@@ -92,21 +79,33 @@ class SharedSimulator:
 
     def __init__(self, program: "_Program", group: PolicyGroup) -> None:
         self.lanes = program.lanes
-        self._program, self._family = program, group
+        self._program, self._group = program, group
 
     def blocks_per_call(self) -> int:
         return self._program.blocks_per_call()
 
-    def __call__(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
-        outcomes: list[Outcome] = []
+    def __call__(
+        self,
+        members: Sequence[int],
+        points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"],
+        key: Key[Array, ""],
+    ) -> list[Verdicts]:
+        verdicts: list[Verdicts] = []
         most = self._program.capacity * len(self._program.devices)
         for start in range(0, len(members), most):
             part = slice(start, start + most)
-            outcomes += self._call(members[part], points[part], first[part], key)
-        return outcomes
+            verdicts += self._call(members[part], points[part], first[part], key)
+        return verdicts
 
-    def _call(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
-        policies = [self._family.weights[member] for member in members]
+    def _call(
+        self,
+        members: Sequence[int],
+        points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"],
+        key: Key[Array, ""],
+    ) -> list[Verdicts]:
+        policies = [self._group.weights[member] for member in members]
         rho, status = self._program("evaluate", policies, points, first, key)
         flat = rho.reshape(-1, rho.shape[2])
 
@@ -118,9 +117,7 @@ class SharedSimulator:
             return every.reshape(flat.shape)
 
         violated = violations(flat, status.ravel(), holds).reshape(status.shape)
-        proper = status == Status.OK
-        least = np.where(proper, np.min(rho, axis=2), np.nan).astype(np.float32)
-        return [Outcome(*block) for block in zip(least, violated, proper, strict=True)]
+        return [Verdicts(*block) for block in zip(rho, status, violated, strict=True)]
 
 
 def shared_simulator(
@@ -128,9 +125,9 @@ def shared_simulator(
     group: PolicyGroup,
     lanes: int,
     dim: int,
-    devices: Sequence[Any] | None = None,
+    devices: Sequence[Device] | None = None,
 ) -> SharedSimulator:
-    """Return the simulator of a group; its programs live as long as `problem_of` is in use."""
+    """Return the simulator of a group; programs are kept as long as `problem_of` is in use."""
     where = tuple(jax.local_devices() if devices is None else devices)
     try:
         program = _known_program(problem_of, group.structure, lanes, dim, where)
@@ -141,28 +138,32 @@ def shared_simulator(
 
 @lru_cache(maxsize=16)
 def _known_program(
-    problem_of: Any, structure: str, lanes: int, dim: int, devices: tuple[Any, ...]
+    problem_of: Callable[[Any], Problem],
+    structure: str,
+    lanes: int,
+    dim: int,
+    devices: tuple[Device, ...],
 ) -> "_Program":
     return _Program(problem_of, lanes, dim, devices)
 
 
 class _Program:
-    """What is compiled for one structure: blocks in, robustness and status out."""
+    """The compiled programs of one structure: blocks in, robustness and status out."""
 
     def __init__(
         self,
         problem_of: Callable[[Any], Problem],
         lanes: int,
         dim: int,
-        devices: tuple[Any, ...],
+        devices: tuple[Device, ...],
     ) -> None:
         self.problem_of, self.lanes, self.dim, self.devices = problem_of, lanes, dim, devices
         self.capacity = MOST_BLOCKS
         self._seconds: float | None = None  # Of a block, on one device.
-        self._executables: dict[str, Any] = {}
+        self._executables: dict[Mode, jax.stages.Compiled] = {}
 
     def blocks_per_call(self) -> int:
-        """Blocks in a call that lasts about `SLICE_SECONDS`; few at first."""
+        """Return the blocks of a call that lasts about `SLICE_SECONDS`; only some at first."""
         if not _one_by_one(self.devices):
             return self.capacity * len(self.devices)
         if self._seconds is None:
@@ -171,9 +172,14 @@ class _Program:
         return each * len(self.devices)
 
     def __call__(
-        self, mode: str, policies: Sequence[Any], points: Any, first: Any, key: Any
+        self,
+        mode: Mode,
+        policies: Sequence[PyTree],
+        points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"],
+        key: Key[Array, ""],
     ) -> list[np.ndarray]:
-        """Results `[blocks, lanes, ...]` of as many blocks as there are policies."""
+        """Return results `[blocks, lanes, ...]` of as many blocks as there are policies."""
         count, devices = len(policies), len(self.devices)
         share = -(-count // devices)
         # Device i works on blocks i * share and following, which lie at the start of its part.
@@ -192,7 +198,7 @@ class _Program:
         self._seconds = (time.perf_counter() - began) / share
         return results
 
-    def _executable(self, mode: str, policy: Any) -> Any:
+    def _executable(self, mode: Mode, policy: PyTree) -> jax.stages.Compiled:
         if mode not in self._executables:
             enable_compile_cache()
             whole = len(self.devices) * self.capacity
@@ -203,32 +209,22 @@ class _Program:
                 jax.ShapeDtypeStruct((whole, self.lanes, self.dim), jnp.float32),
                 jax.ShapeDtypeStruct((whole,), jnp.int32),
                 jax.ShapeDtypeStruct((len(self.devices),), jnp.int32),
-                jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32")),
+                jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION)),
             )
             self._executables[mode] = jax.jit(self._traced(mode)).lower(*arguments).compile()
         return self._executables[mode]
 
-    def _traced(self, mode: str) -> Any:
-        def row(problem: Problem) -> Any:
-            monitor = streaming_monitor(problem) if mode == "evaluate" else None
-
-            def one(u: Array, key: Array) -> Any:
-                features = problem.space.unflatten(u)
-                if monitor is not None:
-                    return monitor(features, key)
-                trace = problem.system(features, key)
-                if mode == "holds":
-                    return (boolean_semantics(problem, trace),)
-                return trace_verdict(problem, trace)
-
-            return one
-
-        def on_device(weights: Any, u: Array, first: Array, count: Array, key: Array) -> Any:
-            def block(i: Any) -> Any:
+    def _traced(self, mode: Mode) -> Callable[..., PyTree]:
+        def on_device(weights: PyTree, u: Array, first: Array, count: Array, key: Array) -> PyTree:
+            def block(i: Array) -> PyTree:
                 policy = jax.tree.map(lambda leaf: leaf[i], weights)
                 numbers = first[i] + jnp.arange(self.lanes, dtype=jnp.int32)
                 keys = jax.vmap(partial(simulation_key, key))(numbers)
-                return jax.vmap(row(problem_with(self.problem_of, policy)))(u[i], keys)
+                engine = Engine(problem_with(self.problem_of, policy), self.lanes)
+                if mode == "holds":
+                    return (jax.vmap(engine.row_holds)(u[i], keys),)
+                rows = jax.vmap(engine.row, in_axes=(0, 0, None))(u[i], keys, jnp.float32(1.0))
+                return rows.rho, rows.status
 
             if not _one_by_one(self.devices):
                 return jax.vmap(block)(jnp.arange(self.capacity))
@@ -237,7 +233,7 @@ class _Program:
                 lambda leaf: jnp.zeros((self.capacity, *leaf.shape), leaf.dtype), form
             )
 
-            def step(i: Any, results: Any) -> Any:
+            def step(i: Array, results: PyTree) -> PyTree:
                 return jax.tree.map(lambda all_, one: all_.at[i].set(one), results, block(i))
 
             return jax.lax.fori_loop(0, count[0], step, results)
@@ -245,13 +241,15 @@ class _Program:
         return spread_over_devices(on_device, (True, True, True, True, False), self.devices)
 
 
-def _one_by_one(devices: Sequence[Any]) -> bool:
-    """Whether a block keeps a device busy. An accelerator works on all blocks of a call at once."""
+def _one_by_one(devices: Sequence[Device]) -> bool:
+    """Return whether a block keeps a device busy; an accelerator works on all blocks at once."""
     return devices[0].platform == "cpu"
 
 
-def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
-    """Return `whole` rows: the given ones at these places, the first of them elsewhere."""
+def _spread(
+    rows: ArrayLike | Sequence[ArrayLike], places: Int[np.ndarray, " n"], whole: int
+) -> np.ndarray:
+    """Return an array of `whole` rows with these at their places, and the first one elsewhere."""
     given = np.asarray(rows)
     spread = np.empty((whole, *given.shape[1:]), given.dtype)
     spread[:] = given[0]
@@ -260,7 +258,7 @@ def _spread(rows: Any, places: Int[np.ndarray, " n"], whole: int) -> np.ndarray:
 
 
 class SeparateSimulators:
-    """Each policy by itself: for systems out of JAX's sight, and code that needs the numbers."""
+    """Simulators of each policy by itself, for host systems and code that needs the numbers."""
 
     def __init__(self, problems: Sequence[Problem], lanes: int) -> None:
         self.lanes = lanes
@@ -271,16 +269,20 @@ class SeparateSimulators:
     def blocks_per_call(self) -> int:
         return 1
 
-    def __call__(self, members: Any, points: Any, first: Any, key: Any) -> list[Outcome]:
-        outcomes = []
+    def __call__(
+        self,
+        members: Sequence[int],
+        points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"],
+        key: Key[Array, ""],
+    ) -> list[Verdicts]:
+        verdicts = []
         for member, u, number in zip(members, points, first, strict=True):
             if member not in self._evaluators:
                 self._evaluators[member] = Evaluator(self._problems[member], self.lanes)
-            engine = self._evaluators[member].engine
-            verdicts = engine.evaluate(u, key, int(number))
-            told = next((message for message in verdicts.messages or () if message), None)
-            if told is not None:
-                self.messages.setdefault(member, told)
-            least = np.where(verdicts.proper, verdicts.least, np.nan).astype(np.float32)
-            outcomes.append(Outcome(least, verdicts.violated, verdicts.proper))
-        return outcomes
+            evaluated = self._evaluators[member].engine.evaluate(u, key, int(number))
+            message = next((message for message in evaluated.messages or () if message), None)
+            if message is not None:
+                self.messages.setdefault(member, message)
+            verdicts.append(evaluated)
+        return verdicts

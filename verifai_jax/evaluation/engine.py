@@ -228,7 +228,7 @@ class Engine:
     def _trace(self, mode: Mode) -> jax.stages.Traced:
         if mode in self._traced:
             return self._traced[mode]
-        one_row = {"evaluate": self.row, "holds": self._holds}[mode]
+        one_row = {"evaluate": self.row, "holds": self.row_holds}[mode]
         key = jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
         first = jax.ShapeDtypeStruct((), jnp.int32)
         leading = () if self.alone else (self.padded,)
@@ -342,9 +342,14 @@ class Engine:
             more["clause_gradients"] = jnp.pad(derivatives, ((0, missing), (0, 0))).astype(dtype)
         return Row(rho.astype(dtype), status, features, more)
 
-    def _holds(
-        self, row: PyTree, key: Array, temperature: Array, shared: PyTree
+    def row_holds(
+        self,
+        row: PyTree,
+        key: Key[Array, ""],
+        temperature: Float[Array, ""] | float = 1.0,
+        shared: PyTree = (),
     ) -> Bool[Array, " formulas"]:
+        """Return the Boolean semantics of one row under `jax.vmap`, in a caller's program."""
         coordinates = self.inputs.coordinates(row, shared, self.precision)
         features, system = self.inputs.simulated(coordinates, row, shared)
         return boolean_semantics(self.problem, system(features, key))

@@ -131,7 +131,7 @@ class Problem:
         return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
 
     def on_backend(self, backend: str) -> "Problem":
-        """Return the same problem on one backend of its system, made once, with its programs.
+        """Return the same problem on one backend of its system, made once.
 
         A problem whose system has no backends, or is on this one already, is itself.
 
@@ -145,7 +145,7 @@ class Problem:
         )
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
-        """Return the problem with these features varied alone, the others at their nominal values.
+        """Return the same problem with these features varied alone, others at nominal values.
 
         - `nominal`: values to fix the others at, where they differ from the problem's own.
 
