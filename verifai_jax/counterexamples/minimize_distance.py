@@ -1,6 +1,7 @@
 """The nearest failure to nominal over given features, in batches along the failure boundary.
 
-    points = minimize_distance(candidates, starts, rng)  # failing, none farther than its start
+    points = minimize_distance(candidates, starts, rng, keep_nominal=True)
+                                                # failing, none farther than its start
 
 Each round a batch of candidates for each point that is followed:
 

@@ -2,7 +2,7 @@
 
     CubePoints(problem)                                 # points of the unit cube
     TableRows(refiner, formats)                         # features of a table, at a finer step
-    WithParameters(problem, restore, system_of, start)  # points, and parameters that all share
+    WithParameters(problem, size, system_of)            # points, and parameters that all share
 
 An engine compiles one program for each kind of inputs; everything else about it is the same.
 """
