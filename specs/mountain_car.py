@@ -107,7 +107,7 @@ def trained_on(size: float) -> MountainCarTask:
 
 
 # The paper's study: which algorithm, and how large a training set, gives a network that climbs the
-# hill? The sizes are snapshots of one training, so they cost nothing beside the largest.
+# hill? The sizes are checkpoints of one training, so they cost nothing beside the largest.
 safe_training = vj.Study(
     "safe_training",
     vj.FeatureSpace(
@@ -133,7 +133,7 @@ safe_training = vj.Study(
         nominal=MountainCarTask(),
     ),
     climb_with,
-    snapshots=(8_192, 16_384, 32_768, 65_536),
+    checkpoints=(8_192, 16_384, 32_768, 65_536),
     seeds=2,
     p=0.01,
     description="which algorithm, shaping and training-set size give a policy that climbs the hill",

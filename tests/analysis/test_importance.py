@@ -17,8 +17,8 @@ def test_influence_is_found(found):
     rest = found.table.loc[["y", "lanes", "same"], ["failing", "rho"]]
     assert rest.abs().to_numpy().max() < 0.02
     assert found.table.loc["x", "failing"] > 0.2
-    assert found.trusted("failing")
-    assert found.trusted("rho")
+    assert found.is_reliable("failing")
+    assert found.is_reliable("rho")
     assert found.scores["failing"] > 0.98
     words = str(found).splitlines()
     assert words[0].startswith("failing depends on x (")
@@ -50,8 +50,8 @@ def test_noise_means_nothing():
     frame["rho"] = g.normal(size=1000)
     frame["violated"] = g.random(1000) < 0.4
     found = importance(frame)
-    assert not found.trusted("failing")
-    assert not found.trusted("rho")
+    assert not found.is_reliable("failing")
+    assert not found.is_reliable("rho")
     assert str(found).count("importances mean nothing") == 2
 
 

@@ -119,7 +119,7 @@ def drifting(space=None, **options):
     options = {"steps": 128, "algorithms": Drift(), "task": Point(), **options}
     made = Trainer(options.pop("task"), options.pop("algorithms"), options.pop("steps"))
     space = {"rate": vj.LogUniform(0.01, 1.0)} if space is None else space
-    return Study("drifting", space, made, closed_loop, **{"snapshots": (32, 64), **options})
+    return Study("drifting", space, made, closed_loop, **{"checkpoints": (32, 64), **options})
 
 
 def quick_certificates(

@@ -43,7 +43,7 @@ class ToyStudy(Study):
     name = "toy"
     space = SPACE
     p = P
-    snapshots = (1000, 2000)
+    checkpoints = (1000, 2000)
     curve = "eventually return >= 90"
 
     @staticmethod
@@ -120,15 +120,15 @@ def curve_to(returned, updates=20):
     return Curve(steps, np.where(steps == 100, np.nan, values))
 
 
-def planted_rows(configurations=40, seed=0, seeds=1, snapshots=(2000,)):
+def planted_rows(configurations=40, seed=0, seeds=1, checkpoints=(2000,)):
     """Return depends on the discount, failing on the learning rate and, less, on the width."""
     rng = np.random.default_rng(seed)
     rows = []
     for number in range(configurations):
         u = rng.random(4)
         for training in range(seeds):
-            for steps in snapshots:
-                late = steps == max(snapshots)
+            for steps in checkpoints:
+                late = steps == max(checkpoints)
                 rate = max(0.0, 1.2 * u[0] - 0.45) ** 2 * (0.6 + 0.4 * (u[2] > 0.5))
                 rate = min(1.0, rate + 0.3 * (not late))
                 returned = min(500.0, 700 * u[1] + 60) * (1.0 if late else 0.6)

@@ -21,7 +21,7 @@ SPACE = vj.FeatureSpace(
 )
 
 
-def made(configurations, failing, returns, seed=0, snapshots=(1000,)):
+def made(configurations, failing, returns, seed=0, checkpoints=(1000,)):
     """A table of configurations drawn from `SPACE`, safety by functions of the unit coordinates."""
     rng = np.random.default_rng(seed)
     rows = []
@@ -34,7 +34,7 @@ def made(configurations, failing, returns, seed=0, snapshots=(1000,)):
             "width": [32, 64][int(2 * u[3])],
             "environments": 4 + int(5 * u[4]),
         }
-        for steps in snapshots:
+        for steps in checkpoints:
             rate = failing(u, steps)
             rows.append(
                 {
@@ -88,22 +88,22 @@ def test_components_of_the_unsafe_and_the_safe(planted):
     assert "unsafe configurations vary most along" in str(planted)
 
 
-def test_snapshots_count_as_training_set_size():
+def test_checkpoints_count_as_training_set_size():
     table = made(
         12,
         lambda u, steps: float(steps < 2000),
         lambda u, steps: u[0],
-        snapshots=(1000, 2000, 4000),
+        checkpoints=(1000, 2000, 4000),
     )
     found = hyperparameter_importance(table, list(SPACE.domains), SPACE, repeats=2)
     assert found.table["failure_rate"].idxmax() == "steps"
     assert found.table.loc["steps", "failure_rate_total"] > 0.9
 
 
-def test_lengths_of_trainings_may_be_swept_with_snapshots_before_their_ends():
+def test_lengths_of_trainings_may_be_swept_with_checkpoints_before_their_ends():
     space = vj.FeatureSpace({**SPACE.domains, "steps": vj.Categorical(2000, 4000)})
     table = made(
-        12, lambda u, steps: u[0], lambda u, steps: steps / 10, snapshots=(1000, 2000, 4000)
+        12, lambda u, steps: u[0], lambda u, steps: steps / 10, checkpoints=(1000, 2000, 4000)
     )
     found = hyperparameter_importance(table, list(space.domains), space, repeats=2)
     assert found.table["nominal_return"].idxmax() == "steps"
@@ -150,7 +150,7 @@ def test_trends_are_those_of_scipy_and_chance_is_rarely_beaten():
 
 
 def test_too_few_configurations_are_admitted():
-    table = made(6, lambda u, steps: u[0], lambda u, steps: u[1], snapshots=(1, 2, 3))
+    table = made(6, lambda u, steps: u[0], lambda u, steps: u[1], checkpoints=(1, 2, 3))
     found = hyperparameter_importance(table, list(SPACE.domains), SPACE)
     assert found.scores == {}
     assert "failing: 6 configurations with a verdict, too few to learn from (at least 10)" in str(

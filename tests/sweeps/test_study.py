@@ -102,7 +102,7 @@ WRONG = {
     ),
     r"algorithm 'picks': Picks learns discrete actions; Point has Continuous\(.*\). "
     "Those that fit: ppo, sac": lambda: study(trainer=Trainer(Point(), Picks())),
-    "snapshots must lie between 1 and steps = 128; got 200": lambda: study(snapshots=(64, 200)),
+    "checkpoints must lie between 1 and steps = 128; got 200": lambda: study(checkpoints=(64, 200)),
     "problem must return a Problem for a policy; it returned int": lambda: study(
         problem=lambda policy: 3
     ),
@@ -139,7 +139,7 @@ def test_parts_of_a_wrong_kind():
         (lambda: study(p=0.0), "p must lie between 0 and 1"),
         (lambda: study(seeds=0), "seeds must be an integer of at least 1"),
         (lambda: study(seeds=(1, 1)), "training seeds must be different"),
-        (lambda: study(snapshots=(0,)), "a snapshot must be an integer of at least 1"),
+        (lambda: study(checkpoints=(0,)), "a checkpoint must be an integer of at least 1"),
         (lambda: study(problem=drifting().untrained_problem()), "must be a function from a policy"),
         (lambda: study(curve="always retrun >= 3"), "did you mean 'return'"),
         (lambda: Trainer(Point(), {}), "at least one algorithm"),
@@ -151,11 +151,11 @@ def test_parts_of_a_wrong_kind():
             wrong()
 
 
-def test_seeds_and_snapshots():
+def test_seeds_and_checkpoints():
     assert study(seeds=3).training_seeds == (0, 1, 2)
     assert study(seeds=(5, 2)).training_seeds == (5, 2)
-    assert drifting().snapshots_of(128) == (32, 64, 128)
-    assert drifting().snapshots_of(48) == (32, 48)
+    assert drifting().checkpoints_of(128) == (32, 64, 128)
+    assert drifting().checkpoints_of(48) == (32, 48)
     text = str(drifting())
     assert "hyper-parameters: rate" in text
     assert "trains: drift on Point, 128 steps" in text

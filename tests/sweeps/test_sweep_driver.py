@@ -144,7 +144,7 @@ def test_algorithms_and_widths_in_one_sweep():
         "width": vj.Categorical(4, 5),
         "rate": vj.Box(0.05, 0.06),
     }
-    study = drifting(space, algorithms={"slow": Drift(), "fast": Drift(noise=0.0)}, snapshots=())
+    study = drifting(space, algorithms={"slow": Drift(), "fast": Drift(noise=0.0)}, checkpoints=())
     found = sweep(study, configurations=4, samples=8)
     assert len(found.table) == 4
     for row, policy in zip(found.table.itertuples(), found.record.policies, strict=True):
@@ -156,7 +156,7 @@ def test_algorithms_and_widths_in_one_sweep():
 
 def test_steps_are_a_hyper_parameter_too():
     space = {"steps": vj.Categorical(64, 96), "rate": vj.Box(0.05, 0.06)}
-    study = drifting(space, snapshots=(32, 80))
+    study = drifting(space, checkpoints=(32, 80))
     found = sweep(study, configurations=2, samples=8)
     assert list(found.record.columns)[:4] == ["configuration", "seed", "steps", "rate"]
     assert found.record.hyperparameters == ("steps", "rate")
@@ -177,7 +177,7 @@ def test_a_curve_is_judged():
 
 def test_configurations_are_distinct():
     space = {"rate": vj.Categorical(0.1, 0.2, 0.3), "noise": vj.Categorical(0.0, 0.1)}
-    found = sweep(drifting(space, snapshots=()), search="uniform", configurations=50, samples=8)
+    found = sweep(drifting(space, checkpoints=()), search="uniform", configurations=50, samples=8)
     assert len(found.table) == 6
     assert not found.table[["rate", "noise"]].duplicated().any()
 
@@ -312,7 +312,7 @@ def test_optuna_proposes_and_is_told(tmp_path):
         "limit": vj.DiscreteBox(50, 60),
         "reward_scale": vj.Categorical(1.0, 2.0),
     }
-    study = drifting(space, snapshots=())
+    study = drifting(space, checkpoints=())
     how = {"configurations": 14, "batch": 3, "samples": 16}
     one = sweep(study, search="optuna:tpe", folder=tmp_path, **how)
     assert len(one.table) == 14
@@ -382,7 +382,7 @@ def test_options_are_refused_first(monkeypatch):
     with unchecked(), pytest.raises(TypeError, match="sweep needs a Study"):
         sweep(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises(StudyError, match="the study has none before the end at 128 steps"):
-        sweep(drifting(snapshots=()), halving=Halving())
+        sweep(drifting(checkpoints=()), halving=Halving())
     with pytest.raises(StudyError, match="take steps out of the space"):
         sweep(drifting({"steps": vj.Categorical(64, 128)}), halving=Halving())
     with pytest.raises(ValueError, match="reduction must be greater than 1; got 1"):

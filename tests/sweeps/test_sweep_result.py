@@ -113,7 +113,7 @@ def test_configurations_are_the_worst_of_their_seeds(small):
     assert list(groups["seeds_safe"]) == [1, 0, 2, 0, 0]
     assert groups["nominal_return"].tolist()[:3] == pytest.approx([99.0, 99.6, 50.0])
     assert groups["failure_rate_worst"].tolist()[:2] == pytest.approx([0.004, 0.3])
-    # The early snapshot of configuration 3 is safe, its end is not.
+    # The early checkpoint of configuration 3 is safe, its end is not.
     assert list(groups["best_row"]) == [0, 3, 5, 6, -1]
     assert groups.loc[3, "best_steps"] == 1000
     assert groups.loc[3, "best_verdict"] == "safe@0.01"
@@ -261,7 +261,7 @@ def test_what_the_certification_met_is_kept(tmp_path):
     assert loaded.counterexamples(0).empty
 
 
-def test_a_curve_goes_up_to_the_rows_own_snapshot(small):
+def test_a_curve_goes_up_to_the_rows_own_checkpoint(small):
     curve = curve_to(99.8)
     early, late = small.curve(6), small.curve(7)
     assert early.clock()[-1] == 1000
@@ -365,7 +365,7 @@ def test_the_picture_is_written(small, tmp_path):
     assert [axes.get_title() for axes in figure.axes] == ["Return is not safety", "Learning curves"]
     values_of_features = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
     assert "safe (3)" in values_of_features
-    assert "safe, earlier snapshot (1)" in values_of_features
+    assert "safe, earlier checkpoint (1)" in values_of_features
     assert "wanted: below 1 %" in values_of_features
 
 

@@ -21,7 +21,7 @@ def test_a_whole_sweep(tmp_path):
         {"learning_rate": vj.LogUniform(1e-3, 1e-1), "length_range": vj.Box(0.0, 1.0)},
         Trainer(CartPoleTask(), TINY, steps=256),
         balance_with,
-        snapshots=(64,),
+        checkpoints=(64,),
         curve="eventually return >= 15",
     )
     found = vj.sweep(study, configurations=5, samples=64, folder=tmp_path)

@@ -2,7 +2,7 @@
 
 found = importance(run)
 found.table                 drop of the score when a feature is shuffled
-found.trusted("failing")    whether the model behind it can predict at all
+found.is_reliable("failing")    whether the model behind it can predict at all
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class Importance:
     missing: dict[str, str]
     name: str
 
-    def trusted(self, target: str) -> bool:
+    def is_reliable(self, target: str) -> bool:
         """Return whether the model of `"failing"` or `"rho"` predicts rows kept aside."""
         return self.scores.get(target, -np.inf) >= LEAST[target]
 
@@ -87,7 +87,7 @@ class Importance:
             listed = ", ".join(
                 f"{self.table.index[i]} ({losses[i]:.2f})" for i in order[:MOST_NAMED]
             )
-            if self.trusted(target):
+            if self.is_reliable(target):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
             else:
                 lines.append(

@@ -32,7 +32,7 @@ def plot_importance(importance: Importance, path: str | Path | None = None) -> F
         for target in importance.scores
     }
     title = f"importance of the features of {importance.name}"
-    weak = [target for target in importance.scores if not importance.trusted(target)]
+    weak = [target for target in importance.scores if not importance.is_reliable(target)]
     if weak:
         what = " and of ".join(NAMES[target] for target in weak)
         title += f"\nmeaningless for {what}: the model does not predict"

@@ -23,7 +23,7 @@ from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import (
     full_return_threshold,
     is_safe,
-    last_snapshots,
+    last_checkpoints,
     preference_order,
 )
 from verifai_jax.sweeps.result import Sweep
@@ -101,13 +101,13 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
     crowded = len(table) > 60
     least = _least_shown(table, sweep.p)
     shown = _spread(table, least)
-    final = shown.index.isin(last_snapshots(sweep.table).index)
+    final = shown.index.isin(last_checkpoints(sweep.table).index)
     for verdict, (colour, marker) in LOOKS.items():
         of_kind = is_safe(table) if verdict == "safe" else (table["verdict"] == verdict).to_numpy()
         for rows, weight in ((shown.loc[of_kind & ~final], 0.3), (shown.loc[of_kind & final], 1.0)):
             if not len(rows):
                 continue
-            when = "" if weight == 1.0 else ", earlier snapshot"
+            when = "" if weight == 1.0 else ", earlier checkpoint"
             if weight == 1.0:
                 _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
             axes.scatter(
@@ -208,7 +208,7 @@ def _curve_rows(sweep: Sweep) -> list[int]:
     if not len(order := preference_order(table)):
         return []
     rows = [int(table.index[order[0]])]
-    others = last_snapshots(table)
+    others = last_checkpoints(table)
     others = others.loc[~_same_training(others, table.loc[rows[0]].to_dict())]
     unsafe = others.loc[others["verdict"] == "unsafe"]
     unsafe = unsafe.loc[unsafe["nominal_return"] >= full_return_threshold(table)]
@@ -218,14 +218,14 @@ def _curve_rows(sweep: Sweep) -> list[int]:
 
 
 def _same_training(table: "pd.DataFrame", row: Mapping[str, Any]) -> Bool[np.ndarray, " rows"]:
-    """Return True for the snapshots of the training of a row."""
+    """Return True for the checkpoints of the training of a row."""
     same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
     return np.asarray(same)
 
 
 def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
     """Draw the learning curves of the whole trainings of some rows, over environment steps."""
-    last = last_snapshots(sweep.table)
+    last = last_checkpoints(sweep.table)
     for row in rows:
         entry: Any = sweep.table.loc[row].to_dict()
         verdict = str(entry["verdict"])
@@ -253,7 +253,7 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
                 markersize=12,
                 markeredgecolor=BOUND,
                 linestyle="none",
-                label=f"row {row}: snapshot at {steps:,} steps",
+                label=f"row {row}: checkpoint at {steps:,} steps",
             )
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")

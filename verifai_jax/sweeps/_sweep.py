@@ -4,7 +4,7 @@
     result = sweep(study, search="bayes", configurations=64, folder="sweeps/mine")  # resumable
 
 A sweep is a deterministic function of computations that are cached one by one: a training up to a
-snapshot, the return of a policy, a part of a certification. Killed at any moment and called again
+checkpoint, the return of a policy, a part of a certification. Killed at any moment and called again
 with the same folder, it reads the finished ones, computes the rest, and gives the same table.
 """
 
@@ -42,7 +42,7 @@ _MOST_BARREN = 64
 _FOR_TRAINING = 2 / 3
 """Share of `max_seconds` after which no training begins, so that there is time to certify."""
 _LAST = 10**9
-"""Number of a snapshot beyond the last one of every training."""
+"""Number of a checkpoint beyond the last one of every training."""
 
 
 @suggests_options
@@ -67,7 +67,7 @@ def sweep(
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify their policies.
 
-    A row of the result is a policy: a configuration, trained with one seed, at one snapshot. The
+    A row of the result is a policy: a configuration, trained with one seed, at one checkpoint. The
     same seed gives the same table on one machine.
 
     **Arguments:**
@@ -84,7 +84,7 @@ def sweep(
     - `budget`: samples of the certification in all; see `certify`.
     - `attack`, `attack_simulations`: the search that tries to make each policy fail first, and its
       simulations of each policy; the failures that it finds enter no rate.
-    - `halving`: stop all but the best configurations at each snapshot.
+    - `halving`: stop all but the best configurations at each checkpoint.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: episodes whose mean is the nominal return.
     - `folder`: a folder, or a `.sqlite` file, that caches finished work; the folder of an
@@ -146,7 +146,7 @@ def sweep(
 
 @dataclass(eq=False)
 class _Configuration:
-    """One configuration: values, training runs, and the snapshot at which halving stopped it."""
+    """One configuration: values, training runs, and the checkpoint at which halving stopped it."""
 
     values: Hyperparameters
     runs: tuple[int, ...]
@@ -157,7 +157,7 @@ class _Configuration:
 class _RunningSweep:
     """The state of a sweep: its configurations, training runs, returns and safety.
 
-    A place is a training run and one of its snapshots, both by number.
+    A place is a training run and one of its checkpoints, both by number.
     """
 
     study: Study
@@ -223,7 +223,7 @@ class _RunningSweep:
 
     def _train(self, numbers: Sequence[int]) -> None:
         runs = self._runs_of(numbers)
-        last = len(self.study.snapshots_of(self.study.trainer.steps)) - 1
+        last = len(self.study.checkpoints_of(self.study.trainer.steps)) - 1
         if self.halving is None:
             self.runs.train(runs, max(map(self.runs.rungs, runs)) - 1)
             self._measure_returns(runs)
@@ -243,7 +243,7 @@ class _RunningSweep:
         return [run for number in numbers for run in self.configurations[number].runs]
 
     def _measure_returns(self, runs: Sequence[int]) -> None:
-        """Measure the nominal returns of all snapshots of training runs that have none yet."""
+        """Measure the nominal returns of all checkpoints of training runs that have none yet."""
         missing: list[tuple[int, int]] = []
         for run in runs:
             for rung in range(self.runs.rungs(run)):
@@ -268,18 +268,18 @@ class _RunningSweep:
         return f"return/{self.runs.cache_name(run, rung)}"
 
     def _is_finite(self, place: tuple[int, int]) -> bool:
-        snapshot = self.runs.snapshot(*place)
-        return snapshot is not None and snapshot.finite
+        checkpoint = self.runs.checkpoint(*place)
+        return checkpoint is not None and checkpoint.finite
 
     def _policy(self, place: tuple[int, int]) -> Policy:
-        snapshot = self.runs.snapshot(*place)
-        assert snapshot is not None
-        return snapshot.policy
+        checkpoint = self.runs.checkpoint(*place)
+        assert checkpoint is not None
+        return checkpoint.policy
 
     # Objectives of searches and of halving
 
     def _halving_objectives(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
-        """Return the objectives of configurations at a snapshot; NaN where one is unknown."""
+        """Return the objectives of configurations at a checkpoint; NaN where one is unknown."""
         if by == SAFETY:
             values = self._screen({n: self._places_of(n, rung) for n in numbers})
             return {n: float("nan") if value is None else value for n, value in values.items()}
@@ -301,7 +301,7 @@ class _RunningSweep:
         return [values[number] for number in numbers]
 
     def _places_of(self, number: int, rung: int) -> list[tuple[int, int]]:
-        """Return the places of a configuration's runs at a snapshot, or at their last."""
+        """Return the places of a configuration's runs at a checkpoint, or at their last."""
         runs = self.configurations[number].runs
         return [(n, min(rung, self.runs.rungs(n) - 1)) for n in runs]
 
@@ -432,9 +432,9 @@ class _RunningSweep:
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
         training = self.runs.runs[run]
         rows: list[Row] = []
-        for rung, steps in enumerate(training.snapshots):
-            snapshot = self.runs.snapshot(run, rung)
-            if snapshot is None:
+        for rung, steps in enumerate(training.checkpoints):
+            checkpoint = self.runs.checkpoint(run, rung)
+            if checkpoint is None:
                 continue
             status = TRAINED if configuration.stopped != rung else STOPPED
             rows.append(
@@ -443,9 +443,9 @@ class _RunningSweep:
                     seed=training.seed,
                     steps=steps,
                     values=configuration.values,
-                    status=status if snapshot.finite else NONFINITE,
+                    status=status if checkpoint.finite else NONFINITE,
                     place=(run, rung),
-                    snapshot=snapshot,
+                    checkpoint=checkpoint,
                     nominal_return=self.returns.get((run, rung), float("nan")),
                     safety=self.safety.get((run, rung)),
                 )
@@ -455,7 +455,7 @@ class _RunningSweep:
                 Row(
                     configuration=number,
                     seed=training.seed,
-                    steps=training.snapshots[-1],
+                    steps=training.checkpoints[-1],
                     values=configuration.values,
                     status=f"error: {self.runs.errors[run]}",
                     place=(run, -1),

@@ -45,7 +45,7 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
             name: _describe(algorithm) for name, algorithm in study.trainer.by_name.items()
         },
         "steps": study.trainer.steps,
-        "snapshots": list(study.snapshots),
+        "snapshots": list(study.checkpoints),
         "seeds": list(study.training_seeds),
         "p": study.p,
         "curve": None if study.curve_formula is None else str(study.curve_formula),

@@ -1,4 +1,4 @@
-"""Successive halving: at each snapshot only the best configurations continue to train.
+"""Successive halving: at each checkpoint only the best configurations continue to train.
 
     sweep(study, configurations=64, halving=Halving(reduction=3))
 
@@ -19,12 +19,12 @@ RETURN, SAFETY = "return", "safety"
 
 @dataclass(frozen=True)
 class Halving:
-    """Successive halving: keep the best 1/reduction of the configurations at each snapshot.
+    """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
 
     **Arguments:**
 
     - `reduction`: greater than 1; of so many configurations one continues, rounded up.
-    - `by`: the criterion. `"return"` is the nominal return at the snapshot; `"safety"` is the
+    - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
 

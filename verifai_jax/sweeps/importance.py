@@ -280,7 +280,7 @@ def _permutation_losses(
     distinct, member = np.unique(groups, return_inverse=True)
     scores, losses = [], []
     for repeat in range(repeats):
-        # Seeds and snapshots of a configuration are alike: they stay on one side.
+        # Seeds and checkpoints of a configuration are alike: they stay on one side.
         fold = generator.permutation(np.arange(len(distinct)) % FOLDS)[member]
         guess = np.zeros((dimensions + 1, rows))
         orders = [generator.permutation(rows) for _ in range(dimensions)]
@@ -312,7 +312,7 @@ def _inputs(
         if entries.nunique(dropna=True) < 2:
             continue
         number = pd.api.types.is_numeric_dtype(entries) and not pd.api.types.is_bool_dtype(entries)
-        # Snapshots need not lie in the domain of the lengths of trainings.
+        # Checkpoints need not lie in the domain of the lengths of trainings.
         domain = None if name == "steps" else domains.get(name)
         if domain is not None and domain.size == 1 and not isinstance(domain, Constant):
             present = entries.dropna().unique().tolist()
@@ -354,7 +354,7 @@ def _components(
     known = verdicts.str.startswith("safe") | (verdicts == "unsafe")
     frame = pd.DataFrame({one.name: one.values for one in ordered}, index=table.index)
     frame["violated"] = (verdicts == "unsafe").to_numpy()
-    # One row a configuration, at its last snapshot; the worst of its seeds decides.
+    # One row a configuration, at its last checkpoint; the worst of its seeds decides.
     last = table["steps"] == table.groupby("configuration")["steps"].transform("max")
     frame = frame.loc[known & last].assign(configuration=table["configuration"])
     frame = frame.sort_values("violated", kind="stable")

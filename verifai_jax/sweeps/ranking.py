@@ -62,21 +62,21 @@ def full_return_threshold(table: "pd.DataFrame") -> float:
     return float(returned.max() - FULL * np.ptp(returned))
 
 
-def last_snapshots(table: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the rows at the last snapshot of each training."""
+def last_checkpoints(table: "pd.DataFrame") -> "pd.DataFrame":
+    """Return the rows at the last checkpoint of each training."""
     last = table.groupby(["configuration", "seed"])["steps"].transform("max")
     return table.loc[table["steps"] == last]
 
 
 def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
-    """Return one row for each configuration: its trainings at their last snapshots, together."""
+    """Return one row for each configuration: its trainings at their last checkpoints, together."""
     import pandas as pd
 
     names = [name for name in hyperparameters if name != "steps"]
     place = {int(i): rank for rank, i in enumerate(table.index[preference_order(table)])}
     rows: list[dict[str, Any]] = []
     for number, part in table.groupby("configuration", sort=True):
-        last = last_snapshots(part)
+        last = last_checkpoints(part)
         ranked = [int(i) for i in part.index if int(i) in place]
         best = min(ranked, key=place.__getitem__, default=-1)
         rows.append(

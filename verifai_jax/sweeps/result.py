@@ -96,7 +96,7 @@ class Sweep:
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """One row for each policy: a configuration, trained with a seed up to a snapshot.
+        """One row for each policy: a configuration, trained with a seed up to a checkpoint.
 
         `steps` are environment steps; `training_return` is the mean return of the last episodes
         with exploration, `nominal_return` that of the policy's likeliest actions on the nominal
@@ -138,11 +138,11 @@ class Sweep:
 
     @cached_property
     def configurations(self) -> "pd.DataFrame":
-        """One row for each configuration, over its training seeds at their last snapshot.
+        """One row for each configuration, over its training seeds at their last checkpoint.
 
         `nominal_return` and `failure_rate` are means over the seeds, `failure_rate_worst` and
         `failure_high` the greatest, `verdict` the worst of them, `seeds_safe` the number of safe
-        ones. `best_row` is the row of the table to choose among all seeds and snapshots, or -1.
+        ones. `best_row` is the row of the table to choose among all seeds and checkpoints, or -1.
         """
         return group_by_configuration(self.table, self.hyperparameters)
 

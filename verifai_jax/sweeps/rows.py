@@ -12,7 +12,7 @@ from verifai_jax.sweeps.curves import curve_robustness
 from verifai_jax.sweeps.record import AFTER, BEFORE, Curve
 from verifai_jax.sweeps.safety import PolicySafety
 from verifai_jax.sweeps.study import Study
-from verifai_jax.sweeps.training_runs import RunSnapshot
+from verifai_jax.sweeps.training_runs import RunCheckpoint
 
 _INTEGERS = {"configuration", "seed", "steps", "failures", "simulations"}
 _TEXTS = {"status", "verdict"}
@@ -22,11 +22,11 @@ _TEXTS = {"status", "verdict"}
 class Row:
     """One policy, or one training run without a policy.
 
-    - `configuration`, `seed`, `steps`: number of the configuration, training seed, snapshot.
+    - `configuration`, `seed`, `steps`: number of the configuration, training seed, checkpoint.
     - `values`: hyper-parameters.
     - `status`: see `record`.
-    - `place`: numbers of the training run and of its snapshot.
-    - `snapshot`: the run there; None where it did not train.
+    - `place`: numbers of the training run and of its checkpoint.
+    - `checkpoint`: the run there; None where it did not train.
     - `nominal_return`: mean return on the nominal task; NaN where it is not known.
     - `safety`: of the policy; None where it was not certified.
     """
@@ -37,7 +37,7 @@ class Row:
     values: Mapping[str, object]
     status: str
     place: tuple[int, int]
-    snapshot: RunSnapshot | None = None
+    checkpoint: RunCheckpoint | None = None
     nominal_return: float = float("nan")
     safety: PolicySafety | None = None
 
@@ -68,13 +68,13 @@ def tabulate(rows: Sequence[Row], study: Study) -> Table:
             columns[name] = np.array(entries, np.float64)
     curves: dict[tuple[int, int], Curve] = {}
     for row in rows:
-        # The last snapshot of a run has the longest curve.
-        if row.snapshot is not None:
-            curves[row.configuration, row.seed] = row.snapshot.curve
+        # The last checkpoint of a run has the longest curve.
+        if row.checkpoint is not None:
+            curves[row.configuration, row.seed] = row.checkpoint.curve
     return Table(
         columns=columns,
         policies=tuple(
-            row.snapshot.policy if row.snapshot is not None and row.snapshot.finite else None
+            row.checkpoint.policy if row.checkpoint is not None and row.checkpoint.finite else None
             for row in rows
         ),
         worst=tuple(None if row.safety is None else row.safety.features for row in rows),
@@ -83,17 +83,17 @@ def tabulate(rows: Sequence[Row], study: Study) -> Table:
 
 
 def _cells(row: Row, study: Study) -> dict[str, object]:
-    nan, snapshot, safety = float("nan"), row.snapshot, row.safety
+    nan, checkpoint, safety = float("nan"), row.checkpoint, row.safety
     curve = nan
-    if study.curve_formula is not None and snapshot is not None:
-        curve = curve_robustness(study.curve_formula, *snapshot.curve)
+    if study.curve_formula is not None and checkpoint is not None:
+        curve = curve_robustness(study.curve_formula, *checkpoint.curve)
     return {
         **row.values,
         "configuration": row.configuration,
         "seed": row.seed,
         "steps": row.steps,
         "status": row.status,
-        "training_return": nan if snapshot is None else snapshot.training_return,
+        "training_return": nan if checkpoint is None else checkpoint.training_return,
         "nominal_return": row.nominal_return,
         "failures": 0 if safety is None else safety.failures,
         "simulations": 0 if safety is None else safety.simulations,
@@ -103,7 +103,7 @@ def _cells(row: Row, study: Study) -> dict[str, object]:
         "worst_robustness": nan if safety is None else safety.worst,
         "verdict": "" if safety is None else safety.verdict,
         "curve_robustness": curve,
-        "training_seconds": nan if snapshot is None else snapshot.seconds,
+        "training_seconds": nan if checkpoint is None else checkpoint.seconds,
     }
 
 

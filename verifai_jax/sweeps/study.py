@@ -5,7 +5,7 @@
         space=FeatureSpace({"learning_rate": LogUniform(1e-4, 1e-2), "width": Categorical(16, 64)}),
         trainer=Trainer(task, PPO(), steps=32_768),
         problem=problem_of,                                 # Policy -> Problem
-        snapshots=(8_192, 16_384, 32_768),
+        checkpoints=(8_192, 16_384, 32_768),
     )
 
 `Study.check()` finds everything that is wrong with it before anything trains.
@@ -38,8 +38,8 @@ class Study:
     - `trainer`: the task and the algorithms.
     - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
       weights.
-    - `snapshots`: environment steps at which a training's policy is a row of the table, beside the
-      end of the training.
+    - `checkpoints`: environment steps at which a training's policy is a row of the table, beside
+      the end of the training.
     - `seeds`: training seeds of each configuration: their number (0, 1, ...), or the seeds.
     - `p`: the failure probability below which a policy is safe, between 0 and 1.
     - `curve`: a formula over the learning curve, whose time is environment steps; None for none.
@@ -58,7 +58,7 @@ class Study:
     space: FeatureSpace
     trainer: Trainer
     problem: Callable[[Policy], Problem]
-    snapshots: tuple[int, ...]
+    checkpoints: tuple[int, ...]
     seeds: int | Sequence[int]
     p: float
     curve: Formula | str | None
@@ -73,7 +73,7 @@ class Study:
         space: FeatureSpace | Mapping[str, Domain],
         trainer: Trainer,
         problem: Callable[[Policy], Problem],
-        snapshots: Sequence[int] = (),
+        checkpoints: Sequence[int] = (),
         seeds: int | Sequence[int] = 1,
         p: float = 0.01,
         curve: Formula | str | None = None,
@@ -94,13 +94,13 @@ class Study:
                 f"problem must be a function from a policy to a Problem; got {problem!r}"
             )
         check_fraction("p", p, error=StudyError)
-        steps = {check_count("a snapshot", at, error=StudyError) for at in snapshots}
+        steps = {check_count("a checkpoint", at, error=StudyError) for at in checkpoints}
         values = {
             "name": name,
             "space": space,
             "trainer": trainer,
             "problem": problem,
-            "snapshots": tuple(sorted(steps)),
+            "checkpoints": tuple(sorted(steps)),
             "seeds": seeds,
             "p": p,
             "curve": curve,
@@ -112,15 +112,15 @@ class Study:
         for attribute, value in values.items():
             object.__setattr__(self, attribute, value)
 
-    def snapshots_of(self, steps: int) -> tuple[int, ...]:
+    def checkpoints_of(self, steps: int) -> tuple[int, ...]:
         """Return the environment steps of the rows of a training that takes `steps` in all."""
-        return (*(at for at in self.snapshots if at < steps), steps)
+        return (*(at for at in self.checkpoints if at < steps), steps)
 
     def check(self) -> None:
         """Check that the study can be swept, before anything compiles or trains.
 
         **Raises:** `StudyError` and `UnknownNameError` as `Trainer.check`; `StudyError` for
-        snapshots after the end of every training, and for a problem that raises for an untrained
+        checkpoints after the end of every training, and for a problem that raises for an untrained
         policy, is no `Problem`, or has a specification over signals that its closed loop lacks.
         """
         self.trainer.check(self.space)
@@ -128,9 +128,9 @@ class Study:
         most = self.trainer.steps
         if STEPS in self.space.domains:
             most = max(int(value) for value, _ in probe_values(self.space.domains[STEPS]))
-        late = [at for at in self.snapshots if at > most]
+        late = [at for at in self.checkpoints if at > most]
         if late:
-            raise StudyError(f"snapshots must lie between 1 and steps = {most}; got {late[0]}")
+            raise StudyError(f"checkpoints must lie between 1 and steps = {most}; got {late[0]}")
         for name in self.algorithms:
             problem = self._problem_of(name)
             try:

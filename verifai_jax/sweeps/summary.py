@@ -16,7 +16,7 @@ from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.sweeps.ranking import (
     full_return_threshold,
     is_safe,
-    last_snapshots,
+    last_checkpoints,
     preference_order,
     return_safety_correlation,
 )
@@ -61,7 +61,7 @@ def format_summary(findings: Findings) -> str:
     if len(groups):
         lines.append(f"  configurations  {format_verdicts(groups)}")
     if len(table) > len(groups):
-        lines.append(f"  policies        {format_verdicts(table)}; each seed and snapshot is one")
+        lines.append(f"  policies        {format_verdicts(table)}; each seed and checkpoint is one")
     if len(preference_order(table)):
         lines += _best_lines(findings)
     if len(groups) and (groups["seeds"] > 1).any():
@@ -70,7 +70,7 @@ def format_summary(findings: Findings) -> str:
         lines.append(f"  without policy  {missing}")
     if stopped := sum(str(status) == "stopped" for status in table["status"]):
         lines.append(f"  halving         stopped {_plural(stopped, 'training')} before the end")
-    correlation = return_safety_correlation(last_snapshots(table)) if len(table) else np.nan
+    correlation = return_safety_correlation(last_checkpoints(table)) if len(table) else np.nan
     if np.isfinite(correlation):
         lines.append(
             f"  return, safety  rank correlation {correlation:.2f} "

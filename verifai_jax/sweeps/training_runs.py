@@ -1,12 +1,12 @@
-"""The training runs of a sweep: policies at the snapshots, learning curves, seconds, all cached.
+"""The training runs of a sweep: policies at the checkpoints, learning curves, seconds, all cached.
 
     runs = TrainingRuns(study, cache, clock)
     number = runs.add(values, seed=0)
-    runs.train([number, ...], rung=0)                   # to the first snapshot, or cached
-    runs.snapshot(number, 0).policy
+    runs.train([number, ...], rung=0)                   # to the first checkpoint, or cached
+    runs.checkpoint(number, 0).policy
 
 Runs of one structure share a program. As many as there are devices continue together from one
-snapshot to the next, so that a run that has begun is soon finished and cached.
+checkpoint to the next, so that a run that has begun is soon finished and cached.
 """
 
 import time
@@ -32,12 +32,12 @@ RECENT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class RunSnapshot:
-    """A training run at one of its snapshots.
+class RunCheckpoint:
+    """A training run at one of its checkpoints.
 
     - `policy`: the policy, on the host.
     - `finite`: False where one of its numbers is not finite.
-    - `curve`: learning curve from the beginning up to the snapshot.
+    - `curve`: learning curve from the beginning up to the checkpoint.
     - `seconds`: of one core, without compilation.
     """
 
@@ -64,7 +64,7 @@ class TrainingRun:
     - `values`: hyper-parameters, plain values.
     - `seed`: training seed.
     - `key`: digest of the hyper-parameters that the algorithm uses; part of the cache's names.
-    - `snapshots`: environment steps of its rows.
+    - `checkpoints`: environment steps of its rows.
     - `configuration`: task and algorithm with these values; None where they cannot train.
     - `error`: the reason for that, in one line.
     """
@@ -72,7 +72,7 @@ class TrainingRun:
     values: Mapping[str, object]
     seed: int
     key: str
-    snapshots: tuple[int, ...]
+    checkpoints: tuple[int, ...]
     configuration: Configuration | None
     error: str = ""
 
@@ -83,7 +83,7 @@ class TrainingRuns:
     **Arguments:**
 
     - `study`: the study that is swept.
-    - `cache`: stores each run at each snapshot.
+    - `cache`: stores each run at each checkpoint.
     - `clock`: times the training, and ends it.
     """
 
@@ -91,7 +91,7 @@ class TrainingRuns:
         self.study, self.cache, self.clock = study, cache, clock
         self.runs: list[TrainingRun] = []
         self.errors: dict[int, str] = {}
-        self._snapshots: dict[tuple[int, int], RunSnapshot] = {}
+        self._checkpoints: dict[tuple[int, int], RunCheckpoint] = {}
         self._policy_structures: dict[Hashable, Any] = {}
         self._compiled: set[Hashable] = set()
         self._batches: dict[int, tuple[BatchedTraining, int]] = {}
@@ -110,20 +110,20 @@ class TrainingRuns:
             steps = configuration.steps
         except (ValueError, TypeError) as problem:
             configuration, error, steps = None, _one_line(problem), trainer.steps
-        snapshots = self.study.snapshots_of(steps)
-        self.runs.append(TrainingRun(dict(values), seed, key, snapshots, configuration, error))
+        checkpoints = self.study.checkpoints_of(steps)
+        self.runs.append(TrainingRun(dict(values), seed, key, checkpoints, configuration, error))
         number = len(self.runs) - 1
         if error:
             self.errors[number] = error
         return number
 
     def rungs(self, number: int) -> int:
-        """Return the number of snapshots of a run."""
-        return len(self.runs[number].snapshots)
+        """Return the number of checkpoints of a run."""
+        return len(self.runs[number].checkpoints)
 
-    def snapshot(self, number: int, rung: int) -> RunSnapshot | None:
-        """Return a run at a snapshot; None where it has not trained so far."""
-        return self._snapshots.get((number, rung))
+    def checkpoint(self, number: int, rung: int) -> RunCheckpoint | None:
+        """Return a run at a checkpoint; None where it has not trained so far."""
+        return self._checkpoints.get((number, rung))
 
     def structure(self, number: int) -> Hashable:
         """Return a key that is equal for runs whose policies have one form and share a program."""
@@ -132,12 +132,12 @@ class TrainingRuns:
         return policy_structure(configuration)
 
     def train(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
-        """Train runs up to a snapshot, or up to their last if they have fewer.
+        """Train runs up to a checkpoint, or up to their last if they have fewer.
 
         **Arguments:**
 
         - `numbers`: the runs.
-        - `rung`: number of the snapshot, from 0 on.
+        - `rung`: number of the checkpoint, from 0 on.
         - `further`: keep their states, because some will continue from there.
 
         **Raises:** `OutOfTime` where the seconds of the stage are over.
@@ -150,14 +150,14 @@ class TrainingRuns:
             last = min(rung, self.rungs(number) - 1)
             for at in range(last + 1):
                 self._recall(number, at)
-            if (number, last) in self._snapshots:
+            if (number, last) in self._checkpoints:
                 self.clock.advance(self._steps(number, last))
             else:
                 place = (id(self._batches[number][0]), self.structure(number))
                 waiting.setdefault(place, []).append(number)
         for group in waiting.values():
             # Of one length, so that devices finish together.
-            group.sort(key=lambda n: (self.runs[n].snapshots[-1], n))
+            group.sort(key=lambda n: (self.runs[n].checkpoints[-1], n))
             batch = self._batches[group[0]][0]
             size = len(batch.devices) * batch.per_device
             for start in range(0, len(group), size):
@@ -179,7 +179,7 @@ class TrainingRuns:
             self._batches.update({n: (batch, place) for place, (n, _) in enumerate(trainable)})
 
     def _train_group(self, numbers: list[int], rung: int, further: bool) -> None:
-        """Train runs that share a program from snapshot to snapshot, caching each."""
+        """Train runs that share a program from checkpoint to checkpoint, caching each."""
         structure = self.structure(numbers[0])
         self.clock.advance(0, "" if structure in self._compiled else "compiling")
         self._compiled.add(structure)
@@ -203,16 +203,16 @@ class TrainingRuns:
         batch = self._batches[numbers[0]][0]
         number_of = {self._batches[n][1]: n for n in numbers}
         for at in range(rung + 1):
-            here = [n for n in numbers if at < self.rungs(n) and (n, at) not in self._snapshots]
-            targets = {self._batches[n][1]: self.runs[n].snapshots[at] for n in here}
+            here = [n for n in numbers if at < self.rungs(n) and (n, at) not in self._checkpoints]
+            targets = {self._batches[n][1]: self.runs[n].checkpoints[at] for n in here}
             began, busy = time.perf_counter(), 0.0
             for place in batch.advance(targets):
                 number = number_of[place]
                 policy, curve = batch.policy(place), Curve(*batch.curve(place))
                 arrays = _encode(policy, curve, batch.seconds(place))
                 self.cache.put({self.cache_name(number, at): arrays})
-                self._set_snapshot(number, at, arrays)
-                before = self._snapshots.get((number, at - 1))
+                self._set_checkpoint(number, at, arrays)
+                before = self._checkpoints.get((number, at - 1))
                 share = batch.seconds(place) - (before.seconds if before else 0.0)
                 busy += share / len(batch.devices)
                 self.clock.advance(self._steps(number, at) - self._steps(number, at - 1))
@@ -220,19 +220,19 @@ class TrainingRuns:
             self.clock.check()
 
     def _recall(self, number: int, rung: int) -> None:
-        if (number, rung) in self._snapshots:
+        if (number, rung) in self._checkpoints:
             return
         arrays = self.cache.get(self.cache_name(number, rung))
         if arrays is not None:
-            self._set_snapshot(number, rung, arrays)
+            self._set_checkpoint(number, rung, arrays)
 
-    def _set_snapshot(self, number: int, rung: int, arrays: Arrays) -> None:
+    def _set_checkpoint(self, number: int, rung: int, arrays: Arrays) -> None:
         leaves = [arrays[f"leaf{i}"] for i in range(int(arrays["leaves"]))]
         policy = jax.tree.unflatten(self._policy_structure(number), leaves)
         finite = all(bool(np.all(np.isfinite(leaf))) for leaf in leaves)
         curve = Curve(arrays["steps"], arrays["mean_return"])
         seconds = float(arrays["seconds"])
-        self._snapshots[number, rung] = RunSnapshot(policy, finite, curve, seconds)
+        self._checkpoints[number, rung] = RunCheckpoint(policy, finite, curve, seconds)
 
     def _policy_structure(self, number: int) -> Any:
         """Return the tree structure of a run's policy; nothing compiles."""
@@ -251,13 +251,13 @@ class TrainingRuns:
         return self._policy_structures[structure]
 
     def cache_name(self, number: int, rung: int) -> str:
-        """Return the name of a run at a snapshot in the cache."""
+        """Return the name of a run at a checkpoint in the cache."""
         run = self.runs[number]
-        total, at = run.snapshots[-1], run.snapshots[rung]
+        total, at = run.checkpoints[-1], run.checkpoints[rung]
         return f"train/{run.key}/seed {run.seed}/{at} of {total}"
 
     def _steps(self, number: int, rung: int) -> int:
-        return self.runs[number].snapshots[rung] if rung >= 0 else 0
+        return self.runs[number].checkpoints[rung] if rung >= 0 else 0
 
 
 def _encode(policy: Policy, curve: Curve, seconds: float) -> Arrays:

@@ -24,7 +24,7 @@ def check_options(
 
     **Raises:** `TypeError` for something that is no study or no `Halving`; `ValueError` for a
     number out of range, or a budget that cannot sample all policies; `StudyError` for halving
-    without snapshots or of trainings of several lengths.
+    without checkpoints or of trainings of several lengths.
     """
     if not isinstance(study, Study):
         raise TypeError(f"sweep needs a Study; got {study!r}")
@@ -54,9 +54,9 @@ def check_options(
 def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
     """Return the greatest number of rows that a sweep can have."""
     several_lengths = STEPS in study.space.domains
-    snapshots = 1 + sum(several_lengths or at < study.trainer.steps for at in study.snapshots)
+    checkpoints = 1 + sum(several_lengths or at < study.trainer.steps for at in study.checkpoints)
     left, total = configurations, 0
-    for _ in range(snapshots):
+    for _ in range(checkpoints):
         total += left
         left = left if halving is None else halving.survivors(left)
     return total * len(study.training_seeds)
@@ -67,11 +67,11 @@ def _check_halving(study: Study, halving: object) -> None:
         raise TypeError(f"halving must be a Halving; got {halving!r}")
     if STEPS in study.space.domains:
         raise StudyError(
-            "halving compares trainings of one length at their snapshots; "
+            "halving compares trainings of one length at their checkpoints; "
             "take steps out of the space"
         )
-    if not [at for at in study.snapshots if at < study.trainer.steps]:
+    if not [at for at in study.checkpoints if at < study.trainer.steps]:
         raise StudyError(
-            "halving stops trainings at snapshots; the study has none before the end at "
+            "halving stops trainings at checkpoints; the study has none before the end at "
             f"{study.trainer.steps} steps"
         )
