@@ -2,6 +2,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.analysis import tightest as module
 from verifai_jax.analysis.data.samples import Samples
@@ -108,7 +109,10 @@ def test_refused():
     frame = table("mixed")
     with pytest.raises(ValueError, match="k must be an integer of at least 1; got 0"):
         k_closest(frame, 0)
-    with pytest.raises(ValueError, match=r"k must be an integer of at least 1; got 2.5"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"k must be an integer of at least 1; got 2.5"),
+    ):
         random_rows(frame, 2.5, 0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(UnknownNameError, match=r"unknown feature 'y'.*Known: x, a, b"):
         nearest(frame, {"x": 1.0, "a": "p", "b": True})

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 
@@ -64,7 +65,7 @@ class TestFeatures:
         assert vj.DiscreteBox.from_intervals((0.2, 3.9)) == vj.DiscreteBox(1, 3)
         with pytest.raises(ValueError, match="low must be below high"):
             vj.Box(3, 1)
-        with pytest.raises(ValueError, match="an interval is a pair of numbers"):
+        with unchecked(), pytest.raises(ValueError, match="an interval is a pair of numbers"):
             vj.Box.from_intervals(3)  # pyright: ignore[reportArgumentType]
 
     def test_order_is_the_one_written(self):

@@ -149,7 +149,8 @@ def test_each_loss_has_a_gradient_for_its_own_weights():
         return generator.normal(size=shape).astype(np.float32)
 
     batch = StoredTransitions(part(8, 1), part(8, 1), np.tanh(part(8, 1)), part(8), np.zeros(8))
-    noise = part(2, 8, 1)
+    batch = StoredTransitions(*map(jnp.asarray, batch))
+    noise = jnp.asarray(part(2, 8, 1))
 
     @jax.jit
     def gradient(reward):
@@ -165,7 +166,9 @@ def test_each_loss_has_a_gradient_for_its_own_weights():
     # By hand: d/d(log temperature) = mean(-log probability) - wanted entropy.
     (w0, b0), (w1, b1) = [(np.asarray(w), np.asarray(b)) for w, b in state.weights.policy]
     mean, log_std = np.split(np.maximum(batch.observation @ w0 + b0, 0) @ w1 + b1, 2, axis=-1)
-    expected = 1.0 - float(np.mean(squash_log_prob(mean, log_std, noise[1])))
+    expected = 1.0 - float(
+        np.mean(squash_log_prob(jnp.asarray(mean), jnp.asarray(log_std), noise[1]))
+    )
     assert float(first.log_temperature) == pytest.approx(expected, rel=1e-4)
 
 

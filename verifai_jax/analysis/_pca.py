@@ -287,4 +287,4 @@ def _accepted(space: FeatureSpace | None, frame: pd.DataFrame) -> np.ndarray:
 
 
 def _matters(loading: float) -> bool:
-    return abs(loading) >= 0.05
+    return bool(abs(loading) >= 0.05)

@@ -77,7 +77,7 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
 def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
     """Return the two columns of which the clusters explain most of the variation."""
 
-    def explained(total: Float[np.ndarray, " n"]) -> float:
+    def explained(total: Float[np.ndarray, "n d"]) -> float:
         spread = ((total - total.mean(axis=0)) ** 2).sum()
         means = np.stack([total[clusters.assigned == c].mean(axis=0) for c in kinds])
         inner = ((total - means[np.searchsorted(kinds, clusters.assigned)]) ** 2).sum()

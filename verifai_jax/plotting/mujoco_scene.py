@@ -162,7 +162,7 @@ def film(
     plain = frames(motion, samples.tolist(), size, **camera)
     drawn = [
         _labelled(frame, motion, sample, motion.caption)
-        for frame, sample in zip(plain, samples, strict=True)
+        for frame, sample in zip(plain, samples.tolist(), strict=True)
     ]
     # One palette for all and no dithering, so that what does not move keeps its colour and the file
     # stays small. Half of it is for the colours that there are, however few their pixels, or floor
@@ -376,7 +376,9 @@ def _view(mujoco: Any, model: Any, name: str | None) -> Any:
     return view
 
 
-def _labelled(image: Frame, motion: Motion, sample: int, caption: str) -> Frame:
+def _labelled(
+    image: Frame, motion: Motion, sample: int, caption: str
+) -> UInt8[np.ndarray, "taller width 3"]:
     """Write caption and time above a frame; a red edge from the decisive sample on."""
     from PIL import Image, ImageDraw, ImageFont
 

@@ -9,7 +9,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -58,53 +58,61 @@ class Problem:
     space: FeatureSpace
     system: System
     spec: Formula | str | Mapping[str, Formula | str]
-    nominal: Mapping[str, Any] | None = None
-    description: str = ""
-    end: End = "hold"
-    draw: Callable[..., None] | None = None
-    priority: Sequence[str] | Sequence[tuple[str, str]] | None = None
+    nominal: Mapping[str, Any] | None
+    description: str
+    end: End
+    draw: Callable[..., None] | None
+    priority: Sequence[str] | Sequence[tuple[str, str]] | None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
-    rulebook: Rulebook | None = field(init=False, repr=False, default=None)
-    programs: ProgramCache = field(init=False, repr=False, default_factory=ProgramCache)
+    rulebook: Rulebook | None = field(init=False, repr=False)
+    programs: ProgramCache = field(init=False, repr=False)
 
-    if TYPE_CHECKING:
-        # For type checkers: a dictionary and a function are stored as a space and a system.
-        def __init__(
-            self,
-            name: str,
-            space: FeatureSpace | Mapping[str, Domain],
-            system: System | Callable[..., Trace],
-            spec: Formula | str | Mapping[str, Formula | str],
-            nominal: Mapping[str, Any] | None = None,
-            description: str = "",
-            end: End = "hold",
-            draw: Callable[..., None] | None = None,
-            priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
-        ) -> None: ...
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise ProblemError(f"a problem needs a name; got {self.name!r}")
-        if isinstance(self.space, Mapping):
-            object.__setattr__(self, "space", FeatureSpace(self.space))
-        if not isinstance(self.space, FeatureSpace):
+    def __init__(
+        self,
+        name: str,
+        space: FeatureSpace | Mapping[str, Domain],
+        system: System | Callable[..., Trace],
+        spec: Formula | str | Mapping[str, Formula | str],
+        nominal: Mapping[str, Any] | None = None,
+        description: str = "",
+        end: End = "hold",
+        draw: Callable[..., None] | None = None,
+        priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
+    ) -> None:
+        if not isinstance(name, str) or not name.strip():
+            raise ProblemError(f"a problem needs a name; got {name!r}")
+        if isinstance(space, Mapping):
+            space = FeatureSpace(space)
+        if not isinstance(space, FeatureSpace):
             raise ProblemError(
-                f"space must be a FeatureSpace or a dictionary of domains; got {self.space!r}"
+                f"space must be a FeatureSpace or a dictionary of domains; got {space!r}"
             )
-        if not callable(self.system):
+        if not callable(system):
             raise ProblemError(
-                f"system must be a function (features, key) -> Trace; got {self.system!r}"
+                f"system must be a function (features, key) -> Trace; got {system!r}"
             )
-        object.__setattr__(self, "system", as_system(self.system))
-        spec = self.spec if isinstance(self.spec, Mapping) else {"spec": self.spec}
-        if not spec:
+        named = spec if isinstance(spec, Mapping) else {"spec": spec}
+        if not named:
             raise ProblemError("spec has no formula; give a formula or a dictionary of them")
-        formulas = {name: _formula(name, formula) for name, formula in spec.items()}
-        object.__setattr__(self, "formulas", formulas)
-        if self.priority is not None:
-            object.__setattr__(self, "rulebook", _rulebook(self.priority, formulas))
-        if self.nominal is not None:
-            self.space.check(self.nominal)
+        formulas = {name: _formula(name, formula) for name, formula in named.items()}
+        values = {
+            "name": name,
+            "space": space,
+            "system": as_system(system),
+            "spec": spec,
+            "nominal": nominal,
+            "description": description,
+            "end": end,
+            "draw": draw,
+            "priority": priority,
+            "formulas": formulas,
+            "rulebook": None if priority is None else _rulebook(priority, formulas),
+            "programs": ProgramCache(),
+        }
+        for attribute, value in values.items():
+            object.__setattr__(self, attribute, value)
+        if nominal is not None:
+            space.check(nominal)
 
     @property
     def monitored(self) -> tuple[str, ...]:

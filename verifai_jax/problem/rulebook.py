@@ -14,12 +14,15 @@ counterexample always scores lower.
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 from verifai_jax.core.errors import check_names
+
+Violation: TypeAlias = Sequence[float] | Shaped[np.ndarray, " k"]
+"""By how much a row breaks each rule: numbers, 0 where a rule is kept, or truth values."""
 
 MOST_RULES = 30
 """Rules at most: beyond, a lexicographic number would not be exact."""
@@ -53,7 +56,7 @@ class Rulebook:
             raise ValueError(f"a rulebook has at most {MOST_RULES} rules; got {len(self.names)}")
         object.__setattr__(self, "order", self._sorted())
 
-    def graver(self, one: Sequence[Any], other: Sequence[Any]) -> bool:
+    def graver(self, one: Violation, other: Violation) -> bool:
         """Return whether `one` is a graver counterexample than `other`.
 
         Each says by how much every rule is broken, in the order of `names`: a number that is 0
@@ -63,7 +66,9 @@ class Rulebook:
         first, second = np.asarray(one, np.float64), np.asarray(other, np.float64)
         return bool(self._outdone(second[None], first[None])[0, 0])
 
-    def front(self, violations: Bool[Any, "n k"] | Float[Any, "n k"]) -> Bool[np.ndarray, " n"]:
+    def front(
+        self, violations: Shaped[np.ndarray, "n k"] | Sequence[Sequence[float]]
+    ) -> Bool[np.ndarray, " n"]:
         """Mark the rows that no other row outdoes: the Pareto set of counterexamples.
 
         Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
@@ -77,7 +82,9 @@ class Rulebook:
             kept[block] = ~np.any(self._outdone(unique[block], unique), axis=1)
         return kept[place.ravel()]
 
-    def grade(self, violated: Bool[Any, "n k"]) -> Float[np.ndarray, " n"]:
+    def grade(
+        self, violated: Bool[np.ndarray, "n k"] | Float[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, " n"]:
         """Return one number for what is broken: larger for a graver row, equal for equal rows.
 
         A linear extension of the order: of two rows that cannot be compared one is larger too.
@@ -86,7 +93,9 @@ class Rulebook:
         weights = 2.0 ** np.arange(len(places) - 1, -1, -1)
         return np.asarray(violated, np.float64)[..., places] @ weights
 
-    def _outdone(self, rows: np.ndarray, others: np.ndarray) -> Bool[np.ndarray, "n m"]:
+    def _outdone(
+        self, rows: Float[np.ndarray, "n k"], others: Float[np.ndarray, "m k"]
+    ) -> Bool[np.ndarray, "n m"]:
         """Return whether row i is less grave than other row j."""
         more = others[None] > rows[:, None]  # Rules that the other breaks by more.
         less = others[None] < rows[:, None]
@@ -142,7 +151,7 @@ class Objective:
         }
 
     def __call__(
-        self, rho: Float[Any, "n k"], violated: Bool[Any, "n k"]
+        self, rho: Float[np.ndarray, "n k"], violated: Bool[np.ndarray, "n k"]
     ) -> Float[np.ndarray, " n"]:
         """Score rows `[n, k]` of robustness and verdicts; NaN stays NaN."""
         rho = np.asarray(rho, np.float64)

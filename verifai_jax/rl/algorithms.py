@@ -4,18 +4,22 @@ algorithm_named("sac")                    # the class SAC
 algorithms_for(Discrete(2))               # ("ppo", "pqn")
 """
 
+from typing import TypeAlias
+
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.ppo import PPO
 from verifai_jax.rl.pqn import PQN
 from verifai_jax.rl.sac import SAC
 from verifai_jax.rl.task.task import Action
 
-ALGORITHMS: dict[str, type[PPO] | type[PQN] | type[SAC]] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
+AlgorithmClass: TypeAlias = type[PPO] | type[PQN] | type[SAC]
+"""The class of a training algorithm of this package."""
+
+ALGORITHMS: dict[str, AlgorithmClass] = {"ppo": PPO, "pqn": PQN, "sac": SAC}
 """The classes of the training algorithms, by name."""
 
 
-def algorithm_named(name: str) -> type[Algorithm]:
+def algorithm_named(name: str) -> AlgorithmClass:
     """Return the class of an algorithm.
 
     **Raises:** `UnknownNameError`, with the nearest names.

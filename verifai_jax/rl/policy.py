@@ -76,10 +76,13 @@ class Policy:
         if self.squash and isinstance(self.action, Discrete):
             raise ValueError(f"only continuous actions can be squashed; got {self.action}")
 
-    def __call__(self, observation: Float[Array | np.ndarray, " k"]) -> Float[Array, " outputs"]:
+    def __call__(
+        self, observation: Float[Array | np.ndarray, "*batch k"]
+    ) -> Float[Array, "*batch outputs"]:
         """Return logits or values `[n]` of the actions, or the mean action `[size]`.
 
-        A continuous action is in units of half its range around the middle of it.
+        A continuous action is in units of half its range around the middle of it. A batch of
+        observations gives a batch of outputs.
         """
         if self.mean is not None and self.scale is not None:
             observation = (observation - self.mean) / self.scale

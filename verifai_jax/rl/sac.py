@@ -241,9 +241,9 @@ class SACState(NamedTuple):
 
 
 def squash_log_prob(
-    mean: Float[Array, "*batch actions"],
-    log_std: Float[Array, "*batch actions"],
-    noise: Float[Array, "*batch actions"],
+    mean: Float[Array, "*#batch actions"],
+    log_std: Float[Array, "*#batch actions"],
+    noise: Float[Array, "*#batch actions"],
 ) -> Float[Array, "*batch"]:
     """Compute the log density of `tanh(mean + exp(log_std) * noise)`, a vector in the unit cube.
 

@@ -8,12 +8,13 @@ together (`confidence_sequences`).
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from verifai_jax.core.checks import check_fraction
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 
+@runtime_checkable
 class StoppingRule(Protocol):
     """A rule that ends a run of prior samples; `falsify(..., stop_when=rule)`."""
 

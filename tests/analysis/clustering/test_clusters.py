@@ -3,6 +3,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
+from checked_types import unchecked
 from sklearn.metrics import adjusted_rand_score
 
 from verifai_jax.analysis.clustering import density
@@ -164,7 +165,10 @@ def test_absent_items_are_a_kind():
 
 def test_refused():
     frame, _ = blobs()
-    with pytest.raises(ValueError, match=r"method must be one of 'auto', .*got 'means'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"method must be one of 'auto', .*got 'means'"),
+    ):
         clusters(frame, "means")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"k-means needs an ordered column.*weather is unordered"):
         clusters(frame, "kmeans", columns=["weather"])

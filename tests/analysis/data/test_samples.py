@@ -2,6 +2,7 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.analysis.data.samples import Samples, generator
 from verifai_jax.core.errors import UnknownNameError
@@ -204,9 +205,15 @@ def test_refused():
     frame = pd.DataFrame({"speed": [1.0], "alg": ["a"]})
     with pytest.raises(UnknownNameError, match="unknown column 'sped'; did you mean 'speed'"):
         Samples.of(frame, columns=["sped"])
-    with pytest.raises(ValueError, match=r"must be one of 'counterexamples', 'safe', .*got 'good'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"must be one of 'counterexamples', 'safe', .*got 'good'"),
+    ):
         Samples.of(frame, "good")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="come from a run, its table or a DataFrame; got list"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match="come from a run, its table or a DataFrame; got list"),
+    ):
         Samples.of([1, 2])  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="'alg' is named twice"):
         Samples.of(frame, columns=["alg", "speed", "alg"])
@@ -218,7 +225,10 @@ def test_refused():
         Samples.of(pd.concat([frame, frame]))
     with pytest.raises(ValueError, match="'speed' is infinite in row 1"):
         Samples.of(pd.DataFrame({"speed": [1.0, np.inf]}))
-    with pytest.raises(ValueError, match=r"scale must be one of 'range', 'rows', .*got 'log'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"scale must be one of 'range', 'rows', .*got 'log'"),
+    ):
         Samples.of(frame).matrix("log")  # pyright: ignore[reportArgumentType]
     with pytest.raises(UnknownNameError, match="unknown column 'gears'"):
         Samples.of(frame, space=SPACE)

@@ -76,8 +76,8 @@ def count_occupied(
     untried: list[tuple[Any, ...]] = []
     missing = 0
     for i, one in enumerate(rows):
-        seen = _count(one, counts[i]) > 0
-        prior = one.prior if allowed is None else _shares(_count(allowed[i], counts[i]))
+        seen = _count(one, len(one.prior)) > 0
+        prior = one.prior if allowed is None else _shares(_count(allowed[i], len(one.prior)))
         real = seen | (prior > 0)
         table[i, :3] = real.sum(), np.mean(seen[real]), np.mean(_chance(prior[real], n))
         if one.single_values:
