@@ -16,9 +16,9 @@ leader and half to its likeliest rivals (top-two sampling: Russo, Simple Bayesia
 best-arm identification, Operations Research 68, 2020). The chance decides when to stop and is no
 bound; nothing is certified by it.
 
-**Verdicts** stand on bounds that hold at any time (`statistics/confidence_sequences.py`), so they are right whatever this
-file decides. An open policy is simulated further where its observed rate promises a decision within
-the budget, the nearest decisions first.
+**Verdicts** stand on bounds that hold at any time (`statistics/confidence_sequences.py`), so they
+are right whatever this file decides. An open policy is simulated further where its observed rate
+promises a decision within the budget, the nearest decisions first.
 """
 
 import math
