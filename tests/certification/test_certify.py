@@ -100,7 +100,7 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
         return memo[key]
 
     again = certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=recalled)
-    assert again.table().equals(certificates.table())
+    assert again.table.equals(certificates.table)
     # A part of it is enough: the others are simulated as they were.
     random = np.random.default_rng(0)
     some = {key: memo[key] for key in memo if random.random() < 0.5}
@@ -109,7 +109,7 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
         return some[key] if key in some else compute()
 
     again = certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=partly)
-    assert again.table().equals(certificates.table())
+    assert again.table.equals(certificates.table)
 
 
 def test_order_company_and_devices_change_nothing(certificates):
@@ -118,8 +118,8 @@ def test_order_company_and_devices_change_nothing(certificates):
         problem_of, [POLICIES[i] for i in order], p=0.1, samples=128, seed=3,
         devices=jax.devices()[:1],
     )  # fmt: skip
-    table = other.table().assign(policy=order).sort_values("policy").reset_index(drop=True)
-    assert table.equals(certificates.table())
+    table = other.table.assign(policy=order).sort_values("policy").reset_index(drop=True)
+    assert table.equals(certificates.table)
     assert order[other.safest] == certificates.safest
 
 
@@ -131,8 +131,8 @@ def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
         attack_simulations=0,
     )  # fmt: skip
     columns = ["failures", "not_finite"]
-    first = other.table()[columns][other.table()["simulations"] == 128]
-    expected = certificates.table()[columns].loc[first.index]
+    first = other.table[columns][other.table["simulations"] == 128]
+    expected = certificates.table[columns].loc[first.index]
     assert len(first) >= 2
     assert first.equals(expected)
 
@@ -235,10 +235,10 @@ def outside(policy):
 def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
     some = [POLICIES[2]]
     options = {"p": 0.05, "samples": 64, "budget": 64, "attack_simulations": 64}
-    expected = certify(problem_of, some, **options).table()
+    expected = certify(problem_of, some, **options).table
     for make, told in [(untraceable, "compiled one by one: policy 0; JAX"), (outside, None)]:
         found = certify(make, some, **options)
-        assert found.table()["failures"].tolist() == expected["failures"].tolist()
+        assert found.table["failures"].tolist() == expected["failures"].tolist()
         assert [note[: len(told)] for note in found.notes] == [told] if told else not found.notes
 
 

@@ -120,8 +120,9 @@ class Certificates:
         """Samples if every policy had had as many as the one that needed most."""
         return len(self.rows) * max((row.simulations for row in self.rows), default=0)
 
+    @property
     def table(self) -> "pd.DataFrame":
-        """Return one row a policy, in the order they were given."""
+        """A row for each policy, in the order they were given."""
         import pandas as pd
 
         def bound(row: Certificate, name: str) -> float:
@@ -167,7 +168,7 @@ class Certificates:
         shown = order if len(order) <= 16 else order[:12]
         lines += [f"  {row}" for row in shown]
         if len(shown) < len(order):
-            lines.append(f"  ... and {len(order) - len(shown)} more: .table()")
+            lines.append(f"  ... and {len(order) - len(shown)} more: .table")
         equal = (
             f"; the same number for every policy would be {self.uniform:,}"
             if self.uniform > self.simulations
