@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help falsify test test-all lint notebooks notebooks-update bench policy wheel clean
+.PHONY: help falsify test test-slow test-all lint notebooks notebooks-update bench policy wheel clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
@@ -40,13 +40,15 @@ falsify: .venv/installed
 # Tests of one file share what they compile, so a file stays with one worker; long files begin.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# Quick tests compile without most of XLA's optimisations, in two thirds of the time; test-all
-# compiles as a user does.
+# Quick tests compile without most of XLA's optimisations, in two thirds of the time; slow ones
+# compile as a user does.
 test: .venv/installed
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
 
-test-all: .venv/installed
-	$(PYTEST) -m "slow or not slow"
+test-slow: .venv/installed
+	$(PYTEST) -m slow
+
+test-all: test test-slow
 
 lint: .venv/lint
 	$(BIN)/ruff check .
