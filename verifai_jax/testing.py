@@ -128,21 +128,21 @@ def check_search(
     ) -> tuple[PyTree, list[np.ndarray]]:
         points = []
         for _ in range(first, last):
-            u, asked = ask(state, cube, batch)
+            u, pending = ask(state, cube, batch)
             assert u.shape == (batch, cube.dim), (
                 f"ask must give shape {[batch, cube.dim]}; got {list(u.shape)}"
             )
             assert u.dtype == jnp.float32, f"ask must give float32; got {u.dtype}"
             assert bool(jnp.all((u >= 0) & (u <= 1))), "points must stay in [0, 1]"
             if search.wants_gradient:
-                tau = search.temperature(asked)
+                tau = search.temperature(pending)
                 assert tau.shape == (), f"temperature must be a scalar; got shape {tau.shape}"
                 assert bool(tau > 0), f"temperature must be positive; got {tau}"
-            told = _evaluate(u, search, asked, cube)
+            observations = _evaluate(u, search, pending, cube)
             if spoil is not None:
-                told = _spoiled(told, odd, spoil)
-            state = tell(asked, cube, told)
-            _same_type(asked, state)
+                observations = _spoiled(observations, odd, spoil)
+            state = tell(pending, cube, observations)
+            _same_type(pending, state)
             points.append(np.asarray(u))
         return state, points
 
@@ -163,15 +163,15 @@ def check_search(
         assert np.all(np.isfinite(points)), "points must be finite"
 
     # What a constraint does: some rows are those of the second proposals, some stay refused.
-    first, asked = ask(state, cube, batch)
-    second, asked = ask(asked, cube, batch)
-    mixed = _evaluate(jnp.where(odd[:, None], second, first), search, asked, cube)
+    first, pending = ask(state, cube, batch)
+    second, pending = ask(pending, cube, batch)
+    mixed = _evaluate(jnp.where(odd[:, None], second, first), search, pending, cube)
     refused = mixed._replace(valid=mixed.valid & (np.arange(batch) % 4 != 0))
-    after = tell(asked, cube, refused)
-    _same_type(asked, after)
+    after = tell(pending, cube, refused)
+    _same_type(pending, after)
 
     earlier = jax.random.uniform(jax.random.key(seed + 1), (batch, cube.dim), jnp.float32)
-    rho = _evaluate(earlier, search, asked, cube).rho
+    rho = _evaluate(earlier, search, pending, cube).rho
     warmed = warm(state, cube, Observations(earlier, rho, jnp.ones(batch, bool)))
     _same_type(state, warmed, "warm_start")
     for beginning in (after, warmed):
@@ -248,11 +248,13 @@ def check_system(
             message = f"simulation {i} failed only in a batch: {outcome.message}"
             assert outcome.trace is not None, message
             _agree(alone[i], outcome.trace, tolerance, "one by one, and called alone")
-    told = system.abstract(forms)
-    if told is not None:
-        shapes = {name: tuple(signal.shape) for name, signal in told.signals.items()}
-        given = {name: np.shape(signal) for name, signal in alone[0].signals.items()}
-        assert shapes == given, f"abstract must tell the signals' shapes {given}; got {shapes}"
+    form = system.abstract(forms)
+    if form is not None:
+        shapes = {name: tuple(signal.shape) for name, signal in form.signals.items()}
+        simulated = {name: np.shape(signal) for name, signal in alone[0].signals.items()}
+        assert shapes == simulated, (
+            f"abstract must give the signals' shapes {simulated}; got {shapes}"
+        )
 
 
 def _check_trace(trace: object) -> None:
@@ -324,14 +326,15 @@ def _status(trace: Trace) -> str:
     return Status(0 if trace.status is None else int(trace.status)).name
 
 
-def _evaluate(u: Array, search: Search, asked: PyTree, cube: Cube) -> Observations:
+def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observations:
     """Evaluate a bowl with its bottom, and failures, off the middle, as the search wants it."""
     offset = u - 0.3
-    rho, slope = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
-    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    rho, gradient = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
+    valid = jnp.ones(len(u), bool)
+    observations = Observations(u, rho, valid, gradient if search.wants_gradient else None)
     if not search.wants_clauses:
-        return told
-    plan = search.plan(asked, cube, len(u))
+        return observations
+    plan = search.plan(pending, cube, len(u))
     assert plan.temperature.shape == (len(u),), (
         f"the plan must have a temperature for each row; got shape {plan.temperature.shape}"
     )
@@ -339,26 +342,26 @@ def _evaluate(u: Array, search: Search, asked: PyTree, cube: Cube) -> Observatio
         f"the plan must be for 1 to {len(u)} rows; got {plan.rows}"
     )
     clauses = jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho)
-    gradients = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(slope)
-    return told._replace(
+    gradients = jnp.zeros((len(u), CLAUSES, cube.dim)).at[:, 0].set(gradient)
+    return observations._replace(
         valid=jnp.arange(len(u)) < plan.rows,
         clauses=clauses,
         clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),
     )
 
 
-def _spoiled(told: Observations, rows: np.ndarray, value: float) -> Observations:
+def _spoiled(observations: Observations, rows: np.ndarray, value: float) -> Observations:
     def spoil(leaf: Array | None) -> Any:
         if leaf is None:
             return None
         return jnp.where(rows.reshape(-1, *(1,) * (leaf.ndim - 1)), value, leaf)
 
-    return told._replace(
-        rho=spoil(told.rho),
-        valid=told.valid & ~rows,
-        gradient=spoil(told.gradient),
-        clauses=spoil(told.clauses),
-        clause_gradients=spoil(told.clause_gradients),
+    return observations._replace(
+        rho=spoil(observations.rho),
+        valid=observations.valid & ~rows,
+        gradient=spoil(observations.gradient),
+        clauses=spoil(observations.clauses),
+        clause_gradients=spoil(observations.clause_gradients),
     )
 
 

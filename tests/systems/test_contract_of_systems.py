@@ -56,7 +56,7 @@ class Other(Host):
         return jax.vmap(lambda f, k: ramp({"x0": 2 * f["x0"]}, k))(features, keys)
 
 
-class Mistold(Host):
+class WrongForm(Host):
     def abstract(self, features):
         return jax.eval_shape(lambda: Trace({"x": jnp.zeros(9)}, dt=0.25))
 
@@ -75,7 +75,7 @@ CALLS = iter(range(100))
         (lambda f, key: Trace({"x": jnp.ones(2) * next(CALLS)}, dt=1.0), "same trace for the same"),
         (Twice(), "each of 4 indices once; got"),
         (Other(), "in a batch, and called alone: signal 'x' differs by"),
-        (Mistold(), r"abstract must tell the signals' shapes \{'x': \(5,\)\}; got"),
+        (WrongForm(), r"abstract must give the signals' shapes \{'x': \(5,\)\}; got"),
         (
             lambda f, key: dataclasses.replace(ramp(f, key), valid=jnp.int32(2), held=True),
             "must repeat its last valid sample; 'x' does not",

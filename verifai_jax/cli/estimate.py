@@ -20,7 +20,7 @@ from verifai_jax.cli.arguments import (
 
 @click.command()
 @TARGET
-@click.option("--method", help="monte_carlo, importance or splitting [chosen by what it sees].")
+@click.option("--method", help="monte_carlo, importance or splitting  [default: chosen]")
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
 @click.option("--p0", type=float, help="Probability that it should be below.")
 @click.option("--confidence", type=float, default=0.95, show_default=True)
