@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.evaluation import engine as engine_module
@@ -371,7 +372,7 @@ class TestRefusedBeforeAnythingCompiles:
             vj.falsify(problem, max_second=3)
         with pytest.raises(ValueError, match=r"'elit'.*did you mean 'elite"):
             vj.search.named("cross_entropy", elit=0.1)
-        with pytest.raises(ValueError, match="'controler'; did you mean 'controller'"):
+        with unchecked(), pytest.raises(ValueError, match="'controler'; did you mean 'controller'"):
             vj.ode(None, None, dt=0.1, steps=3, controler=None)
 
     def test_a_misspelt_feature_names_itself(self):
@@ -423,5 +424,5 @@ class TestProblems:
     )
     def test_bad_parts_are_refused_where_they_are_made(self, changes, message):
         parts = {"name": "p", "space": SPACE, "system": ramp, "spec": "always x <= 1"} | changes
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             vj.Problem(parts.pop("name"), **parts)

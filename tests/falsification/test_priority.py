@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 
@@ -94,5 +95,8 @@ class TestStopWhen:
     def test_only_for_prior_samples(self, plain):
         with pytest.raises(ValueError, match="stop_when needs independent samples"):
             vj.falsify(plain, "cross_entropy", stop_when=vj.Within(0.05))
-        with pytest.raises(TypeError, match=r"a rule such as Within\(0.005\); got 0.05"):
+        with (
+            unchecked(),
+            pytest.raises(TypeError, match=r"a rule such as Within\(0.005\); got 0.05"),
+        ):
             vj.falsify(plain, "uniform", stop_when=0.05)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 
@@ -58,7 +59,7 @@ def test_refuses_what_needs_the_host(problem):
     ]
     for change, message in cases:
         parts = {"space": SPACE, "system": hill, "spec": "x > 0", **change}
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             vj.repeat(vj.Problem("hill", **parts), "uniform", 8)
     with pytest.raises(ValueError, match="seeds must be a number or a list"):
         vj.repeat(problem, "uniform", 8, seeds=[])

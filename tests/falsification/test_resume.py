@@ -6,6 +6,7 @@ import shutil
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax import search
@@ -161,7 +162,7 @@ class TestRefused:
         assert same(resumed, vj.falsify(problem, Own(), 32, batch=16))
 
     def test_a_search_without_the_base(self, problem):
-        with pytest.raises(TypeError, match="search must be a name or a search"):
+        with unchecked(), pytest.raises(TypeError, match="search must be a name or a search"):
             vj.falsify(problem, search.CrossEntropy)
 
 
@@ -194,5 +195,8 @@ class TestWarmStart:
         table = vj.falsify(problem, "uniform", 16, batch=16).table.all
         with pytest.raises(ValueError, match="unknown column of warm_start 'kind'"):
             vj.falsify(problem, warm_start=table.drop(columns="kind"))
-        with pytest.raises(TypeError, match="a run, an error table or a DataFrame; got 3"):
+        with (
+            unchecked(),
+            pytest.raises(TypeError, match="a run, an error table or a DataFrame; got 3"),
+        ):
             vj.falsify(problem, warm_start=3)

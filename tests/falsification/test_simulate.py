@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.cube import Cube
@@ -62,7 +63,7 @@ def test_contract():
     ],
 )
 def test_bad_input(problem, make, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         make(problem)
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from click.testing import CliRunner
 from scipy.optimize import brentq
 
@@ -233,7 +234,7 @@ def test_a_simulation_without_a_verdict_is_no_repair():
     ],
 )
 def test_bad_input(make, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         make()
 
 

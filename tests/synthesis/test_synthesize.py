@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from checked_types import unchecked
 from click.testing import CliRunner
 
 import verifai_jax as vj
@@ -245,7 +246,7 @@ def test_parameters_of_every_kind_can_be_held():
     ],
 )
 def test_bad_input(options, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         synthesize(first_order, **options)
 
 

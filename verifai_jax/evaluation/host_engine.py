@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
@@ -121,7 +121,7 @@ class HostEngine:
         self,
         features: PyTree,
         keys: Key[Array, " n"],
-        seeds: Int[np.ndarray, " n"],
+        seeds: Integer[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"] | None,
         first: int,
     ) -> Verdicts:
@@ -149,7 +149,7 @@ class HostEngine:
     def _one_by_one(
         self,
         features: PyTree,
-        seeds: Int[np.ndarray, " n"],
+        seeds: Integer[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"] | None,
         first: int,
         rows: "_Rows",

@@ -150,7 +150,7 @@ class Run:
         return late("verifai_jax.analysis", "analyze")(self, **options)
 
     def replay(
-        self, row: "int | pd.Series | Mapping[str, Any]", precision: str | None = None
+        self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
     ) -> Replay:
         """Simulate a row of the table again and keep its trace.
 
@@ -166,13 +166,13 @@ class Run:
                 f"the run of {self.name!r} was loaded without its problem; "
                 "give it: vj.load(path, problem)"
             )
-        number: int | None
         if isinstance(row, (int, np.integer)):
             if not 0 <= row < len(self.table):
                 raise IndexError(f"row {row} is not in the table of {len(self.table)} simulations")
             number, values = int(row), self.table.all.iloc[int(row)]
         else:
-            number, values = getattr(row, "name", None), row
+            index = getattr(row, "name", None)
+            number, values = None if index is None else int(index), row
         precision = self.precision if precision is None else precision
         return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
 

@@ -44,7 +44,7 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
             label=f"{name}: {clusters.entry(cluster, 'size'):,}",
         )
         if cluster >= 0:
-            one = samples.at([clusters.entry(cluster, "representative")])
+            one = samples.at([int(clusters.entry(cluster, "representative"))])
             axes.scatter(
                 positions(samples, across, one),
                 positions(samples, up, one),

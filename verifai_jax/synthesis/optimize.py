@@ -210,7 +210,7 @@ def climb(
 
 def has_gradients(loop: Parametric) -> bool:
     """Return whether there are gradients, or few enough parameters for differences."""
-    return loop.differentiable or (loop.bounded and 0 < loop.free.sum() <= MOST_DIFFERENCES)
+    return loop.differentiable or (loop.bounded and 0 < int(loop.free.sum()) <= MOST_DIFFERENCES)
 
 
 def _gradients(
