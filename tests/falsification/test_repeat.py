@@ -63,3 +63,24 @@ def test_refuses_what_needs_the_host(problem):
             vj.repeat(vj.Problem("hill", **parts), "uniform", 8)
     with pytest.raises(ValueError, match="seeds must be a number or a list"):
         vj.repeat(problem, "uniform", 8, seeds=[])
+
+
+@pytest.mark.parametrize("search", ["uniform", "portfolio"])
+@pytest.mark.parametrize("spec", ["always k < 7", "always k <= 7"])
+def test_a_failure_is_what_it_is_in_falsify(search, spec):
+    def system(features, key):
+        return vj.Trace({"k": jnp.full(3, features["k"])}, dt=1.0)
+
+    problem = vj.Problem("counts", {"k": vj.DiscreteBox(0, 9)}, system, spec)
+    trials = vj.repeat(problem, search, budget=32, batch=16, seeds=3, stop_early=False)
+    assert np.any(trials.rho == 0)
+    for seed in range(3):
+        run = vj.falsify(problem, search, budget=32, batch=16, seed=seed, confirm=False)
+        violated = run.table.all["violated"].to_numpy()
+        count = min(len(violated), trials.violated.shape[1])
+        np.testing.assert_array_equal(trials.violated[seed, :count], violated[:count])
+        if violated.any():
+            first = int(violated.argmax())
+            assert trials.first_failure[seed] == first + 1
+            point = problem.space.flatten({"k": int(run.table.all["k"].iloc[first])})
+            np.testing.assert_allclose(trials.failures[seed], point, atol=0.05)
