@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.trace import Status, Trace
 
@@ -60,7 +61,7 @@ def test_signals_keep_the_order_written():
     ],
 )
 def test_bad_traces_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         Trace(**arguments)
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Trace
@@ -174,11 +175,17 @@ def test_vectors():
         lambda p: robustness("X (norm(p) <= 1)", Trace({"p": p}, dt=1.0), smooth(0.1))
     )(jnp.asarray(trace["p"]))
     assert np.isfinite(gradient).all()
-    with pytest.raises(TypeError, match=r"'p' is a vector of 2 components .* p\[0\], or norm\(p\)"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"'p' is a vector of 2 components .* p\[0\], or norm\(p\)"),
+    ):
         robustness("p > 0", trace)
-    with pytest.raises(TypeError, match=r"'x' is a scalar: x\[0\] needs a vector"):
+    with unchecked(), pytest.raises(TypeError, match=r"'x' is a scalar: x\[0\] needs a vector"):
         robustness("x[0] > 0", trace)
-    with pytest.raises(TypeError, match=r"'p' has 2 components, counted from 0; got p\[2\]"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"'p' has 2 components, counted from 0; got p\[2\]"),
+    ):
         robustness("p[2] > 0", trace)
 
 
@@ -200,19 +207,25 @@ def test_an_unknown_signal_is_named_with_the_nearest():
 
 def test_wrong_options_are_refused():
     trace = Trace({"x": np.ones(5)}, dt=0.02)
-    with pytest.raises(ValueError, match="end is 'hold', 'truncate' or 'strict'; got 'wrap'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="end is 'hold', 'truncate' or 'strict'; got 'wrap'"),
+    ):
         robustness("x > 0", trace, end="wrap")
-    with pytest.raises(ValueError, match="compat is None or 'pymtl'; got 'rtamt'"):
+    with unchecked(), pytest.raises(ValueError, match="compat is None or 'pymtl'; got 'rtamt'"):
         robustness("x > 0", trace, compat="rtamt")
-    with pytest.raises(TypeError, match="semantics is hard, boolean or smooth"):
+    with unchecked(), pytest.raises(TypeError, match="semantics is hard, boolean or smooth"):
         robustness("x > 0", trace, smooth)
-    with pytest.raises(TypeError, match="a formula or its text is needed; got 3"):
+    with unchecked(), pytest.raises(TypeError, match="a formula or its text is needed; got 3"):
         robustness(3, trace)
-    with pytest.raises(ValueError, match="tau must be positive; got 0"):
+    with unchecked(), pytest.raises(ValueError, match="tau must be positive; got 0"):
         smooth(0)
     with pytest.raises(ValueError, match="a temperature tau or an error"):
         smooth()
-    with pytest.raises(ValueError, match="bound is 'none', 'lower' or 'upper'; got 'both'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="bound is 'none', 'lower' or 'upper'; got 'both'"),
+    ):
         smooth(1.0, bound="both")
 
 
@@ -303,6 +316,6 @@ def test_formulas_are_static_and_equal_by_value():
     assert len(calls) == 1
     assert hash(parse("G[0,1] (x > 0)")) == hash(always(signal("x") > 0, 0, 1))
     assert parse("x > 0") != parse("x >= 0")
-    with pytest.raises(TypeError, match=r"no truth value.*write a < x < b as"):
+    with unchecked(), pytest.raises(TypeError, match=r"no truth value.*write a < x < b as"):
         bool((signal("x") > 0) and (signal("x") < 1))
     assert isinstance(ast.TRUE & (signal("x") > 0), ast.And)

@@ -1,6 +1,7 @@
 """The text of formulas: what parses, what it means, and the wording of every refusal."""
 
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.mtl import (
     FALSE,
@@ -152,11 +153,14 @@ def test_constants_and_definitions():
     assert formula == always(((Y > 1) & (X > 0.1)) >> (X < 2.5), 0, 3)
     with pytest.raises(ValueError, match="'T' is both a constant and a definition"):
         parse("T", constants={"T": 3}, definitions={"T": "x > 0"})
-    with pytest.raises(ValueError, match="a definition's name must be an identifier; got 'a b'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="a definition's name must be an identifier; got 'a b'"),
+    ):
         parse("x > 0", definitions={"a b": "x > 0"})
     with pytest.raises(FormulaSyntaxError):
         parse("safe", definitions={"safe": "x >"})
-    with pytest.raises(TypeError, match="a formula's text is a str; got int"):
+    with unchecked(), pytest.raises(TypeError, match="a formula's text is a str; got int"):
         parse(3)
 
 
@@ -165,11 +169,17 @@ def test_python_refuses_what_makes_no_sense():
         always(X > 0, 3, 1)
     with pytest.raises(ValueError, match=r"starts at a finite time, at least 0; got \[-1,1\]"):
         always(X > 0, -1, 1)
-    with pytest.raises(TypeError, match="a number or a signal is needed here; got 'three'"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match="a number or a signal is needed here; got 'three'"),
+    ):
         X > "three"  # noqa: B015
-    with pytest.raises(TypeError, match="a formula is needed here; got 3"):
+    with unchecked(), pytest.raises(TypeError, match="a formula is needed here; got 3"):
         always(3)
-    with pytest.raises(ValueError, match="a number in a formula must be finite; got nan"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="a number in a formula must be finite; got nan"),
+    ):
         float("nan") < X  # noqa: B015
     with pytest.raises(ValueError, match="only a signal has components"):
         (X + 1)[0]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations
@@ -174,5 +175,5 @@ def test_batches_of_one():
     ],
 )
 def test_values_out_of_range(options, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         Annealing(**options)

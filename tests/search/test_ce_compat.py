@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations
@@ -151,7 +152,7 @@ def test_contract(cube):
     ],
 )
 def test_values_out_of_range(make, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         make()
 
 
@@ -163,5 +164,5 @@ def test_values_out_of_range(make, message):
     ],
 )
 def test_spaces_that_do_not_fit(cube, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         CECompat().check(cube)

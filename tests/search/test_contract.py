@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from playing import tell_of
 
 from verifai_jax.core.cube import Cube
@@ -47,7 +48,7 @@ EACH = [
 def test_contract(search, cube):
     refused = REFUSED.get((type(search).__name__, cube))
     if refused is not None:
-        with pytest.raises(ValueError, match=refused):
+        with unchecked(), pytest.raises(ValueError, match=refused):
             search.check(cube)
         return
     check_search(search, cube)
@@ -134,7 +135,7 @@ class TestNames:
         ],
     )
     def test_misspelt(self, name, options, message):
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             named(name, **options)
 
     @pytest.mark.parametrize(
@@ -158,5 +159,5 @@ class TestNames:
         ],
     )
     def test_values_out_of_range(self, make, message):
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             make()

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform
@@ -65,13 +66,22 @@ def test_it_is_what_the_search_inside_is():
 
 
 def test_refusals():
-    with pytest.raises(TypeError, match=r"Diverse needs a search like CrossEntropy\(\); got 'ce'"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"Diverse needs a search like CrossEntropy\(\); got 'ce'"),
+    ):
         Diverse("ce")
-    with pytest.raises(ValueError, match=r"radius must be in \(0, 1\]; got 2"):
+    with unchecked(), pytest.raises(ValueError, match=r"radius must be in \(0, 1\]; got 2"):
         Diverse(Uniform(), radius=2)
-    with pytest.raises(ValueError, match=r"least_radius must be at most radius, 0.1; got 0.2"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match=r"least_radius must be at most radius, 0.1; got 0.2"),
+    ):
         Diverse(Uniform(), radius=0.1, least_radius=0.2)
-    with pytest.raises(ValueError, match="patience must be an integer of at least 1; got 0"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="patience must be an integer of at least 1; got 0"),
+    ):
         Diverse(Uniform(), patience=0)
 
 

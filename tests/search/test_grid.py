@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.grid import Grid
@@ -107,7 +108,7 @@ def test_contract_of_many_dimensions():
     ],
 )
 def test_spaces_that_do_not_fit(search, cube, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         search.check(cube)
 
 
@@ -120,5 +121,5 @@ def test_spaces_that_do_not_fit(search, cube, message):
     ],
 )
 def test_values_out_of_range(points, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         Grid(points)

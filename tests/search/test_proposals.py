@@ -51,7 +51,7 @@ def test_every_search(name):
     assert np.all(jax.vmap(below)(features))
     # Differentiated rounds have few rows.
     assert len(points) >= (16 if search.wants_clauses else 64)
-    assert proposals.accepted == len(points) <= proposals.asked
+    assert proposals.accepted == len(points) <= proposals.proposed
     again = play(Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint), 8, search.wants_gradient)
     np.testing.assert_array_equal(points, again)
 
@@ -63,7 +63,7 @@ def test_a_search_goes_on_from_its_snapshot_under_a_constraint():
         two = Proposals(named(name), SPACE.cube, 16, jax.random.key(99), SPACE.constraint)
         two.restore(one.snapshot())
         np.testing.assert_array_equal(play(one, 3, False), play(two, 3, False))
-        assert (one.asked, one.accepted) == (two.asked, two.accepted)
+        assert (one.proposed, one.accepted) == (two.proposed, two.accepted)
 
 
 def test_accepted_samples_follow_the_prior_given_the_constraint():

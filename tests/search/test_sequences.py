@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from scipy import stats
 
 from verifai_jax.core.cube import Cube
@@ -80,7 +81,7 @@ class TestHalton:
         ],
     )
     def test_what_cannot_be_skipped(self, options, message):
-        with pytest.raises(ValueError, match=message):
+        with unchecked(), pytest.raises(ValueError, match=message):
             Halton(**options)
 
     def test_large_indices(self):

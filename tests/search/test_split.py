@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from playing import tell_of
 
 from verifai_jax.core.cube import Cube
@@ -99,10 +100,13 @@ def test_json(search):
     ],
 )
 def test_bad_input(make, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         make()
 
 
 def test_a_part_that_is_no_search():
-    with pytest.raises(TypeError, match="the part 'x' of a Split must be a search; got 3"):
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match="the part 'x' of a Split must be a search; got 3"),
+    ):
         Split({"x": 3}, Uniform())

@@ -15,9 +15,10 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Int, Real
 
-Samples: TypeAlias = Float[Array | np.ndarray, "time *k"]
+Samples: TypeAlias = Real[Array | np.ndarray, "time *k"] | Bool[Array | np.ndarray, "time *k"]
+"""A signal, one row a sample; truth values count as +1 and -1."""
 
 
 class Status(enum.IntEnum):
@@ -52,9 +53,9 @@ class Trace:
 
     signals: Mapping[str, Samples]
     dt: float | None = None
-    times: Float[Array | np.ndarray, " time"] | None = None
-    valid: Int[Array, ""] | int | None = None
-    status: Int[Array, ""] | int | None = None
+    times: Real[Array | np.ndarray, " time"] | None = None
+    valid: Int[Array | np.ndarray, "*batch"] | np.integer | int | None = None
+    status: Int[Array | np.ndarray, "*batch"] | np.integer | int | None = None
     held: bool = False
     finite: tuple[str, ...] = ()
 
@@ -90,7 +91,7 @@ class Trace:
         """Number of samples stored (valid or not)."""
         return np.shape(next(iter(self.signals.values())))[0]
 
-    def clock(self) -> Float[Array, " time"]:
+    def clock(self) -> Real[Array, " time"]:
         """Return the sample times `[time]` in seconds."""
         if self.times is not None:
             return jnp.asarray(self.times)

@@ -12,7 +12,7 @@ from typing import Any, TypeGuard, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.errors import unknown_name
@@ -37,7 +37,10 @@ class Waveform:
       the last value hold.
     """
 
-    knots: Float[Array, "knots *shape"]
+    # JAX rebuilds the class with placeholders and with batches, which have other shapes.
+    __no_type_check__ = True
+
+    knots: Float[Array | np.ndarray, "knots *shape"]
     hold: str = field(default="linear", metadata={"static": True})
     duration: float | None = field(default=None, metadata={"static": True})
 
@@ -52,7 +55,9 @@ class Waveform:
         """
         return replace(self, duration=check_duration(duration))
 
-    def __call__(self, time: Float[Array, ""] | float) -> Float[Array, "*shape"]:
+    def __call__(
+        self, time: Real[Array, ""] | np.number | float
+    ) -> Float[Array | np.ndarray, "*shape"] | np.floating:
         """Return the value at a time in seconds.
 
         **Raises:** `ValueError` without a duration.

@@ -128,7 +128,7 @@ class Rounds:
         """Share of proposed points that the constraint let through; None without one."""
         if self.problem.space.where is None or self._proposals is None:
             return None
-        return self._proposals.accepted / max(self._proposals.asked, 1)
+        return self._proposals.accepted / max(self._proposals.proposed, 1)
 
     def advance(self, most: int) -> None:
         """Ask, evaluate, tell and store at most `most` simulations."""

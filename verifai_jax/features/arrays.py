@@ -140,7 +140,7 @@ class Items:
         places = jax.tree.leaves(self.values)[0].shape[jnp.ndim(self.length)]
         return jnp.arange(places) < jnp.asarray(self.length)[..., None]
 
-    def __getitem__(self, name: str) -> PyTree:
+    def __getitem__(self, name: str | int) -> PyTree:
         return self.values[name]
 
     def cleared(self, absent: PyTree) -> "Items":

@@ -397,7 +397,7 @@ def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
 
 
 def _but(
-    x: Float[Array, ""], condition: Bool[Array, ""], value: float | np.ndarray
+    x: Float[Array, ""], condition: Bool[Array, ""], value: float | np.floating
 ) -> Float[Array, ""]:
     """Replace `x` by `value` where the condition holds, and keep the derivative of `x` there.
 

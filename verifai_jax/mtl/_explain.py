@@ -12,12 +12,11 @@ operand that decides each minimum or maximum finds it.
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
@@ -25,7 +24,7 @@ from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import prepare, seconds
+from verifai_jax.mtl.setting import Setting, prepare, seconds
 
 
 @dataclass(frozen=True)
@@ -166,7 +165,7 @@ def _distinct(formula: Formula) -> tuple[Formula, ...]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _all_values(setting: Any, signals: Any) -> list[Any]:
+def _all_values(setting: Setting, signals: dict[str, Array]) -> list[Array]:
     """Compute every sub-formula, each to where it settles and at least to the last sample."""
     e = Evaluator(signals, setting.length, setting.dt, end=setting.end)
     values = []
@@ -177,12 +176,14 @@ def _all_values(setting: Any, signals: Any) -> list[Any]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _influence(setting: Any, signals: Any, tau: Any) -> list[Any]:
+def _influence(
+    setting: Setting, signals: dict[str, Array], tau: float | Float[Array, ""]
+) -> list[Float[Array, " time"]]:
     """Compute the gradient of the smooth robustness with respect to every leaf at every sample."""
     leaves = [f for f in _distinct(setting.formula) if isinstance(f, ast.Predicate | ast.Atom)]
     dtype = next(iter(signals.values())).dtype if signals else jnp.result_type(float)
 
-    def rho(nudges: list[Any]) -> Any:
+    def rho(nudges: list[Array]) -> Array:
         e = Evaluator(
             signals,
             setting.length,
@@ -217,19 +218,20 @@ class _Walk:
         return float(values[min(i, len(values) - 1)])
 
     def node(self, f: Formula, i: int, decides: bool) -> Node:
-        asked = self.asked(f, i)
-        chosen = self.chosen(f, i, asked) if decides else None
-        if not asked:
+        operands = self.operands(f, i)
+        deciding = self.deciding(f, i, operands) if decides else None
+        if not operands:
             children = ()
         else:
             children = tuple(
-                self.node(part, j, decides and n == chosen) for n, (part, j) in enumerate(asked)
+                self.node(part, j, decides and k == deciding)
+                for k, (part, j) in enumerate(operands)
             )
         return Node(
             f, self.time(i), self.at(f, i), decides, children, self.series[f][: self.last + 1]
         )
 
-    def asked(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
+    def operands(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
         """Return the operands at the instants that matter for `f` at `i`; none if vacuous."""
         match f:
             case ast.Not(p):
@@ -250,11 +252,11 @@ class _Walk:
                 return self.witness(p, q, self.behind(span, i), i, -1)
         return []
 
-    def chosen(self, f: Formula, i: int, asked: list[tuple[Formula, int]]) -> int | None:
+    def deciding(self, f: Formula, i: int, operands: list[tuple[Formula, int]]) -> int | None:
         """Return the number of the operand that has the value of `f`."""
-        if not asked:
+        if not operands:
             return None
-        values = [self.at(p, j) for p, j in asked]
+        values = [self.at(p, j) for p, j in operands]
         if isinstance(f, ast.Or):
             return int(np.argmax(values))
         return int(np.argmin(values)) if len(values) > 1 else 0
@@ -283,7 +285,7 @@ class _Walk:
         """Find where until (since) is most nearly fulfilled: the witness and the weakest link."""
         if not window:
             return []
-        best, found = -math.inf, None
+        best, place = -math.inf, None
         weakest, link = math.inf, i
         ordered = window if step > 0 else reversed(window)
         k = i
@@ -293,10 +295,10 @@ class _Walk:
                     weakest, link = self.at(p, k), k
                 k += step
             value = min(self.at(q, j), weakest)
-            if found is None or value > best:
-                best, found = value, (j, link)
-        assert found is not None
-        return [(p, found[1]), (q, found[0])] if found[0] != i else [(q, i)]
+            if place is None or value > best:
+                best, place = value, (j, link)
+        assert place is not None
+        return [(p, place[1]), (q, place[0])] if place[0] != i else [(q, i)]
 
 
 def _critical(
@@ -308,11 +310,11 @@ def _critical(
 ) -> tuple[Instant, ...]:
     """Find the greatest local peaks of each leaf's share over time."""
     total = sum(float(np.abs(share).sum()) for share in shares) or 1.0
-    found = []
+    instants = []
     for leaf, share in zip(leaves, shares, strict=True):
         share = np.abs(share) / total
         padded = np.concatenate([[-1.0], share, [-1.0]])
         peaks = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (share > 1e-4)
         for i in map(int, np.flatnonzero(peaks)):
-            found.append(Instant(leaf, walk.time(i), float(values[leaf][i]), float(share[i])))
-    return tuple(sorted(found, key=lambda instant: -instant.share)[:k])
+            instants.append(Instant(leaf, walk.time(i), float(values[leaf][i]), float(share[i])))
+    return tuple(sorted(instants, key=lambda instant: -instant.share)[:k])

@@ -54,7 +54,7 @@ class Online:
         """Return the state before any sample."""
         leaves = tuple(jnp.asarray(jnp.nan) for _ in _leaves(self.formula))
         machine = _Machine(self.dt, lambda f, sign: jnp.asarray(jnp.nan), jnp.int32(-1), {})
-        machine.anchored("", self.formula, 1)
+        machine.value_at_start("", self.formula, 1)
         return State(jnp.int32(0), leaves, machine.fresh)
 
     def step(self, state: State, sample: Mapping[str, Any]) -> State:
@@ -69,14 +69,14 @@ class Online:
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the least and greatest robustness at time 0 that further samples allow."""
-        return _ended(self, state, -math.inf), _ended(self, state, math.inf)
+        return _end_with(self, state, -math.inf), _end_with(self, state, math.inf)
 
     def finish(self, state: State) -> Float[Array, ""]:
         """Return the robustness at time 0 if the trace ends here and is held: the offline value.
 
         NaN before the first sample.
         """
-        return _ended(self, state, None)
+        return _end_with(self, state, None)
 
     @property
     def memory(self) -> int:
@@ -114,18 +114,18 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
         jnp.asarray(evaluator.value(f, 0, 0)[0], old.dtype)
         for f, old in zip(_leaves(monitor.formula), state.last, strict=True)
     )
-    return _advanced(monitor, state, last)
+    return _advance(monitor, state, last)
 
 
-def _advanced(monitor: Online, state: State, last: tuple[Array, ...]) -> State:
+def _advance(monitor: Online, state: State, last: tuple[Array, ...]) -> State:
     values = dict(zip(_leaves(monitor.formula), last, strict=True))
     machine = _Machine(monitor.dt, lambda f, sign: values[f], state.count, state.cells)
-    machine.anchored("", monitor.formula, 1)
+    machine.value_at_start("", monitor.formula, 1)
     return State(state.count + 1, last, machine.fresh)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 2), inline=True)
-def _ended(monitor: Online, state: State, unknown: float | None) -> Array:
+def _end_with(monitor: Online, state: State, unknown: float | None) -> Array:
     """Compute the value at time 0 if all further leaves are `unknown` (the last, if None)."""
     values = dict(zip(_leaves(monitor.formula), state.last, strict=True))
 
@@ -140,12 +140,12 @@ def _ended(monitor: Online, state: State, unknown: float | None) -> Array:
 
     def more(i: Array, cells: Cells) -> Cells:
         machine = _Machine(monitor.dt, leaf, state.count + i, cells)
-        machine.anchored("", monitor.formula, 1)
+        machine.value_at_start("", monitor.formula, 1)
         return machine.fresh
 
     cells = jax.lax.fori_loop(0, settling, more, state.cells)
     final = _Machine(monitor.dt, leaf, state.count + settling, cells)
-    return final.anchored("", monitor.formula, 1)
+    return final.value_at_start("", monitor.formula, 1)
 
 
 class _Machine:
@@ -171,10 +171,10 @@ class _Machine:
         default = jnp.full((n,) if n else (), start, value.dtype)
         return self.cells.get(path, default)
 
-    def pushed(self, path: str, value: Array, start: float, n: int) -> Array:
+    def push(self, path: str, value: Array, start: float, n: int) -> Array:
         """Return the last `n` values of a stream, the newest last."""
-        held = self.cell(path, value, start, n)
-        self.fresh[path] = jnp.concatenate([held[1:], value[None]])
+        before = self.cell(path, value, start, n)
+        self.fresh[path] = jnp.concatenate([before[1:], value[None]])
         return self.fresh[path]
 
     # Streams
@@ -217,18 +217,18 @@ class _Machine:
             case ast.Not(p):
                 return -self.stream(path + "0", p, -sign)
             case ast.And(parts) | ast.Or(parts):
-                values = self.aligned(path, parts, sign)
+                values = self.align(path, parts, sign)
                 join = jnp.minimum if isinstance(f, ast.And) else jnp.maximum
                 return functools.reduce(join, values)
             case ast.Next(p):
                 return self.stream(path + "0", p, sign)
             case ast.Prev(p, weak):
                 value = self.past(path, p, sign, math.inf if weak else -math.inf)
-                return self.pushed(path, value, math.inf if weak else -math.inf, 2)[0]
+                return self.push(path, value, math.inf if weak else -math.inf, 2)[0]
             case ast.Always(p, i) | ast.Eventually(p, i):
                 a, b = self.span(i)
                 value = self.stream(path + "0", p, sign)
-                window = self.pushed(path, value, 0.0, int(b) - a + 1)
+                window = self.push(path, value, 0.0, int(b) - a + 1)
                 return window.min() if isinstance(f, ast.Always) else window.max()
             case ast.Historically(p, i) | ast.Once(p, i):
                 least = isinstance(f, ast.Historically)
@@ -237,17 +237,17 @@ class _Machine:
                 return self.window(path, value, *self.span(i), nothing, least)
             case ast.Until(p, q, i):
                 a, b = self.span(i)
-                left, right = self.aligned(path, (p, q), sign)
+                left, right = self.align(path, (p, q), sign)
                 n = int(b) + 1
-                lefts = self.pushed(path + "l", left, 0.0, n)
-                rights = self.pushed(path + "r", right, 0.0, n)
+                lefts = self.push(path + "l", left, 0.0, n)
+                rights = self.push(path + "r", right, 0.0, n)
                 before = jnp.concatenate([jnp.full(1, jnp.inf, left.dtype), lefts[:-1]])
                 return jnp.minimum(rights, jax.lax.cummin(before))[a:].max()
             case ast.Since(p, q, i):
                 return self.since(path, p, q, *self.span(i), sign)
         return self.leaf(f, sign)
 
-    def aligned(self, path: str, parts: tuple[Formula, ...], sign: int) -> list[Array]:
+    def align(self, path: str, parts: tuple[Formula, ...], sign: int) -> list[Array]:
         """Return streams of several formulas, the quicker ones delayed to match the slowest."""
         slowest = max(map(self.delay, parts))
         values = []
@@ -255,7 +255,7 @@ class _Machine:
             value = self.stream(f"{path}{k}.", part, sign)
             wait = slowest - self.delay(part)
             if wait:
-                value = self.pushed(f"{path}{k}w", value, 0.0, wait + 1)[0]
+                value = self.push(f"{path}{k}w", value, 0.0, wait + 1)[0]
             values.append(value)
         return values
 
@@ -269,43 +269,43 @@ class _Machine:
     ) -> Array:
         """Return the least (greatest) of a stream's values from `b` to `a` samples ago."""
         if math.isfinite(b):
-            kept = self.pushed(path, value, nothing, int(b) + 1)[: int(b) - a + 1]
-            return kept.min() if least else kept.max()
+            window = self.push(path, value, nothing, int(b) + 1)[: int(b) - a + 1]
+            return window.min() if least else window.max()
         if a:
-            value = self.pushed(path + "w", value, nothing, a + 1)[0]
-        held = self.cell(path, value, nothing)
-        self.fresh[path] = jnp.minimum(held, value) if least else jnp.maximum(held, value)
+            value = self.push(path + "w", value, nothing, a + 1)[0]
+        before = self.cell(path, value, nothing)
+        self.fresh[path] = jnp.minimum(before, value) if least else jnp.maximum(before, value)
         return self.fresh[path]
 
     def since(self, path: str, p: Formula, q: Formula, a: int, b: float, sign: int) -> Array:
-        left, right = self.aligned(path, (p, q), sign)
+        left, right = self.align(path, (p, q), sign)
         begun = self.now - max(self.delay(p), self.delay(q)) >= 0
         left, right = jnp.where(begun, left, jnp.inf), jnp.where(begun, right, -jnp.inf)
         if math.isfinite(b):
             n = int(b) + 1
-            lefts = self.pushed(path + "l", left, 0.0, n)[::-1]
-            rights = self.pushed(path + "r", right, -math.inf, n)[::-1]
+            lefts = self.push(path + "l", left, 0.0, n)[::-1]
+            rights = self.push(path + "r", right, -math.inf, n)[::-1]
             after = jnp.concatenate([jnp.full(1, jnp.inf, left.dtype), lefts[:-1]])
             return jnp.minimum(rights, jax.lax.cummin(after))[a:].max()
-        held = self.cell(path, right, -math.inf)
-        self.fresh[path] = value = jnp.maximum(right, jnp.minimum(left, held))
+        before = self.cell(path, right, -math.inf)
+        self.fresh[path] = value = jnp.maximum(right, jnp.minimum(left, before))
         if not a:
             return value
         # p S[a,inf) q = H[0,a-1] p & (p S q) a samples ago; before there are any, it fails anyway.
-        recent = self.pushed(path + "l", left, math.inf, a).min()
-        return jnp.minimum(recent, self.pushed(path + "s", value, -math.inf, a + 1)[0])
+        recent = self.push(path + "l", left, math.inf, a).min()
+        return jnp.minimum(recent, self.push(path + "s", value, -math.inf, a + 1)[0])
 
     # Anchored at time 0
 
-    def anchored(self, path: str, f: Formula, sign: int) -> Array:
+    def value_at_start(self, path: str, f: Formula, sign: int) -> Array:
         """Return the value of `f` at time 0 if every stream stays as it is from now on."""
         match f:
             case ast.Constant():
                 return self.constant(f)
             case ast.Not(p):
-                return -self.anchored(path + "0", p, -sign)
+                return -self.value_at_start(path + "0", p, -sign)
             case ast.And(parts) | ast.Or(parts):
-                values = [self.anchored(f"{path}{k}.", p, sign) for k, p in enumerate(parts)]
+                values = [self.value_at_start(f"{path}{k}.", p, sign) for k, p in enumerate(parts)]
                 return functools.reduce(
                     jnp.minimum if isinstance(f, ast.And) else jnp.maximum, values
                 )
@@ -313,30 +313,30 @@ class _Machine:
                 a, b = self.span(i)
                 least = isinstance(f, ast.Always)
                 value = self.stream(path + "0", p, sign)
-                return self.accumulated(path, value, self.now - self.delay(p), a, b, least)
+                return self.accumulate(path, value, self.now - self.delay(p), a, b, least)
             case ast.Until(p, q, i):
-                return self.anchored_until(path, p, q, *self.span(i), sign)
+                return self.until_at_start(path, p, q, *self.span(i), sign)
         value = self.stream(path + "s", f, sign)
-        return self.accumulated(path, value, self.now - self.delay(f), 0, 0, True)
+        return self.accumulate(path, value, self.now - self.delay(f), 0, 0, True)
 
     def constant(self, f: ast.Constant) -> Array:
         return jnp.asarray(math.inf if f.value else -math.inf)
 
-    def accumulated(
+    def accumulate(
         self, path: str, value: Array, index: Array, a: int, b: float, least: bool
     ) -> Array:
         """Return the least (greatest) of a stream over the instants `a` to `b`."""
-        held = self.cell(path, value, math.inf if least else -math.inf)
-        both = jnp.minimum(held, value) if least else jnp.maximum(held, value)
+        before = self.cell(path, value, math.inf if least else -math.inf)
+        both = jnp.minimum(before, value) if least else jnp.maximum(before, value)
         counts = (index >= a) & (index <= b)
-        self.fresh[path] = jnp.where(counts, both, held)
+        self.fresh[path] = jnp.where(counts, both, before)
         # What is still to come in the window is what the stream gives now.
-        return jnp.where(index <= b, both, held)
+        return jnp.where(index <= b, both, before)
 
-    def anchored_until(
+    def until_at_start(
         self, path: str, p: Formula, q: Formula, a: int, b: float, sign: int
     ) -> Array:
-        left, right = self.aligned(path, (p, q), sign)
+        left, right = self.align(path, (p, q), sign)
         index = self.now - max(self.delay(p), self.delay(q))
         best = self.cell(path + "b", right, -math.inf)
         weakest = self.cell(path + "l", left, math.inf)

@@ -16,7 +16,7 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval
-from verifai_jax.mtl.grammar import BINARY, FormulaSyntaxError, explain_error, parser
+from verifai_jax.mtl.grammar import BINARY, FormulaSyntaxError, Tree, explain_error, parser
 from verifai_jax.mtl.words import FUNCTIONS, NAME
 
 _UNITS = {
@@ -91,7 +91,7 @@ class _Builder:
         self.constants = constants
         self.known = known
 
-    def formula(self, tree: Any) -> Formula:
+    def formula(self, tree: Tree) -> Formula:
         return self._formula(self._build(tree))
 
     def _fail(self, reason: str, start: int, end: int) -> FormulaSyntaxError:
@@ -120,18 +120,18 @@ class _Builder:
             )
         return part.value
 
-    def _build(self, tree: Any) -> _Part:
+    def _build(self, tree: Tree) -> _Part:
         return getattr(self, f"_{tree.data}".rstrip("_"))(tree)
 
-    def _span(self, tree: Any) -> tuple[int, int]:
+    def _span(self, tree: Tree) -> tuple[int, int]:
         return tree.meta.start_pos, tree.meta.end_pos
 
-    def _operands(self, tree: Any) -> tuple[list[_Part], list[Any]]:
+    def _operands(self, tree: Tree) -> tuple[list[_Part], list[Any]]:
         return [self._build(c) for c in tree.children[::2]], tree.children[1::2]
 
     # Boolean connectives
 
-    def _iff(self, tree: Any) -> _Part:
+    def _iff(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
         if len(words) > 1:
             raise self._chained(parts, words, "either")
@@ -139,7 +139,7 @@ class _Builder:
         value = left.iff(right) if words[0].type == "IFF" else left ^ right
         return _Part(value, *self._span(tree), rule="iff")
 
-    def _impl(self, tree: Any) -> _Part:
+    def _impl(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
         self._refuse_open(parts, words)
         if len(words) > 1:
@@ -147,13 +147,13 @@ class _Builder:
         left, right = map(self._formula, parts)
         return _Part(left >> right, *self._span(tree), rule="impl")
 
-    def _or(self, tree: Any) -> _Part:
+    def _or(self, tree: Tree) -> _Part:
         return self._joined(tree, ast.Or)
 
-    def _and(self, tree: Any) -> _Part:
+    def _and(self, tree: Tree) -> _Part:
         return self._joined(tree, ast.And)
 
-    def _joined(self, tree: Any, kind: type[ast.And] | type[ast.Or]) -> _Part:
+    def _joined(self, tree: Tree, kind: type[ast.And] | type[ast.Or]) -> _Part:
         parts, words = self._operands(tree)
         self._refuse_open(parts, words)
         for part in parts:
@@ -168,7 +168,7 @@ class _Builder:
         value = kind(tuple(map(self._formula, parts)))
         return _Part(value, *self._span(tree), rule="join")
 
-    def _bin(self, tree: Any) -> _Part:
+    def _bin(self, tree: Tree) -> _Part:
         parts = [self._build(c) for c in tree.children[::3]]
         words, intervals = tree.children[1::3], tree.children[2::3]
         self._refuse_open(parts, words)
@@ -207,12 +207,12 @@ class _Builder:
 
     # Operators of one operand
 
-    def _negation(self, tree: Any) -> _Part:
+    def _negation(self, tree: Tree) -> _Part:
         part = self._build(tree.children[1])
         start, end = self._span(tree)
         return _Part(ast.Not(self._formula(part)), start, end, part.closed, part.rule)
 
-    def _temporal(self, tree: Any) -> _Part:
+    def _temporal(self, tree: Tree) -> _Part:
         word, interval, operand = tree.children
         part = self._build(operand)
         value = self._formula(part)
@@ -231,7 +231,7 @@ class _Builder:
         rule = part.rule if symbol else "word"
         return _Part(value, *self._span(tree), closed=part.closed, rule=rule)
 
-    def _interval(self, tree: Any) -> Interval:
+    def _interval(self, tree: Tree | None) -> Interval:
         if tree is None:
             return ast.EVERYTHING
         low, high = (self._bound(child) for child in tree.children)
@@ -249,7 +249,7 @@ class _Builder:
             raise self._fail("an interval starts at a finite time", *span)
         return Interval(low, high)
 
-    def _bound(self, tree: Any) -> float:
+    def _bound(self, tree: Tree) -> float:
         if len(tree.children) == 1:
             name = str(tree.children[0])
             if name in ("inf", "infinity"):
@@ -265,7 +265,7 @@ class _Builder:
 
     # Comparisons and arithmetic
 
-    def _cmp(self, tree: Any) -> _Part:
+    def _cmp(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
         if len(words) > 1:
             a, b, c = map(self._source, parts[:3])
@@ -278,7 +278,7 @@ class _Builder:
         value = ast.Predicate(str(words[0]), left, right)
         return _Part(value, *self._span(tree))
 
-    def _sum(self, tree: Any) -> _Part:
+    def _sum(self, tree: Tree) -> _Part:
         parts, words = self._operands(tree)
         value = self._expression(parts[0])
         for word, part in zip(words, parts[1:], strict=True):
@@ -287,14 +287,14 @@ class _Builder:
 
     _product = _sum
 
-    def _minus(self, tree: Any) -> _Part:
+    def _minus(self, tree: Tree) -> _Part:
         part = self._build(tree.children[1])
         return _Part(-self._expression(part), *self._span(tree))
 
-    def _number(self, tree: Any) -> _Part:
+    def _number(self, tree: Tree) -> _Part:
         return _Part(Number(float(tree.children[0])), *self._span(tree))
 
-    def _name(self, tree: Any) -> _Part:
+    def _name(self, tree: Tree) -> _Part:
         name = str(tree.children[0])
         if name in self.constants:
             return _Part(Number(float(self.constants[name])), *self._span(tree))
@@ -307,16 +307,16 @@ class _Builder:
             )
         return _Part(Signal(name), *self._span(tree))
 
-    def _quoted(self, tree: Any) -> _Part:
+    def _quoted(self, tree: Tree) -> _Part:
         return _Part(Signal(str(tree.children[0])[1:-1]), *self._span(tree))
 
-    def _true(self, tree: Any) -> _Part:
+    def _true(self, tree: Tree) -> _Part:
         return _Part(ast.TRUE, *self._span(tree), closed=True)
 
-    def _false(self, tree: Any) -> _Part:
+    def _false(self, tree: Tree) -> _Part:
         return _Part(ast.FALSE, *self._span(tree), closed=True)
 
-    def _component(self, tree: Any) -> _Part:
+    def _component(self, tree: Tree) -> _Part:
         vector, index = tree.children
         part = self._build(vector)
         try:
@@ -327,7 +327,7 @@ class _Builder:
             ) from None
         return _Part(value, *self._span(tree))
 
-    def _call(self, tree: Any) -> _Part:
+    def _call(self, tree: Tree) -> _Part:
         name, *arguments = tree.children
         span = self._span(tree)
         if str(name) not in FUNCTIONS:
@@ -339,11 +339,11 @@ class _Builder:
         except ValueError as error:
             raise self._fail(str(error), *span) from None
 
-    def _parens(self, tree: Any) -> _Part:
+    def _parens(self, tree: Tree) -> _Part:
         part = self._build(tree.children[0])
         return _Part(part.value, *self._span(tree), closed=True)
 
 
-def _text(text: str, tree: Any) -> str:
+def _text(text: str, tree: Tree) -> str:
     """Return the part of `text` that a node of the tree was read from."""
     return text[tree.meta.start_pos : tree.meta.end_pos]

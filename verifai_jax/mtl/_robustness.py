@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
@@ -100,7 +100,12 @@ def _first_nan(formula: Formula, trace: Trace) -> str:
 
 
 def _values(
-    setting: Setting, last: int, signals: dict[str, Array], tau: Any, valid: Any, lanes: int
+    setting: Setting,
+    last: int,
+    signals: dict[str, Array],
+    tau: Array | None,
+    valid: Array | None,
+    lanes: int,
 ) -> Float[Array, "instants *lanes"]:
     """Compute the values at the instants 0 to `last`."""
     if setting.kind == "smooth":
@@ -115,6 +120,7 @@ def _values(
     if setting.kind == "smooth":
         value = jnp.where(jnp.abs(value) >= 0.5 * windows.NEVER, jnp.inf * jnp.sign(value), value)
         if shift:
+            assert tau is not None
             value = value + tau * shift
     if setting.end == "strict" and valid is not None:
         short = (valid - 1) * setting.dt < setting.formula.horizon(setting.dt) - 1e-9 * setting.dt
@@ -137,16 +143,18 @@ class _Root:
     def __init__(self, setting: Setting, gradient: bool) -> None:
         self.setting = setting
         self.gradient = gradient
-        self.out_axes = (0, 1) if gradient else (0,)
+        self.out_axes: tuple[int, ...] = (0, 1) if gradient else (0,)
 
-    def __call__(self, lanes: int, *arguments: Any) -> Any:
+    def __call__(self, lanes: int, *arguments: PyTree) -> tuple[PyTree, ...]:
         work = functools.partial(self._work, lanes)
         # One reduction makes no arrays in between, so there is nothing to keep in the cache.
         if lanes and (self.gradient or _nested(self.setting.formula)):
             return in_chunks(work, (1, 0, 0), self.out_axes, *arguments)
         return work(*arguments)
 
-    def _work(self, lanes: int, signals: dict[str, Array], tau: Any, valid: Any) -> Any:
+    def _work(
+        self, lanes: int, signals: dict[str, Array], tau: Array | None, valid: Array | None
+    ) -> Any:
         def value(signals: dict[str, Array]) -> Array:
             return _values(self.setting, 0, signals, tau, valid, lanes)[0]
 
@@ -157,12 +165,16 @@ class _Root:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _root(setting: Setting, signals: dict[str, Array], tau: Any, valid: Any) -> Array:
+def _root(
+    setting: Setting, signals: dict[str, Array], tau: Array | None, valid: Array | None
+) -> Array:
     return on_lanes(_Root(setting, False), 0, (1, 0, 0), False)(signals, tau, valid)[0]
 
 
 @_root.defjvp
-def _root_jvp(setting: Setting, primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _root_jvp(
+    setting: Setting, primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[Array, Array]:
     rho, gradient = on_lanes(_Root(setting, True), 0, (1, 0, 0), True)(*primals)
     products = (jnp.sum(gradient[name] * tangent) for name, tangent in tangents[0].items())
     return rho, sum(products, jnp.zeros_like(rho))
@@ -174,15 +186,20 @@ class _Everywhere:
     def __init__(self, setting: Setting, pullback: bool) -> None:
         self.setting = setting
         self.pullback = pullback
-        self.out_axes = (1,)
+        self.out_axes: tuple[int, ...] = (1,)
 
-    def __call__(self, lanes: int, *arguments: Any) -> Any:
+    def __call__(self, lanes: int, *arguments: PyTree) -> tuple[PyTree, ...]:
         work = functools.partial(self._work, lanes)
         axes = (1, 0, 0, 1)[: len(arguments)]
         return in_chunks(work, axes, self.out_axes, *arguments) if lanes else work(*arguments)
 
     def _work(
-        self, lanes: int, signals: dict[str, Array], tau: Any, valid: Any, cotangent: Any = None
+        self,
+        lanes: int,
+        signals: dict[str, Array],
+        tau: Array | None,
+        valid: Array | None,
+        cotangent: Array | None = None,
     ) -> Any:
         def value(signals: dict[str, Array]) -> Array:
             return _values(self.setting, self.setting.length - 1, signals, tau, valid, lanes)
@@ -193,15 +210,19 @@ class _Everywhere:
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _everywhere(setting: Setting, signals: dict[str, Array], tau: Any, valid: Any) -> Array:
+def _everywhere(
+    setting: Setting, signals: dict[str, Array], tau: Array | None, valid: Array | None
+) -> Array:
     return on_lanes(_Everywhere(setting, False), 0, (1, 0, 0), False)(signals, tau, valid)[0]
 
 
-def _everywhere_forward(setting: Setting, *arguments: Any) -> tuple[Array, Any]:
+def _everywhere_forward(setting: Setting, *arguments: PyTree) -> tuple[Array, tuple[PyTree, ...]]:
     return _everywhere(setting, *arguments), arguments
 
 
-def _everywhere_backward(setting: Setting, arguments: Any, cotangent: Array) -> Any:
+def _everywhere_backward(
+    setting: Setting, arguments: tuple[Any, ...], cotangent: Array
+) -> tuple[Any, ...]:
     call = on_lanes(_Everywhere(setting, True), 0, (1, 0, 0, 1), True)
     gradient = call(*arguments, cotangent)[0]
     return gradient, *(jax.tree.map(jnp.zeros_like, a) for a in arguments[1:])

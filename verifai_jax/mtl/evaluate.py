@@ -48,17 +48,17 @@ class Evaluator:
     axes; `open_right` makes windows half-open, as in `compat="pymtl"`.
     """
 
-    signals: Mapping[str, Float[Array, "time *lanes"]]
+    signals: Mapping[str, Float[Array, "time ..."]]
     length: int
     dt: float
     kind: str = "hard"
-    tau: Any = None
+    tau: Array | float | None = None
     end: End = "hold"
-    valid: Any = None
+    valid: Array | None = None
     open_right: bool = False
     lanes: int = 0
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
-    nudges: Mapping[Formula, Float[Array, "time *lanes"]] = field(default_factory=dict)
+    nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
 
     @property
@@ -158,7 +158,7 @@ class Evaluator:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)
 
-    def _compared(self, comparison: str, a: Any, b: Any) -> Array:
+    def _compared(self, comparison: str, a: Array | float, b: Array | float) -> Array:
         match comparison:
             case ">" | ">=":
                 margin = a - b
@@ -168,13 +168,14 @@ class Evaluator:
                 margin = -jnp.abs(a - b)
             case _:
                 margin = jnp.abs(a - b)
+        margin = jnp.asarray(margin)
         if self.kind != "boolean":
-            return jnp.asarray(margin)
+            return margin
         holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
         verdict = jnp.where(holds, 1.0, -1.0).astype(margin.dtype)
         return jnp.where(jnp.isnan(margin), margin, verdict)
 
-    def expression(self, e: Term, start: int, stop: int) -> Any:
+    def expression(self, e: Term, start: int, stop: int) -> Array | float:
         """Compute an expression at the samples `start` to `stop` (a float, if it is constant)."""
         match e:
             case Number(value):
@@ -291,7 +292,7 @@ class Evaluator:
         return (first + jnp.arange(x.shape[0])).reshape((-1,) + (1,) * (x.ndim - 1))
 
     @property
-    def _tau(self) -> Any:
+    def _tau(self) -> Array | float | None:
         return self.tau if self.kind == "smooth" else None
 
     def _blank(self, f: Formula, n: int, sign: int = 1) -> Array:
@@ -349,7 +350,7 @@ class Evaluator:
         return jnp.concatenate([blank, value])
 
 
-def _apply(name: str, values: list[Any]) -> Any:
+def _apply(name: str, values: list[Array | float]) -> Array | float:
     first, *others = values
     match name:
         case "neg":

@@ -1,7 +1,7 @@
 """The text grammar of formulas: its parser, and what its errors say."""
 
 import functools
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from verifai_jax.mtl.words import NAME, WORDS
 
@@ -26,6 +26,23 @@ class FormulaSyntaxError(ValueError):
         column = position - (before.rfind("\n") + 1)
         carets = "^" * max(1, min(width, len(shown) - column))
         super().__init__(f"{reason}\n  {shown}\n  {' ' * column}{carets}")
+
+
+@runtime_checkable
+class Place(Protocol):
+    """A place in the text, from `start_pos` to before `end_pos`."""
+
+    start_pos: int
+    end_pos: int
+
+
+@runtime_checkable
+class Tree(Protocol):
+    """A node of the parser's tree: a rule, and its parts (trees, words of the text, or None)."""
+
+    data: str
+    children: list[Any]
+    meta: Place
 
 
 @functools.cache
@@ -124,7 +141,7 @@ _GROUPS = (
 )
 
 
-def explain_error(error: Any, text: str) -> FormulaSyntaxError:
+def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
     """Turn an error of the parser into one that shows the place and the words expected there."""
     import lark
 
@@ -139,7 +156,7 @@ def explain_error(error: Any, text: str) -> FormulaSyntaxError:
         position = error.token.start_pos or 0
         width, found = len(error.token), f"{str(error.token)!r}"
     else:
-        position = error.pos_in_stream or 0
+        position = getattr(error, "pos_in_stream", None) or 0
         width, found = 1, f"{text[position]!r}"
     if found == "'='":
         return FormulaSyntaxError(

@@ -1,14 +1,28 @@
 """Lanes under `jax.vmap`: a batching rule that adds a lane axis, and work in chunks of lanes."""
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 
-def on_lanes(function: Any, lanes: int, axes: tuple[int, ...], spread: bool) -> Any:
+@runtime_checkable
+class Work(Protocol):
+    """A function of lanes: `out_axes` says where each of its results keeps them."""
+
+    out_axes: tuple[int, ...]
+
+    def __call__(self, lanes: int, *arguments: PyTree) -> tuple[PyTree, ...]:
+        """Return the results for arguments with this number of lane axes."""
+        ...
+
+
+def on_lanes(
+    function: Work, lanes: int, axes: tuple[int, ...], spread: bool
+) -> Callable[..., tuple[PyTree, ...]]:
     """Give `function(lanes, *arguments)` a batching rule that adds a lane axis to the arguments.
 
     `axes` says where each argument (a pytree) keeps its lane axes. `spread` repeats arguments that
@@ -20,7 +34,7 @@ def on_lanes(function: Any, lanes: int, axes: tuple[int, ...], spread: bool) -> 
         return function(lanes, *arguments)
 
     @call.def_vmap
-    def rule(size: int, batched: Any, *arguments: Any) -> Any:
+    def rule(size: int, batched: PyTree, *arguments: Any) -> Any:
         def moved(axis: int, array: Array, is_batched: bool) -> Array:
             if is_batched:
                 return jnp.moveaxis(array, 0, axis)
@@ -53,8 +67,11 @@ LANES = 256
 
 
 def in_chunks(
-    function: Any, axes: tuple[int, ...], out_axes: tuple[int, ...], *arguments: Any
-) -> Any:
+    function: Callable[..., tuple[PyTree, ...]],
+    axes: tuple[int, ...],
+    out_axes: tuple[int, ...],
+    *arguments: PyTree,
+) -> tuple[PyTree, ...]:
     """Compute `function(*arguments)` over the first lane axis, a cache's worth at a time.
 
     Arguments keep their lanes on `axes`, results on `out_axes`.
@@ -84,7 +101,7 @@ def in_chunks(
             )
         )
 
-    def step(i: Array, out: Any) -> Any:
+    def step(i: Array, out: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
         # The last chunk starts early enough to be full, and does some lanes again.
         k = jnp.minimum(i * lanes, size - lanes)
         return tuple(

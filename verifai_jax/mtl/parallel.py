@@ -6,13 +6,13 @@ smooth one is a product of Moebius maps in `exp(x / tau)`, kept as logarithms of
 Derivatives are left to JAX, because nothing here is sequential.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 Series = Float[Array, "time *lanes"]
+Maps = tuple[Array, ...]
+"""Maps of a product, by the arrays that hold their entries."""
 
 
 def _shift(x: Series, by: int, reverse: bool, fill: float) -> Series:
@@ -32,7 +32,7 @@ def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
     return sign * x
 
 
-def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> Series:
+def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array | float) -> Series:
     """Compute the same with `tau log sum exp(x / tau)` for the maximum."""
     # An overlap would count samples twice, so windows are joined by the binary digits of n.
     never = 1e30
@@ -53,7 +53,9 @@ def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> 
     return sign * (m + tau * jnp.log(s))
 
 
-def _join(a: Any, b: Any, tau: Array) -> tuple[Series, Series]:
+def _join(
+    a: tuple[Series, Series], b: tuple[Series, Series], tau: Array | float
+) -> tuple[Series, Series]:
     top = lax.stop_gradient(jnp.maximum(a[0], b[0]))
     return top, a[1] * jnp.exp((a[0] - top) / tau) + b[1] * jnp.exp((b[0] - top) / tau)
 
@@ -62,7 +64,7 @@ def until(reverse: bool, f: Series, g: Series) -> Series:
     """Compute `u[t] = max(g[t], min(f[t], u[t+1]))` (`u[t-1]`, if not `reverse`)."""
 
     # x -> max(R, min(L, x)): (L1, R1) after (L2, R2) is (min(L1, L2), max(R1, min(L1, R2))).
-    def after(b: Any, a: Any) -> Any:
+    def after(b: Maps, a: Maps) -> Maps:
         return jnp.minimum(a[0], b[0]), jnp.maximum(a[1], jnp.minimum(a[0], b[1]))
 
     edge = -1 if reverse else 0
@@ -70,7 +72,7 @@ def until(reverse: bool, f: Series, g: Series) -> Series:
     return lax.associative_scan(after, (f, g), reverse=reverse)[1]
 
 
-def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
+def until_smooth(reverse: bool, f: Series, g: Series, tau: Array | float) -> Series:
     """Compute the same with smooth maxima and minima."""
 
     # With X = exp(x / tau), smin(L, x) is LX / (X + L) and smax adds: a matrix
@@ -79,7 +81,7 @@ def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
         top = lax.stop_gradient(jnp.maximum(a, b))
         return top + jnp.log(jnp.exp(a - top) + jnp.exp(b - top))
 
-    def after(b: Any, a: Any) -> Any:
+    def after(b: Maps, a: Maps) -> Maps:
         return (
             add(a[0] + b[0], a[1] + b[2]),
             add(a[0] + b[1], a[1] + b[3]),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.figure import new_figure
+from verifai_jax.core.figure import Axes, Figure, new_figure
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
@@ -25,7 +25,7 @@ HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
 _MOST_ROWS = 14
 
 
-def draw(explanation: Explanation, path: str | Path | None = None) -> Any:
+def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     """Draw an explanation; returns the matplotlib figure, saved to `path` if one is given."""
     from matplotlib.patches import ConnectionPatch
 
@@ -131,7 +131,7 @@ def _shortened(text: str, most: int) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _label(figure: Any, axis: Any, depth: int, node: Node, width: float) -> None:
+def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> None:
     box = axis.get_position()
     middle = (box.y0 + box.y1) / 2
     name = str(node.formula) if not node.children else heading(node.formula)
@@ -153,7 +153,7 @@ def _label(figure: Any, axis: Any, depth: int, node: Node, width: float) -> None
     )
 
 
-def _dress(axis: Any, clock: np.ndarray, last: bool) -> None:
+def _dress(axis: Axes, clock: np.ndarray, last: bool) -> None:
     margin = 0.01 * (clock[-1] - clock[0]) or 0.5
     axis.set_xlim(clock[0] - margin, clock[-1] + margin)
     for side in ("top", "right", "left", "bottom"):
@@ -178,7 +178,7 @@ def _runs(good: np.ndarray) -> list[tuple[int, int, bool]]:
     return [(int(a), int(b), bool(good[a])) for a, b in zip(starts, ends, strict=True)]
 
 
-def _strip(axis: Any, node: Node, clock: np.ndarray) -> float:
+def _strip(axis: Axes, node: Node, clock: np.ndarray) -> float:
     edges = _edges(clock)
     for first, after, good in _runs(node.series >= 0):
         axis.axvspan(
@@ -195,7 +195,7 @@ def _strip(axis: Any, node: Node, clock: np.ndarray) -> float:
     return 0.5
 
 
-def _predicate(axis: Any, explanation: Explanation, node: Node, clock: np.ndarray) -> float:
+def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarray) -> float:
     """Draw the two sides of a predicate; return the height at the deciding instant."""
     setting, signals, _, _ = prepare(node.formula, explanation.trace, hard, "hold", None)
     evaluator = Evaluator(signals, setting.length, setting.dt)
@@ -221,7 +221,7 @@ def _predicate(axis: Any, explanation: Explanation, node: Node, clock: np.ndarra
             main, bound = side(e), np.zeros(last + 1)
         case _:  # TRUE and FALSE have nothing to plot.
             main = bound = np.zeros(last + 1)
-    style = {"color": PATH if node.decides else QUIET, "drawstyle": "default"}
+    style: dict[str, Any] = {"color": PATH if node.decides else QUIET, "drawstyle": "default"}
     axis.plot(clock, main, lw=1.7, **style)
     axis.plot(clock, bound, lw=1.2, ls=(0, (4, 2)), **style)
     values = np.concatenate([main[np.isfinite(main)], bound[np.isfinite(bound)]])

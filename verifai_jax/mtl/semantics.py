@@ -10,7 +10,7 @@ A `Semantics` is a pytree whose only leaf is the temperature, so annealing does 
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import numpy as np
@@ -29,8 +29,11 @@ Bound = Literal["none", "lower", "upper"]
 class Semantics:
     """The way to give a formula its value; made by `hard`, `boolean` and `smooth`."""
 
+    # JAX rebuilds the class with placeholders, which are no numbers.
+    __no_type_check__ = True
+
     kind: Kind
-    tau: Any = None
+    tau: Array | float | None = None
     error: float | None = None
     bound: Bound = "none"
 

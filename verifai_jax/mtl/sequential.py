@@ -10,18 +10,23 @@ Reverse-mode rules are written by hand: differentiating through the scans costs 
 Each is again one or two scans.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 NEVER = 1e30  # Stands for infinity in smooth arithmetic, where inf - inf would be NaN.
 
 Series = Float[Array, "time *lanes"]
+Number = Array | float
+Each = Array | np.ndarray  # One entry a sample: NumPy outside of a scan, JAX within.
+Pair = tuple[Array, Array]
+"""The greatest value so far, and the sum of `exp((x - greatest) / tau)`."""
 
 
 def _starts(n: int, length: int, reverse: bool) -> np.ndarray:
@@ -45,7 +50,7 @@ def _far(by: int, length: int, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(k, 0, length - 1), (k >= 0) & (k < length)
 
 
-def _row(x: Series, k: Array) -> Array:
+def _row(x: Shaped[Array, "time *lanes"], k: Each) -> Shaped[Array, "*lanes"]:
     # Reading a row within the scan saves the copy that a shifted array would be.
     return lax.dynamic_index_in_dim(x, k, keepdims=False)
 
@@ -68,7 +73,7 @@ def _windowed(n: int, reverse: bool, sign: int, x: Series, keep: bool) -> tuple[
     length = x.shape[0]
     lowest = jnp.full(x.shape[1:], -jnp.inf, x.dtype)
 
-    def begin(m: Array, row: Any) -> tuple[Array, Any]:
+    def begin(m: Array, row: tuple[Array, Each]) -> tuple[Array, Any]:
         value, start = row
         value = sign * value
         newest = start | (value >= m)
@@ -82,10 +87,10 @@ def _windowed(n: int, reverse: bool, sign: int, x: Series, keep: bool) -> tuple[
     starts = _starts(n, length, reverse)
     ahead, newest_ahead = lax.scan(begin, lowest, (x, starts), reverse=not reverse)[1]
 
-    def finish(m: Array, row: Any) -> tuple[Array, Any]:
+    def finish(m: Array, row: tuple[Array, Each, tuple[Each, Each]]) -> tuple[Array, Any]:
         value, end, (far, inside) = row
         value = sign * value
-        newest = end | (value >= m)
+        newest = jnp.asarray(end) | (value >= m)
         m = jnp.where(end, value, jnp.maximum(m, value))
         other = jnp.where(inside, _row(ahead, far), -jnp.inf)
         y = sign * jnp.maximum(m, other)
@@ -106,7 +111,7 @@ def _windowed_forward(n: int, reverse: bool, sign: int, x: Series) -> tuple[Seri
 
 
 def _windowed_backward(
-    n: int, reverse: bool, sign: int, residuals: Any, g: Series
+    n: int, reverse: bool, sign: int, residuals: tuple[Array, Array | None], g: Series
 ) -> tuple[Series]:
     # Towards the greatest sample: what reaches a running maximum goes to its newest sample where
     # that one is the greatest, and on to the maximum before it where not.
@@ -114,7 +119,7 @@ def _windowed_backward(
     length = g.shape[0]
     nothing = jnp.zeros(g.shape[1:], g.dtype)
 
-    def back_near(carry: Array, row: Any) -> tuple[Array, Array]:
+    def back_near(carry: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         g, code = row
         newest = (code & 1) != 0
         carry = carry + (g if newest_ahead is None else jnp.where(code >= 2, g, 0.0))
@@ -124,7 +129,9 @@ def _windowed_backward(
     if newest_ahead is None:
         return (first,)
 
-    def back_ahead(carry: Array, row: Any) -> tuple[Array, Array]:
+    def back_ahead(
+        carry: Array, row: tuple[Array, Array, tuple[Each, Each]]
+    ) -> tuple[Array, Array]:
         newest, other, (far, inside) = row
         carry = carry + jnp.where(inside & (_row(code, far) < 2), _row(g, far), 0.0)
         return jnp.where(newest, 0.0, carry), other + jnp.where(newest, carry, 0.0)
@@ -139,7 +146,7 @@ windowed.defvjp(_windowed_forward, _windowed_backward)
 # Smooth windows
 
 
-def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Array]:
+def _add(m: Array, s: Array, x: Array, weight: Number, tau: Number) -> Pair:
     """Add one more value, of a `weight`, to the pair; one exponential instead of two."""
     top = jnp.maximum(m, x)
     fade = jnp.exp((jnp.minimum(m, x) - top) / tau)
@@ -147,17 +154,24 @@ def _add(m: Array, s: Array, x: Array, weight: Any, tau: Any) -> tuple[Array, Ar
     return top, jnp.where(grows, s * fade + weight, s + weight * fade)
 
 
-def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, finish: Any) -> Any:
+def _pairs(
+    n: int,
+    reverse: bool,
+    sign: int,
+    x: Series,
+    weight: Series | None,
+    tau: Number,
+    finish: Callable[[Array, Array], Any],
+) -> Any:
     """Compute `finish(m, s)` of the pairs over windows of `weight * exp(sign * x / tau)`."""
     length = x.shape[0]
     nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))
-    given = weight is not None
 
-    def begin(pair: Any, row: Any) -> Any:
+    def begin(pair: Pair, row: tuple[Array, Each, Array | None]) -> tuple[Pair, Pair]:
         value, start, weight = row
         m, s = pair
         m, s = jnp.where(start, -NEVER, m), jnp.where(start, 0.0, s)
-        m, s = _add(m, s, sign * value, weight if given else 1.0, tau)
+        m, s = _add(m, s, sign * value, 1.0 if weight is None else weight, tau)
         return (m, s), (m, s)
 
     if n < length:
@@ -169,11 +183,13 @@ def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, f
     else:
         ahead, far = (), None
 
-    def complete(pair: Any, row: Any) -> Any:
+    def complete(
+        pair: Pair, row: tuple[Array, Each, Array | None, tuple[Each, Each] | None]
+    ) -> tuple[Pair, Any]:
         value, end, weight, far = row
         m, s = pair
         m, s = jnp.where(end, -NEVER, m), jnp.where(end, 0.0, s)
-        m, s = _add(m, s, sign * value, weight if given else 1.0, tau)
+        m, s = _add(m, s, sign * value, 1.0 if weight is None else weight, tau)
         if far is None:
             return (m, s), finish(m, s)
         more, other = (_row(a, far[0]) for a in ahead)
@@ -186,19 +202,21 @@ def _pairs(n: int, reverse: bool, sign: int, x: Series, weight: Any, tau: Any, f
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
-def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array) -> Series:
+def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Number) -> Series:
     """Compute the same with `tau log sum exp(x / tau)` for the maximum."""
     return _pairs(n, reverse, sign, x, None, tau, lambda m, s: sign * (m + tau * jnp.log(s)))
 
 
 def _windowed_smooth_forward(
-    n: int, reverse: bool, sign: int, x: Series, tau: Array
+    n: int, reverse: bool, sign: int, x: Series, tau: Number
 ) -> tuple[Series, Any]:
     y: Any = windowed_smooth(n, reverse, sign, x, tau)
     return y, (x, y, tau)
 
 
-def _windowed_smooth_backward(n: int, reverse: bool, sign: int, residuals: Any, g: Series) -> Any:
+def _windowed_smooth_backward(
+    n: int, reverse: bool, sign: int, residuals: tuple[Series, Series, Array], g: Series
+) -> tuple[Series, Array]:
     # dx[s] = sum over the windows t that contain s of g[t] exp((x[s] - y[t]) / tau): a window the
     # other way over -y with weights g. No exponent is positive, because y is an upper bound of x.
     x, y, tau = residuals
@@ -211,15 +229,23 @@ windowed_smooth.defvjp(_windowed_smooth_forward, _windowed_smooth_backward)
 
 # Until, and since the other way round
 
+Residuals = tuple[Array | None, Array | None, Any, Array | float | None]
+"""Both arguments of until (None where hard), what to keep of each step, the temperature."""
 
-def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: str) -> tuple[Array, Any]:
+SmoothResiduals = tuple[Array, Array, Array, Number]
+"""The same at a temperature."""
+
+
+def _until(
+    reverse: bool, f: Series, g: Series, tau: Number | None, keep: Literal["u", "v", "uv", ""]
+) -> tuple[Array, Any]:
     """Compute the last value of the recursion, and what to `keep` of each step.
 
     `"u"` keeps the values, `"v"` what the way back needs: the smaller of `f` and the value before,
     or in the hard case where a value comes from: `g` at once, or else `f`.
     """
 
-    def step(u: Array, row: Any) -> Any:
+    def step(u: Array, row: tuple[Array, Array]) -> tuple[Array, Any]:
         f, g = row
         if tau is None:
             inner = jnp.minimum(f, u)
@@ -233,20 +259,24 @@ def _until(reverse: bool, f: Series, g: Series, tau: Any, keep: str) -> tuple[Ar
     return lax.scan(step, nothing, (f, g), reverse=reverse)
 
 
-def _greater(a: Array, b: Array, tau: Any) -> Array:
+def _greater(a: Array, b: Array, tau: Number | None) -> Array:
     m = jnp.maximum(a, b)
     return m if tau is None else m + tau * jnp.log1p(jnp.exp((jnp.minimum(a, b) - m) / tau))
 
 
-def _until_backward(reverse: bool, residuals: Any, pull: Any) -> tuple[Series, Series]:
+def _until_backward(
+    reverse: bool, residuals: Residuals, pull: Float[Array, "*pull"]
+) -> tuple[Series, Series]:
     """Pull back the cotangent of every value `[time, *lanes]`, or of the first alone `[*lanes]`."""
     f, g, v, tau = residuals
     lanes = jnp.ndim(v if tau is not None else v[0]) - 1
     whole = pull.ndim > lanes
 
-    def step(carry: Array, row: Any) -> Any:
+    def step(
+        carry: Array, row: tuple[Array | None, Array | None, Array | None, Any]
+    ) -> tuple[Array, tuple[Array, Array]]:
         pull, f, g, v = row
-        carry = carry + pull if whole else carry
+        carry = carry if pull is None else carry + pull
         if tau is None:
             to_g, to_f = v
             down = jnp.where(to_g, 0.0, carry)
@@ -279,17 +309,19 @@ until.defvjp(_until_forward, _until_backward)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def until_smooth(reverse: bool, f: Series, g: Series, tau: Array) -> Series:
+def until_smooth(reverse: bool, f: Series, g: Series, tau: Number) -> Series:
     """Compute the same with smooth maxima and minima."""
     return _until(reverse, f, g, tau, "u")[1]
 
 
-def _until_smooth_forward(reverse: bool, f: Series, g: Series, tau: Array) -> tuple[Series, Any]:
+def _until_smooth_forward(reverse: bool, f: Series, g: Series, tau: Number) -> tuple[Series, Any]:
     u, v = _until(reverse, f, g, tau, "uv")[1]
     return u, (f, g, v, tau)
 
 
-def _until_smooth_backward(reverse: bool, residuals: Any, pull: Series) -> Any:
+def _until_smooth_backward(
+    reverse: bool, residuals: SmoothResiduals, pull: Series
+) -> tuple[Series, Series, Array]:
     return *_until_backward(reverse, residuals, pull), jnp.zeros_like(residuals[3])
 
 
@@ -307,7 +339,7 @@ def _until_first_forward(f: Series, g: Series) -> tuple[Array, Any]:
     return u, (None, None, v, None)
 
 
-def _until_first_backward(residuals: Any, pull: Array) -> tuple[Series, Series]:
+def _until_first_backward(residuals: Residuals, pull: Array) -> tuple[Series, Series]:
     return _until_backward(True, residuals, pull)
 
 
@@ -315,17 +347,19 @@ until_first.defvjp(_until_first_forward, _until_first_backward)
 
 
 @jax.custom_vjp
-def until_first_smooth(f: Series, g: Series, tau: Array) -> Array:
+def until_first_smooth(f: Series, g: Series, tau: Number) -> Array:
     """Compute the first value of `until_smooth`, without storing the others."""
     return _until(True, f, g, tau, "")[0]
 
 
-def _until_first_smooth_forward(f: Series, g: Series, tau: Array) -> tuple[Array, Any]:
+def _until_first_smooth_forward(f: Series, g: Series, tau: Number) -> tuple[Array, Any]:
     u, v = _until(True, f, g, tau, "v")
     return u, (f, g, v, tau)
 
 
-def _until_first_smooth_backward(residuals: Any, pull: Array) -> Any:
+def _until_first_smooth_backward(
+    residuals: SmoothResiduals, pull: Array
+) -> tuple[Series, Series, Array]:
     return *_until_backward(True, residuals, pull), jnp.zeros_like(residuals[3])
 
 

@@ -1,7 +1,7 @@
 """The setting of one evaluation: formula, trace and semantics, checked before anything compiles."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.trace import Samples, Trace
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
@@ -44,7 +44,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 def prepare(
     formula: Formula | str, trace: Trace, semantics: Semantics, end: End, compat: str | None
-) -> tuple[Setting, dict[str, Array], Any, Any]:
+) -> tuple[Setting, dict[str, Array], Array | None, Array | None]:
     """Check an evaluation; return its setting, its signals, its temperature and valid length."""
     formula = as_formula(formula)
     if end not in ("hold", "truncate", "strict"):
@@ -76,7 +76,7 @@ def prepare(
     return setting, signals, tau, valid
 
 
-def _numbers(signals: dict[str, Any]) -> dict[str, Array]:
+def _numbers(signals: dict[str, Samples]) -> dict[str, Array]:
     """Return the signals as arrays of one floating type; true counts as +1 and false as -1."""
     arrays = {name: jnp.asarray(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
@@ -142,8 +142,12 @@ def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
 
 
 def evaluator_of(
-    setting: Setting, signals: dict[str, Array], tau: Any, valid: Any, lanes: int
-) -> Any:
+    setting: Setting,
+    signals: dict[str, Array],
+    tau: Array | float | None,
+    valid: Array | None,
+    lanes: int,
+) -> Evaluator:
     return Evaluator(
         signals,
         setting.length,

@@ -9,7 +9,7 @@ a maximum is `tau log sum exp(x / tau)`. Two forms of everything: `sequential` s
 likes best, and `parallel` ones for a GPU, where depth is what costs.
 """
 
-from typing import Any
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 from verifai_jax.mtl import parallel, sequential
 from verifai_jax.mtl.sequential import NEVER as NEVER
 
-Tau = Any
+Tau = Array | float | None
 
 
-def _form() -> Any:
+def _form() -> ModuleType:
     return sequential if jax.default_backend() == "cpu" else parallel
 
 
@@ -55,7 +55,7 @@ def windowed(
     sign: int = 1,
     tau: Tau = None,
     reverse: bool = True,
-    form: Any = None,
+    form: ModuleType | None = None,
 ) -> Float[Array, "time *lanes"]:
     """Compute the maximum of `n` samples that begin at each instant; end there, if not `reverse`.
 
@@ -78,7 +78,7 @@ def until(
     g: Float[Array, "time *lanes"],
     tau: Tau = None,
     reverse: bool = True,
-    form: Any = None,
+    form: ModuleType | None = None,
 ) -> Float[Array, "time *lanes"]:
     """Compute `u[t] = max(g[t], min(f[t], u[t+1]))`, and `u = g` at the last sample.
 
@@ -94,7 +94,7 @@ def until_first(
     f: Float[Array, "time *lanes"],
     g: Float[Array, "time *lanes"],
     tau: Tau = None,
-    form: Any = None,
+    form: ModuleType | None = None,
 ) -> Float[Array, " *lanes"]:
     """Compute the first sample of `until(f, g)`."""
     form = form or _form()

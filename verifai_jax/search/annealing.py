@@ -225,7 +225,7 @@ class Annealing(Search[AnnealingState]):
         first = jnp.any(jnp.isinf(energy)) & (state.tells * len(turn) < len(energy))
         return jnp.where(first | (state.spread == 0), _best_to_median(met), state.spread)
 
-    def _smooth(self, cube: Cube, i: int) -> bool:
+    def _smooth(self, cube: Cube, i: int | np.integer) -> bool:
         """Return whether steps in this coordinate are those of a continuous one."""
         return cube.levels[i] == 0 or (cube.ordered[i] and cube.levels[i] > MOST_CELLS)
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
@@ -130,7 +130,7 @@ class Bandit(Search[BanditState]):
 
     def _bandits(
         self, cube: Cube
-    ) -> list[tuple[np.ndarray, Float[np.ndarray, "d leaves+1"], tuple[int, ...]]]:
+    ) -> list[tuple[np.ndarray, Float[np.ndarray, "d edges"], tuple[int, ...]]]:
         """Return groups of coordinates, the edges of their finest buckets, and their branchings."""
         cells = dict(zip(cube.discrete.tolist(), cube.probabilities, strict=True))
         choices = [i for i in cells if not cube.ordered[i]]
@@ -157,19 +157,19 @@ class Bandit(Search[BanditState]):
         state: BanditState,
         reward: Float[Array, " window"],
         places: np.ndarray,
-        edges: Float[np.ndarray, "d leaves+1"],
+        edges: Float[np.ndarray, "d edges"],
         branching: tuple[int, ...],
         batch: int,
-    ) -> Float[Array, "d leaves"]:
+    ) -> Float[Array, "d edges-1"]:
         """Return the share of the next batch that each leaf gets."""
         d, leaves = len(places), edges.shape[1] - 1
         find = jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"), (0, 1), 1)
         leaf = find(jnp.asarray(edges[:, 1:-1]), state.u[:, places])
-        seen = jnp.isfinite(state.score).astype(jnp.float32)
+        present = jnp.isfinite(state.score).astype(jnp.float32)
         sums = jnp.zeros((d, leaves, 2), jnp.float32)
-        sums = sums.at[np.arange(d), leaf].add(jnp.stack([seen, reward], axis=1)[:, None])
+        sums = sums.at[np.arange(d), leaf].add(jnp.stack([present, reward], axis=1)[:, None])
         share = jnp.ones((d, 1), jnp.float32)
-        total = jnp.broadcast_to(jnp.sum(seen), (d, 1))
+        total = jnp.broadcast_to(jnp.sum(present), (d, 1))
         mean = jnp.broadcast_to(jnp.sum(reward), (d, 1)) / jnp.maximum(total, 1.0)
         for level, branches in enumerate(branching):
             shape = (d, int(np.prod(branching[:level])), branches)
@@ -203,7 +203,7 @@ def _fill(
         gap = jnp.maximum(level - mean, 1e-6)
         return jnp.where(exists, jnp.maximum(bonus / gap**2 - count, 0.0), 0.0)
 
-    def halve(_: int, limits: tuple[Array, Array]) -> tuple[Array, Array]:
+    def halve(_: Int[Array, ""], limits: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = limits
         level = (low + high) / 2
         more = jnp.sum(draws(level), axis=-1, keepdims=True) > budget

@@ -47,13 +47,13 @@ PATIENCE = 80  # points without progress, after which half of them are those of 
 class BayesState(NamedTuple):
     key: Key[Array, ""]
     round: UInt32[Array, ""]
-    asked: UInt32[Array, ""]  # points, in all
+    proposals: UInt32[Array, ""]  # points, in all
     explored: UInt32[Array, ""]  # points of the prior among them
-    told: UInt32[Array, ""]  # rows, in all
+    results: UInt32[Array, ""]  # rows, in all
     u: Float[Array, "capacity d"]
     score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
     luck: Float[Array, " capacity"]  # says which points are kept
-    seen: Int[Array, ""]  # points with a verdict, in all
+    verdicts: Int[Array, ""]  # points with a verdict, in all
     fitted: Int[Array, ""]  # of which the last fit knew
     stale: Int[Array, ""]  # points since the last failure or progress
     hyper: Hyper
@@ -100,13 +100,13 @@ class Bayes(Search[BayesState]):
         return BayesState(
             key=key,
             round=jnp.uint32(0),
-            asked=jnp.uint32(0),
+            proposals=jnp.uint32(0),
             explored=jnp.uint32(0),
-            told=jnp.uint32(0),
+            results=jnp.uint32(0),
             u=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
             score=jnp.full(self.capacity, jnp.inf, jnp.float32),
             luck=jnp.zeros(self.capacity, jnp.float32),
-            seen=jnp.int32(0),
+            verdicts=jnp.int32(0),
             fitted=jnp.int32(0),
             stale=jnp.int32(0),
             hyper=_process(cube).first(),
@@ -122,12 +122,12 @@ class Bayes(Search[BayesState]):
             state.score, where=present, initial=jnp.inf
         )
         # Without a difference between points there is nothing to learn from them.
-        informed = spread & (state.seen >= self.initial)
+        informed = spread & (state.verdicts >= self.initial)
         # Where the process leads nowhere, more and more of the points are those of the prior.
         share = jnp.maximum(self.exploration, state.stale / (state.stale + PATIENCE))
         # Every tenth point, say, whatever the batch is; in integers, which do not drift.
         share = jnp.ceil(1000 * share).astype(jnp.uint32)
-        due = (state.asked % 1000 + row) % 1000 * share % 1000 < share
+        due = (state.proposals % 1000 + row) % 1000 * share % 1000 < share
         prior = ~informed | due
         number = state.explored + jnp.cumsum(prior).astype(jnp.uint32)
         # The candidates are further points of the same sequence, far ahead.
@@ -138,11 +138,11 @@ class Bayes(Search[BayesState]):
         # Barriers, or else every use of these numbers compiles and computes them anew.
         points = jax.lax.optimization_barrier(points)
         fresh, anywhere = points[:batch], points[batch:]
-        asked = state._replace(
-            round=state.round + 1, asked=state.asked + np.uint32(batch), explored=number[-1]
+        after = state._replace(
+            round=state.round + 1, proposals=state.proposals + np.uint32(batch), explored=number[-1]
         )
         if cube.dim == 0:
-            return fresh, asked
+            return fresh, after
 
         def propose() -> Float[Array, "batch d"]:
             return self._propose(key, state, cube, batch, anywhere)
@@ -152,32 +152,34 @@ class Bayes(Search[BayesState]):
         mark = chosen @ jnp.cos(jnp.arange(1, cube.dim + 1, dtype=jnp.float32))
         again = jnp.any(jnp.tril(mark[:, None] == mark[None], -1), axis=1)
         chosen = jnp.where(again[:, None], anywhere[:batch], chosen)
-        return jnp.where(prior[:, None], fresh, chosen), asked
+        return jnp.where(prior[:, None], fresh, chosen), after
 
     def tell(self, state: BayesState, cube: Cube, observations: Observations) -> BayesState:
         usable = observations.valid & (observations.rho < jnp.inf)
         score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
-        number = state.told + jnp.arange(len(score), dtype=jnp.uint32)
+        number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
         progress = jnp.min(score) < 0.99 * jnp.min(state.score)
         progress |= jnp.any(score == 0)
-        told = jnp.sum(usable, dtype=jnp.int32)
+        count = jnp.sum(usable, dtype=jnp.int32)
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
         luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
         u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
         score = jnp.concatenate([score, state.score])
         luck = jnp.concatenate([luck, state.luck])
-        kept = _rows_to_keep(score, luck, self.capacity)
+        rows = _rows_to_keep(score, luck, self.capacity)
         state = state._replace(
-            told=state.told + np.uint32(len(usable)),
-            u=u[kept],
-            score=score[kept],
-            luck=luck[kept],
-            seen=state.seen + told,
-            stale=jnp.where(progress, 0, state.stale + told),
+            results=state.results + np.uint32(len(usable)),
+            u=u[rows],
+            score=score[rows],
+            luck=luck[rows],
+            verdicts=state.verdicts + count,
+            stale=jnp.where(progress, 0, state.stale + count),
         )
-        due = (state.seen >= self.initial) & (4 * (state.seen - state.fitted) >= state.fitted)
+        due = (state.verdicts >= self.initial) & (
+            4 * (state.verdicts - state.fitted) >= state.fitted
+        )
         hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
-        return state._replace(hyper=hyper, fitted=jnp.where(due, state.seen, state.fitted))
+        return state._replace(hyper=hyper, fitted=jnp.where(due, state.verdicts, state.fitted))
 
     def _fit(self, state: BayesState, cube: Cube) -> Hyper:
         some = _rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))

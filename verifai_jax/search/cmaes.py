@@ -52,7 +52,7 @@ Tree = TypeVar("Tree")
 class CMAESState(NamedTuple):
     key: Key[Array, ""]
     round: UInt32[Array, ""]  # asks
-    told: UInt32[Array, ""]  # rows, in all
+    results: UInt32[Array, ""]  # rows, in all
     explored: UInt32[Array, ""]  # points of the prior asked for
     run: Int[Array, ""]
     generation: Int[Array, ""]  # of the run; 0 is drawn from the prior
@@ -112,7 +112,7 @@ class CMAES(Search[CMAESState]):
         return CMAESState(
             key=key,
             round=jnp.uint32(0),
-            told=jnp.uint32(0),
+            results=jnp.uint32(0),
             explored=jnp.uint32(0),
             run=jnp.int32(0),
             generation=jnp.int32(0),
@@ -150,7 +150,7 @@ class CMAES(Search[CMAESState]):
         row = state.filled * batch
         inside = jnp.where(outside, jnp.inf, score)
         state = state._replace(
-            told=state.told + np.uint32(batch),
+            results=state.results + np.uint32(batch),
             u=jax.lax.dynamic_update_slice(state.u, u, (row, jnp.int32(0))),
             score=jax.lax.dynamic_update_slice(state.score, inside, (row,)),
             filled=state.filled + 1,
@@ -170,7 +170,7 @@ class CMAES(Search[CMAESState]):
 
     def _explores(self, state: CMAESState, batch: int) -> Bool[Array, " batch"]:
         """Return the rows from the prior: every tenth, say, whatever the batch; in integers."""
-        row = (state.told % 1000 + jnp.arange(batch, dtype=jnp.uint32)) % 1000
+        row = (state.results % 1000 + jnp.arange(batch, dtype=jnp.uint32)) % 1000
         share = np.uint32(np.ceil(1000 * self.exploration))
         return row * share % 1000 < share
 

@@ -43,7 +43,7 @@ class DiverseState(NamedTuple):
     idle: Int[Array, ""]  # rounds without a new failure and without coming nearer to one
     level: Float[Array, ""]  # the least raised robustness since the search began afresh
     size: Float[Array, ""]  # sum of the sizes of robustness seen
-    seen: Float[Array, ""]  # and how many there were
+    verdicts: Float[Array, ""]  # and how many there were
     points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
     rho: Float[Array, " batch"]  # with their own robustness; infinite where there is none
 
@@ -135,7 +135,7 @@ class Diverse(Search[DiverseState]):
             idle=jnp.int32(0),
             level=jnp.float32(jnp.inf),
             size=jnp.float32(0),
-            seen=jnp.float32(0),
+            verdicts=jnp.float32(0),
             points=jnp.full((batch, cube.dim), 0.5, jnp.float32),
             rho=jnp.full(batch, jnp.inf, jnp.float32),
         )
@@ -164,7 +164,7 @@ class Diverse(Search[DiverseState]):
         state = state._replace(
             round=state.round + 1,
             size=state.size + size.astype(jnp.float32),
-            seen=state.seen + jnp.sum(usable),
+            verdicts=state.verdicts + jnp.sum(usable),
         )
         state = self._archive(state, cube, u, usable & (observations.rho < 0))
         discovered = state.count > before
@@ -183,9 +183,9 @@ class Diverse(Search[DiverseState]):
         # The best points of a fruitless period lead nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
-        told = self._deflate(state, cube, observations)
+        raised = self._deflate(state, cube, observations)
         verb = self.search.warm_start if warm else self.search.tell
-        inner = verb(state.inner, cube, told)
+        inner = verb(state.inner, cube, raised)
         if self.search.learns and self.search.total(cube) is None:
             inner = jax.lax.cond(
                 discovered | tired, lambda: self._restart(state, cube), lambda: inner
@@ -228,7 +228,7 @@ class Diverse(Search[DiverseState]):
         return jnp.clip(1 - least / (1.5 * state.radius), 0.0, 1.0), nearest
 
     def _scale(self, state: DiverseState) -> Float[Array, ""]:
-        return 2.0 * state.size / jnp.maximum(state.seen, 1.0) + 1e-6
+        return 2.0 * state.size / jnp.maximum(state.verdicts, 1.0) + 1e-6
 
     def _raise(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
@@ -243,9 +243,9 @@ class Diverse(Search[DiverseState]):
         near, nearest = self._nearness(state, cube, u)
         inside = usable & (near > 0)
         rho = jnp.where(inside, self._raise(state, cube, u, observations.rho), observations.rho)
-        told = observations._replace(rho=rho)
+        changed = observations._replace(rho=rho)
         if observations.gradient is None and observations.clauses is None:
-            return told
+            return changed
 
         offset = jnp.where(np.array(cube.levels) == 0, u - state.archive[nearest], 0.0)
         length = apart(cube, u, state.archive)[jnp.arange(len(u)), nearest]
@@ -255,20 +255,22 @@ class Diverse(Search[DiverseState]):
         if observations.gradient is not None:
             own = jnp.where((observations.rho > 0)[:, None], observations.gradient, 0.0)
             raised = own + self._scale(state) * falls
-            told = told._replace(gradient=jnp.where(inside[:, None], raised, observations.gradient))
+            changed = changed._replace(
+                gradient=jnp.where(inside[:, None], raised, observations.gradient)
+            )
         if observations.clauses is not None:
             # These have no unit, and of clauses that there are not the values stay very low.
             there = inside[:, None] & (observations.clauses > ABSENT)
             lifted = jnp.maximum(observations.clauses, 0.0) + near[:, None]
-            told = told._replace(clauses=jnp.where(there, lifted, observations.clauses))
+            changed = changed._replace(clauses=jnp.where(there, lifted, observations.clauses))
             gradients = observations.clause_gradients
             if gradients is not None:
                 own = jnp.where((observations.clauses > 0)[:, :, None], gradients, 0.0)
                 # Zero where the round asked for none.
                 asked = there & jnp.any(gradients != 0)
                 own = jnp.where(asked[:, :, None], own + falls[:, None, :], gradients)
-                told = told._replace(clause_gradients=own)
-        return told
+                changed = changed._replace(clause_gradients=own)
+        return changed
 
     def _remember(
         self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]

@@ -68,7 +68,7 @@ class Paths(NamedTuple):
     ignored: Bool[Array, "f k"]  # which unordered coordinates a wave ignores
     multiply: Array  # [f, k] unsigned: the sign of a wave at a code is a hash of it
     add: Array
-    weights: Float[Array, "f+n paths"]
+    weights: Float[Array, "terms paths"]
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class GaussianProcess:
 
     def basis(
         self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
-    ) -> Float[Array, "m f+n"]:
+    ) -> Float[Array, "m terms"]:
         """Return basis functions at these points; times the paths' weights the paths' values."""
         waves = self._waves(posterior.hyper, paths, x)
         return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)

@@ -212,32 +212,32 @@ class Gradient(Search[GradientState]):
         finite = jnp.all(jnp.isfinite(gradients), axis=(1, 2))
         gradients = jnp.where(finite[:, None, None], gradients, 0.0)
         informative = finite & jnp.any(gradients != 0, axis=(1, 2)) & jnp.isfinite(least)
-        asked = jnp.any(owner, axis=1)
+        visited = jnp.any(owner, axis=1)
         before = jnp.max(state.clauses, axis=1)
 
         # With gradients: a descent goes on from where they are known, or starts elsewhere.
         # Of descents that may be given up early every second one begins with a smaller box.
         begin = jnp.where((state.number % 3 > 0) & (state.number % 2 == 1), self.shrinks, 1.0)
         differentiated = state._replace(
-            point=_rows(informative & asked, observations.u[best], state.point),
-            clauses=_rows(informative & asked, clauses[best], state.clauses),
-            gradients=_rows(informative & asked, gradients, state.gradients),
-            known=jnp.where(asked, informative & ~failed, state.known),
-            fresh=jnp.where(asked, ~informative | failed, state.fresh),
-            radius=jnp.where(asked & state.fresh, begin, state.radius),
-            flips=jnp.where(asked, 0, state.flips),
-            steps=jnp.where(asked & state.fresh, 0, state.steps),
-            slow=jnp.where(asked & state.fresh, 0, state.slow),
+            point=_rows(informative & visited, observations.u[best], state.point),
+            clauses=_rows(informative & visited, clauses[best], state.clauses),
+            gradients=_rows(informative & visited, gradients, state.gradients),
+            known=jnp.where(visited, informative & ~failed, state.known),
+            fresh=jnp.where(visited, ~informative | failed, state.fresh),
+            radius=jnp.where(visited & state.fresh, begin, state.radius),
+            flips=jnp.where(visited, 0, state.flips),
+            steps=jnp.where(visited & state.fresh, 0, state.steps),
+            slow=jnp.where(visited & state.fresh, 0, state.slow),
             useless=jnp.where(
                 jnp.any(informative),
                 0,
-                state.useless + jnp.sum(asked & jnp.isfinite(least) & ~informative),
+                state.useless + jnp.sum(visited & jnp.isfinite(least) & ~informative),
             ).astype(jnp.int32),
         )
         # Without: a better point, whose gradients are wanted next, or a smaller box.
         better = least < before - 1e-4 * jnp.abs(before)
         smallest = jnp.min(jnp.where(owner, state.box[None], jnp.inf), axis=1)
-        turned = state.flipped[best] & asked
+        turned = state.flipped[best] & visited
         flips = state.flips + jnp.sum(owner, axis=1).astype(jnp.int32)
         radius = jnp.where(better, jnp.minimum(1.0, 2 * state.box[best]), smallest * self.shrinks)
         limit = min(self.flips, len(cube.continuous))
@@ -248,20 +248,20 @@ class Gradient(Search[GradientState]):
         over = failed | (~better & jnp.where(turned, flips >= limit, radius < least_radius))
         slow = jnp.where(least > LITTLE * before, state.slow + 1, 0)
         over |= better & (slow >= self.patience)
-        goes_on = asked & ~over
+        goes_on = visited & ~over
         colder = jnp.maximum(0.5 * state.temperature, self.coldest)
         undifferentiated = state._replace(
             point=_rows(goes_on & better, observations.u[best], state.point),
             clauses=_rows(goes_on & better, clauses[best], state.clauses),
-            known=jnp.where(asked, ~over & ~better, state.known),
-            fresh=jnp.where(asked, over, state.fresh),
+            known=jnp.where(visited, ~over & ~better, state.known),
+            fresh=jnp.where(visited, over, state.fresh),
             radius=jnp.where(goes_on & (better | ~turned), radius, state.radius),
             flips=jnp.where(
                 goes_on, jnp.where(better, 0, jnp.where(turned, flips, 0)), state.flips
             ),
             temperature=jnp.where(goes_on & better, colder, state.temperature),
-            steps=jnp.where(asked & better, state.steps + 1, state.steps),
-            slow=jnp.where(asked & better, slow, state.slow).astype(jnp.int32),
+            steps=jnp.where(visited & better, state.steps + 1, state.steps),
+            slow=jnp.where(visited & better, slow, state.slow).astype(jnp.int32),
         )
         return _either(state.differentiates, differentiated, undifferentiated)
 

@@ -53,7 +53,7 @@ class MutationState(NamedTuple):
     round: UInt32[Array, ""]
     points: Float[Array, "k d"]  # the best so far, the very best first
     score: Float[Array, " k"]  # infinite where there is no point yet
-    seen: Int[Array, ""]  # simulations with a verdict since the last beginning
+    verdicts: Int[Array, ""]  # simulations with a verdict since the last beginning
     stale: Int[Array, ""]  # simulations without progress
 
 
@@ -94,7 +94,7 @@ class Mutation(Search[MutationState]):
             round=jnp.uint32(0),
             points=jnp.full((self.kept, cube.dim), 0.5, jnp.float32),
             score=jnp.full(self.kept, jnp.inf, jnp.float32),
-            seen=jnp.int32(0),
+            verdicts=jnp.int32(0),
             stale=jnp.int32(0),
         )
 
@@ -116,7 +116,7 @@ class Mutation(Search[MutationState]):
         level = jnp.max(jnp.where(there, state.score, -jnp.inf)) <= jnp.min(state.score)
         # The longer without progress, the more it explores.
         share = self.exploration + (MOST_EXPLORATION - self.exploration) * idle
-        explores = (state.seen < self.first) | level | (coins[:, 15] < share)
+        explores = (state.verdicts < self.first) | level | (coins[:, 15] < share)
         u = jnp.where(explores[:, None], fresh, changed)
         return u, state._replace(round=state.round + 1)
 
@@ -135,7 +135,7 @@ class Mutation(Search[MutationState]):
         return state._replace(
             points=points[best],
             score=jnp.where(again, jnp.inf, scores[best]),
-            seen=jnp.where(again, 0, state.seen + usable),
+            verdicts=jnp.where(again, 0, state.verdicts + usable),
             stale=jnp.where(again, 0, stale),
         )
 

@@ -28,7 +28,7 @@ class PointList(Search[PointListState]):
     another dimension than the cube's.
     """
 
-    points: Float[np.ndarray, "n d"] | Sequence[Sequence[float]]
+    points: Float[Array | np.ndarray, "n d"] | Sequence[Sequence[float]]
     learns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

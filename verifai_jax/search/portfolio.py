@@ -149,15 +149,15 @@ class Portfolio(Search[PortfolioState]):
 
     def tell(self, state: PortfolioState, cube: Cube, observations: Observations) -> PortfolioState:
         batch = len(observations.rho)
-        asked = jnp.arange(batch) < jnp.sum(state.rows)
-        observations = observations._replace(valid=observations.valid & asked)
+        simulated = jnp.arange(batch) < jnp.sum(state.rows)
+        observations = observations._replace(valid=observations.valid & simulated)
         common = self._common(observations)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them.
         limit = state.mutation.score[AMONG - 1]
         gained = jnp.isfinite(limit) & ((common.score < limit) | (common.score == 0))
         gained &= common.usable
-        is_member = (member[None] == jnp.arange(3)[:, None]) & asked[None]
+        is_member = (member[None] == jnp.arange(3)[:, None]) & simulated[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
@@ -167,7 +167,7 @@ class Portfolio(Search[PortfolioState]):
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
         state = state._replace(
-            mutation=mutation._replace(seen=jnp.maximum(mutation.seen - descended, 0)),
+            mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(

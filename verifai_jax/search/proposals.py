@@ -39,7 +39,7 @@ class ConstraintError(ValueError):
 class Proposals:
     """The stream of points to simulate; see the module's docstring.
 
-    - `asked`: number of points that the search proposed.
+    - `proposed`: number of points that the search proposed.
     - `accepted`: number of these that the constraint accepted.
     """
 
@@ -53,7 +53,7 @@ class Proposals:
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
-        self.asked = self.accepted = 0
+        self.proposed = self.accepted = 0
         self._program = _program(search, self.cube, batch)
         self._accepts = accepts
         if self._accepts is not None:
@@ -69,7 +69,7 @@ class Proposals:
     @property
     def exhausted(self) -> bool:
         """True when a finite search has no further point."""
-        return self.total is not None and self.asked >= self.total and not len(self._queue)
+        return self.total is not None and self.proposed >= self.total and not len(self._queue)
 
     @property
     def distinct(self) -> int:
@@ -169,7 +169,7 @@ class Proposals:
         return {
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
-            "counts": np.array([self.asked, self.accepted], np.int64),
+            "counts": np.array([self.proposed, self.accepted], np.int64),
         }
 
     def restore(self, snapshot: Mapping[str, np.ndarray | Array]) -> None:
@@ -191,12 +191,12 @@ class Proposals:
             restored.append(jnp.asarray(saved))
         self._state = jax.tree.unflatten(form, restored)
         self._queue = np.asarray(snapshot["queue"])
-        self.asked, self.accepted = (int(count) for count in snapshot["counts"])
+        self.proposed, self.accepted = (int(count) for count in snapshot["counts"])
 
     def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
         if self.total is not None:
-            points = points[: max(0, self.total - self.asked)]
+            points = points[: max(0, self.total - self.proposed)]
         return points
 
     def _accepted_rows(
@@ -212,9 +212,9 @@ class Proposals:
         """Return the next accepted points of a search that does not learn."""
         ready, barren = len(self._queue), 0
         parts: list[np.ndarray | Array] = [self._queue]
-        while ready < most and not (self.total is not None and self.asked >= self.total):
+        while ready < most and not (self.total is not None and self.proposed >= self.total):
             points = self._ask()
-            self.asked += len(points)
+            self.proposed += len(points)
             if self._accepts is not None:
                 points = np.asarray(points)[self._accepted_rows(points)]
             barren = 0 if len(points) else barren + 1
@@ -239,7 +239,7 @@ class Proposals:
         if self.search.wants_clauses:
             plan: Plan = self._program.plan(self._state)
             self._plan, planned = plan, int(plan.rows)
-        self.asked += planned
+        self.proposed += planned
         wanted = np.arange(len(points)) < planned
         accepted = self._accepted_rows(points) & wanted
         for _ in range(TRIES - 1):
@@ -249,7 +249,7 @@ class Proposals:
             fresh = wanted & ~accepted
             if np.array_equal(np.asarray(others)[fresh], np.asarray(points)[fresh]):
                 break  # This search proposes the same until it is told something.
-            self.asked += int(fresh.sum())
+            self.proposed += int(fresh.sum())
             points = jnp.where(fresh[:, None], others, points)
             accepted = accepted | (self._accepted_rows(points) & wanted)
         self._barren = 0 if accepted.any() else self._barren + 1
@@ -271,7 +271,7 @@ class Proposals:
     def _give_up(self) -> NoReturn:
         raise ConstraintError(
             f"where refused all that search {self.search!r} has proposed for {MOST_REFUSED} "
-            f"rounds; it accepted {self.accepted} of {self.asked} points in all. Make the space "
+            f"rounds; it accepted {self.accepted} of {self.proposed} points in all. Make the space "
             "narrower, so that more of it is allowed, or use another search"
         )
 

@@ -42,7 +42,7 @@ UNDECIDED = "undecided"
 UNSAFE = "unsafe"
 """Verdict of a policy that fails more often than is allowed."""
 
-Counts = Real[np.ndarray, "*n"] | float
+Counts = Real[np.ndarray, "*#n"] | float
 """Numbers of samples, one or many; fractions where they are expectations."""
 
 
@@ -68,10 +68,14 @@ def anytime_interval(failures: int, simulations: int, confidence: float = 0.95) 
     )
     limit = mixture + math.log(1 - confidence)
 
-    def inside(rate: float) -> bool:
-        return _log_power(rate, k) + _log_power(1 - rate, n - k) >= limit
-
-    low, high = (_border(k / n, end, inside) for end in (0.0, 1.0))
+    low, high = (
+        _border(
+            k / n,
+            end,
+            lambda rate: _log_power(rate, k) + _log_power(1 - rate, n - k) >= limit,
+        )
+        for end in (0.0, 1.0)
+    )
     return Rate(k, n, low, high, confidence, at_any_time=True)
 
 
@@ -98,15 +102,13 @@ def simultaneous_interval(
     """
     check_counts(failures, simulations)
     limit = required_evidence(confidence, among)
-
-    def not_too_low(rate: float) -> bool:
-        return float(evidence_above(failures, simulations, rate)) < limit
-
-    def not_too_high(rate: float) -> bool:
-        return float(evidence_below(failures, simulations, rate)) < limit
-
     estimate = failures / simulations
-    low, high = _border(estimate, 0.0, not_too_low), _border(estimate, 1.0, not_too_high)
+    low = _border(
+        estimate, 0.0, lambda rate: float(evidence_above(failures, simulations, rate)) < limit
+    )
+    high = _border(
+        estimate, 1.0, lambda rate: float(evidence_below(failures, simulations, rate)) < limit
+    )
     return Rate(failures, simulations, low, high, confidence, at_any_time=True)
 
 
@@ -202,7 +204,9 @@ def _log_power(base: float, exponent: int) -> float:
     return exponent * math.log(base) if base > 0 else -math.inf
 
 
-def _log_likelihood(k: np.ndarray, n: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _log_likelihood(
+    k: Float[np.ndarray, "*#n"], n: Float[np.ndarray, "*#n"], q: Float[np.ndarray, "*#n"]
+) -> Float[np.ndarray, "*n"] | np.float64:
     """Compute the logarithm of the probability of one sequence with `k` failures."""
     from scipy.special import xlog1py, xlogy
 
