@@ -17,8 +17,15 @@ from jaxtyping import install_import_hook
 matplotlib.use("Agg")
 
 CHECKED_ROOMS: list[str] = [
+    "core.cube",
+    "core.devices",
+    "core.keys",
+    "core.trace",
+    "core.waveform",
     "counterexamples",
     "estimation",
+    "features",
+    "statistics",
     "sweeps",
     "systems",
 ]

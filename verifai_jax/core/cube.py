@@ -95,7 +95,7 @@ class Cube:
             ),
         )
 
-    def cells(self, u: Float[Array, "*n d"]) -> Int[Array, "*n k"]:
+    def cells(self, u: Float[Array | np.ndarray, "*n d"]) -> Int[Array, "*n k"]:
         """Return the cell of each discrete coordinate of these points."""
         points = jnp.asarray(u)[..., self.discrete]
         counts = np.array([self.levels[i] for i in self.discrete], np.int32)
@@ -105,7 +105,7 @@ class Cube:
             found = found.at[..., j].set(place.astype(jnp.int32))
         return found
 
-    def centres(self, cells: Int[Array, "*n k"]) -> Float[Array, "*n k"]:
+    def centres(self, cells: Int[Array | np.ndarray, "*n k"]) -> Float[Array, "*n k"]:
         """Return the middles of these cells, as coordinates."""
         counts = np.array([self.levels[i] for i in self.discrete], np.float32)
         middles = ((jnp.asarray(cells) + 0.5) / counts).astype(jnp.float32)
