@@ -364,7 +364,7 @@ class TestRefusedBeforeAnythingCompiles:
         ],
     )
     def test_options(self, problem, options, message):
-        with pytest.raises((ValueError, TypeError), match=message):
+        with unchecked(), pytest.raises((ValueError, TypeError), match=message):
             vj.falsify(problem, **options)
 
     def test_a_misspelt_option_names_itself(self, problem):
@@ -404,7 +404,8 @@ class TestRefusedBeforeAnythingCompiles:
         with pytest.raises(vj.ProblemError, match=r"features \['a', 'b'\].*'c'"):
             vj.falsify(problem, "uniform", 10)
         problem = vj.Problem("misfit", space=SPACE, system=lambda f, k: f["a"], spec="always x < 1")
-        with pytest.raises(vj.ProblemError, match="must return a Trace; it returned"):
+        message = "must return a Trace; it returned"
+        with unchecked(), pytest.raises(vj.ProblemError, match=message):
             vj.falsify(problem, "uniform", 10)
 
 

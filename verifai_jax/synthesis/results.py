@@ -51,7 +51,7 @@ class Synthesis:
     @property
     def holds(self) -> bool:
         """True where the formula kept its margin in every simulation with the best parameters."""
-        kept = self.robustness >= self.margin
+        kept = bool(self.robustness >= self.margin)
         return kept and (self.held_out is None or self.held_out.passed)
 
     @cached_property

@@ -110,7 +110,7 @@ class System:
         """True for a system that has finer steps."""
         return type(self).refined is not System.refined
 
-    def refined(self, factor: int) -> "System":
+    def refined(self, factor: int | Int[Array, ""]) -> "System":
         """Return the same system, sampled and decided as before, at a smaller step.
 
         **Arguments:**
@@ -225,7 +225,7 @@ class FunctionSystem(System):
     def can_refine(self) -> bool:
         return self._offers("refined")
 
-    def refined(self, factor: int) -> System:
+    def refined(self, factor: int | Int[Array, ""]) -> System:
         return as_system(self._method("refined")(factor))
 
     def with_backend(self, name: str) -> System:

@@ -60,7 +60,7 @@ class Ode(System):
         """Simulated seconds."""
         return self.steps * self.dt
 
-    def refined(self, factor: int) -> "Ode":
+    def refined(self, factor: int | Int[Array, ""]) -> "Ode":
         """Return the same loop, sampled, decided and ended as before, at a finer step.
 
         The factor may be traced by JAX; the loop then has no derivative in reverse mode.
