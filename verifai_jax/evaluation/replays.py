@@ -116,7 +116,7 @@ class Replays:
                 parts.append(_raised(len(numbers[block]), len(self.problem.formulas), error))
         return Verdicts.concatenate([part._replace(features=None) for part in parts])
 
-    def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " n"]:
+    def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if together == 1 and not self.draws:
             return self.key[None]  # Any key will do.
         # Always as many, so that one program makes the keys.
