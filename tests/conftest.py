@@ -25,6 +25,8 @@ CHECKED_ROOMS: list[str] = [
     "counterexamples",
     "estimation",
     "features",
+    "mtl",
+    "search",
     "statistics",
     "sweeps",
     "systems",

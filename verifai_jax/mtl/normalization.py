@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Trace
@@ -53,7 +53,7 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
 
 
 def anneal(
-    step: Float[Array, ""] | int, steps: int, start: float = 0.3, end: float = 0.02
+    step: Real[Array, ""] | float, steps: int, start: float = 0.3, end: float = 0.02
 ) -> Float[Array, ""]:
     """Return the temperature at a step of an optimisation: geometric from `start` to `end`.
 
