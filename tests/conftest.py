@@ -17,6 +17,7 @@ from jaxtyping import install_import_hook
 matplotlib.use("Agg")
 
 CHECKED_ROOMS: list[str] = [
+    "analysis",
     "core.cube",
     "core.devices",
     "core.keys",
@@ -24,11 +25,16 @@ CHECKED_ROOMS: list[str] = [
     "core.waveform",
     "counterexamples",
     "estimation",
+    "falsification",
     "features",
     "mtl",
+    "plotting",
+    "problem",
+    "rl",
     "search",
     "statistics",
     "sweeps",
+    "synthesis",
     "systems",
 ]
 """Rooms whose annotations, shapes included, are checked at run time in tests."""

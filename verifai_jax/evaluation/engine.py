@@ -111,7 +111,7 @@ class Engine:
     def evaluate(
         self,
         rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " n"],
+        key: Key[Array, ""] | Key[Array, " lanes"],
         first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
         shared: PyTree = (),
@@ -138,7 +138,7 @@ class Engine:
     def holds(
         self,
         rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " n"],
+        key: Key[Array, ""] | Key[Array, " lanes"],
         first: int = 0,
         shared: PyTree = (),
     ) -> Bool[np.ndarray, "n formulas"]:
@@ -195,7 +195,7 @@ class Engine:
         self,
         mode: Mode,
         rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " n"],
+        key: Key[Array, ""] | Key[Array, " lanes"],
         first: int,
         temperature: ArrayLike,
         shared: PyTree,
@@ -363,7 +363,7 @@ def _pad(rows: np.ndarray | Array, count: int) -> np.ndarray | Array:
     return np.concatenate([rows, np.broadcast_to(rows[-1:], (count - len(rows), *rows.shape[1:]))])
 
 
-def _pad_keys(keys: Key[Array, " n"], count: int) -> Key[Array, " count"]:
+def _pad_keys(keys: Key[Array, " lanes"], count: int) -> Key[Array, " count"]:
     if len(keys) == count:
         return keys
     data = jnp.asarray(_pad(np.asarray(jax.random.key_data(keys)), count))
