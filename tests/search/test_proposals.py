@@ -56,12 +56,12 @@ def test_every_search(name):
     np.testing.assert_array_equal(points, again)
 
 
-def test_a_search_goes_on_from_its_snapshot_under_a_constraint():
+def test_a_search_goes_on_from_its_checkpoint_under_a_constraint():
     for name in ("halton", "cross_entropy"):
         one = Proposals(named(name), SPACE.cube, 16, KEY, SPACE.constraint)
         play(one, 3, False)
         two = Proposals(named(name), SPACE.cube, 16, jax.random.key(99), SPACE.constraint)
-        two.restore(one.snapshot())
+        two.restore(one.checkpoint())
         np.testing.assert_array_equal(play(one, 3, False), play(two, 3, False))
         assert (one.proposed, one.accepted) == (two.proposed, two.accepted)
 

@@ -226,14 +226,14 @@ def resume(
     check_rule(search, stop_when)
     budget = run.budget if budget is None else budget
     check_options(budget, run.batch, run.seed, max_seconds, stop_after)
-    snapshot = run.snapshot or {}
-    rows = int(snapshot.get("rows", 0))
+    checkpoint = run.checkpoint or {}
+    rows = int(checkpoint.get("rows", 0))
     if budget <= rows:
         raise ValueError(
             f"the run of {run.name!r} has {rows} simulations already; resume it with a larger "
             f"budget than {budget}"
         )
-    if not snapshot and len(run.table) and run.stopped != "running":
+    if not checkpoint and len(run.table) and run.stopped != "running":
         raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
     if rows > len(run.table):
         raise ValueError(
@@ -251,8 +251,8 @@ def resume(
     )
 
     def prepare() -> None:
-        if snapshot:
-            rounds.resume(snapshot)
+        if checkpoint:
+            rounds.resume(checkpoint)
 
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
     notes = [note for note in run.notes if note.startswith("portfolio ")]
@@ -322,7 +322,7 @@ def _run_rounds(
             search_data=searches.to_json(search),
             space_data=space_as_data(problem),
             acceptance=rounds.acceptance,
-            snapshot=rounds.snapshot,
+            checkpoint=rounds.checkpoint,
             precision=rounds.precision,
             backend=choice.backend,
             confirm=rounds.confirms,

@@ -1,7 +1,7 @@
 """The state of a run between its rounds, and one round: propose, simulate, judge, tell, store.
 
-A round leaves everything in step: the table, the search and the counts. What `snapshot` gives after
-a round is enough to go on from there, whatever happened since.
+A round leaves everything in step: the table, the search and the counts. The `checkpoint` after a
+round is enough to go on from there, whatever happened since.
 """
 
 import time
@@ -82,7 +82,7 @@ class Rounds:
         self.found = self.judged = 0
         self.best = float("nan")
         self.compile_seconds = 0.0
-        self.snapshot: dict[str, Any] = {}
+        self.checkpoint: dict[str, Any] = {}
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
@@ -230,7 +230,7 @@ class Rounds:
         self._keep()
 
     def save(self, seldom: bool = False) -> None:
-        """Write the snapshot to the folder; if `seldom`, only when the last one is a second old.
+        """Write the checkpoint to the folder; if `seldom`, only when the last one is a second old.
 
         **Raises:** `OSError` where it cannot be written.
         """
@@ -238,26 +238,26 @@ class Rounds:
         if self.folder is None or (seldom and now - self._saved < 1.0):
             return
         self._saved = now
-        write_checkpoint(self.snapshot, self.folder)
+        write_checkpoint(self.checkpoint, self.folder)
         if self._journal is not None:
-            # Only now: rows of the table that the snapshot does not know are simulated again.
-            self._journal.settle(int(self.snapshot.get("rows", 0)))
+            # Only now: rows of the table that the checkpoint does not know are simulated again.
+            self._journal.settle(int(self.checkpoint.get("rows", 0)))
 
-    def _restore_confirmer(self, snapshot: Mapping[str, Any]) -> None:
-        if self._confirmer is not None and "confirmer" in snapshot:
-            examined, band = snapshot["confirmer"]
+    def _restore_confirmer(self, checkpoint: Mapping[str, Any]) -> None:
+        if self._confirmer is not None and "confirmer" in checkpoint:
+            examined, band = checkpoint["confirmer"]
             self._confirmer.examined, self._confirmer.band = int(examined), float(band)
 
-    def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on where `snapshot` was taken; the table must hold its rows already.
+    def resume(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on where `checkpoint` was taken; the table must hold its rows already.
 
-        **Raises:** `ValueError` for a snapshot of another search, space or batch size.
+        **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """
-        self._proposals.restore(snapshot)
-        self._restore_confirmer(snapshot)
+        self._proposals.restore(checkpoint)
+        self._restore_confirmer(checkpoint)
         if self._objective is not None:
             names = self._objective.state
-            self._objective.state = {name: snapshot[f"objective.{name}"] for name in names}
+            self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
         table = self.table.all
         self.judged = len(table) - len(self.table.failed)
         self.found = len(self.table.counterexamples)
@@ -265,16 +265,16 @@ class Rounds:
         self._keep()
 
     def _keep(self) -> None:
-        """Take the snapshot: nothing is copied, as nothing in it is ever written to."""
+        """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
         objective = {} if self._objective is None else self._objective.state
-        self.snapshot = {
-            **self._proposals.snapshot(),
+        self.checkpoint = {
+            **self._proposals.checkpoint(),
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }
         if self._confirmer is not None:
             seen = self._confirmer
-            self.snapshot["confirmer"] = np.array([seen.examined, seen.band], np.float64)
+            self.checkpoint["confirmer"] = np.array([seen.examined, seen.band], np.float64)
 
     def _columns(self, verdicts: Verdicts) -> dict[str, np.ndarray]:
         """Return the columns of the table, as the rows are before they are confirmed."""

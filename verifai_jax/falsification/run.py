@@ -54,7 +54,7 @@ class Run:
     - `problem`: None for a run that was loaded without it.
     - `search_data`, `space_data`: search and space as plain data; None for one of the user's own.
     - `acceptance`: share of proposed points that the constraint accepted; None without one.
-    - `snapshot`: the checkpoint that `resume` goes on from.
+    - `checkpoint`: the checkpoint that `resume` goes on from.
     - `precision`: `"float32"` or `"float64"`, of the simulations.
     - `backend`: the engine that simulated; None for a system that has one only.
     - `notes`: decisions that were made without the user.
@@ -79,7 +79,7 @@ class Run:
     search_data: Mapping[str, Any] | None = None
     space_data: Mapping[str, Any] | None = None
     acceptance: float | None = None
-    snapshot: Mapping[str, Any] | None = None
+    checkpoint: Mapping[str, Any] | None = None
     precision: str = "float32"
     backend: str | None = None
     notes: Sequence[str] = ()
@@ -189,8 +189,8 @@ class Run:
         folder = Path(path)
         self.table.save(folder)
         write_record(self, folder)
-        if self.snapshot:
-            write_checkpoint(self.snapshot, folder)
+        if self.checkpoint:
+            write_checkpoint(self.checkpoint, folder)
         return folder
 
     def __repr__(self) -> str:
@@ -272,7 +272,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         table=ErrorTable.load(folder, features) if begun else ErrorTable(features),
         folder=folder,
         problem=problem,
-        snapshot=read_checkpoint(folder),
+        checkpoint=read_checkpoint(folder),
         **{name: record[name] for name in _RECORDED},
         **{name: record[name] for name in _ADDED if name in record},
     )

@@ -163,7 +163,7 @@ class Proposals:
             )
             self._state = warm_start(self._state, observations)
 
-    def snapshot(self) -> dict[str, np.ndarray | Array]:
+    def checkpoint(self) -> dict[str, np.ndarray | Array]:
         """Return the state that decides the next points; its values are arrays and never change."""
         leaves = jax.tree.leaves(self._state)
         return {
@@ -172,15 +172,15 @@ class Proposals:
             "counts": np.array([self.proposed, self.accepted], np.int64),
         }
 
-    def restore(self, snapshot: Mapping[str, np.ndarray | Array]) -> None:
-        """Continue from a snapshot.
+    def restore(self, checkpoint: Mapping[str, np.ndarray | Array]) -> None:
+        """Continue from a checkpoint.
 
-        **Raises:** `ValueError` for a snapshot of another search, space or batch size.
+        **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """
         leaves, form = jax.tree.flatten(self._state)
         restored = []
         for i, leaf in enumerate(leaves):
-            saved = snapshot.get(f"search.{i}")
+            saved = checkpoint.get(f"search.{i}")
             if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) and isinstance(saved, np.ndarray):
                 saved = jax.random.wrap_key_data(jnp.asarray(saved), impl=jax.random.key_impl(leaf))
             if saved is None or saved.shape != leaf.shape or saved.dtype != leaf.dtype:
@@ -190,8 +190,8 @@ class Proposals:
                 )
             restored.append(jnp.asarray(saved))
         self._state = jax.tree.unflatten(form, restored)
-        self._queue = np.asarray(snapshot["queue"])
-        self.proposed, self.accepted = (int(count) for count in snapshot["counts"])
+        self._queue = np.asarray(checkpoint["queue"])
+        self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
 
     def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
