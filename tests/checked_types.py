@@ -1,4 +1,4 @@
-"""The type checker of the tests: beartype, which takes an int where a float is wanted.
+"""The type checker of the tests: beartype, which takes NumPy's numbers for Python's.
 
 install_import_hook("verifai_jax.estimation", "checked_types.check")
 with unchecked():
@@ -9,9 +9,13 @@ import contextlib
 from collections.abc import Iterator
 
 import jaxtyping
-from beartype import BeartypeConf, beartype
+import numpy as np
+from beartype import BeartypeConf, FrozenDict, beartype
 
-check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+NUMBERS = FrozenDict({int: int | np.integer, float: float | int | np.floating | np.integer})
+"""An integer will do where a number is wanted, and NumPy's scalars are numbers."""
+
+check = beartype(conf=BeartypeConf(hint_overrides=NUMBERS))
 
 
 @contextlib.contextmanager

@@ -17,8 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Real
 
-Samples: TypeAlias = Real[Array | np.ndarray, "time *k"] | Bool[Array | np.ndarray, "time *k"]
-"""A signal, one row a sample; truth values count as +1 and -1."""
+Samples: TypeAlias = (
+    Real[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
+    | Bool[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
+)
+"""A signal or its form, one row a sample; truth values count as +1 and -1."""
 
 
 class Status(enum.IntEnum):

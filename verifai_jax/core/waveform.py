@@ -56,9 +56,9 @@ class Waveform:
         return replace(self, duration=check_duration(duration))
 
     def __call__(
-        self, time: Real[Array, ""] | np.number | float
+        self, time: Real[Array | np.ndarray, "*times"] | np.number | float
     ) -> Float[Array | np.ndarray, "*shape"] | np.floating:
-        """Return the value at a time in seconds.
+        """Return the value at a time, or at several, in seconds.
 
         **Raises:** `ValueError` without a duration.
         """
