@@ -6,8 +6,8 @@ BIN := .venv/bin
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
-	@echo "make test       set up, then run the tests of every room (5 minutes on two cores)"
-	@echo "make test-all   these and the slow ones: parity, statistics, training (40 minutes)"
+	@echo "make test       set up, then run the quick tests of every room"
+	@echo "make test-all   these and the slow ones: parity, statistics, training"
 	@echo "make lint       ruff and pyright"
 	@echo "make notebooks  execute the notebooks; their text must be what is stored"
 	@echo "make notebooks-update  execute the notebooks and store what they show"

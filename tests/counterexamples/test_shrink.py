@@ -186,6 +186,7 @@ def test_without_a_counterexample():
         shrink(run)
 
 
+@pytest.mark.slow
 def test_choices_integers_and_a_constraint():
     space = vj.FeatureSpace(
         {

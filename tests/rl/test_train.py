@@ -53,6 +53,7 @@ class Aim:
 SMALL = PPO(learning_rate=1e-2, hidden=(16,), value_hidden=(16,), environments=8, horizon=16)
 
 
+@pytest.mark.slow
 def test_learns_discrete_actions():
     trained = train(Recall(), SMALL, seed=0, steps=8_000)
     assert np.nanmean(trained.mean_return[:3]) < 0.75
@@ -104,6 +105,7 @@ def test_tasks_are_recognised_by_their_members():
     assert not isinstance(object(), Task)
 
 
+@pytest.mark.slow
 def test_episodes_are_cut_off_and_counted():
     ppo = PPO(hidden=(4,), value_hidden=(4,), environments=2, horizon=7, minibatches=1)
     training = ppo.init(Aim(time_limit=3), jax.random.key(0), updates=2)

@@ -143,6 +143,7 @@ def test_gradient_that_the_environment_stops_is_refused():
         jax.eval_shape(jax.grad(lambda t: system({"theta0": t}, KEY)["x"][-1]), 0.1)
 
 
+@pytest.mark.slow
 def test_falsified_in_batches():
     problem = vj.Problem(
         "gymnax",
