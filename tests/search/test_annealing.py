@@ -11,7 +11,7 @@ from verifai_jax.search import Observations
 from verifai_jax.search.annealing import (
     Annealing,
     _best_to_median,
-    _exchanged,
+    _exchange,
     _matchings,
     _reflected,
 )
@@ -60,7 +60,7 @@ def test_exchanges_sort_cold_chains_and_lose_no_point():
     energy = jnp.array([5.0, 3.0, jnp.inf, 1.0, 4.0, 2.0, 0.0])
     coldness = jnp.array([6.0, 5.0, 4.0, 3.0, 2.0, 1.0, 0.0]) * 1e6
     matchings = _matchings(7)
-    place = np.asarray(_exchanged(energy, coldness, jnp.zeros(matchings.shape)))
+    place = np.asarray(_exchange(energy, coldness, jnp.zeros(matchings.shape)))
     assert sorted(place.tolist()) == list(range(7))
     # Gains only are taken at this temperature: the best goes to the coldest chain in one go.
     assert energy[place[0]] == 0
@@ -76,7 +76,7 @@ def test_exchanges_follow_the_odds():
     energy, coldness = jnp.array([0.0, 1.0]), jnp.array([1.5, 0.5])
     chance = jnp.log(jax.random.uniform(jax.random.key(0), (20000, 2, 2)))
     chance = chance.at[:, 1].set(0.0)
-    place = jax.vmap(lambda chance: _exchanged(energy, coldness, chance))(chance)
+    place = jax.vmap(lambda chance: _exchange(energy, coldness, chance))(chance)
     assert abs(float(jnp.mean(place[:, 0] == 1)) - np.exp(-1)) < 0.02
 
 

@@ -168,7 +168,7 @@ def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     u = jnp.array([[0.2, 0.2], [0.25, 0.2], [0.35, 0.2], [0.9, 0.9]], jnp.float32)
     rho = jnp.array([-1.0, -0.5, 0.1, 0.3], jnp.float32)
     state = told(search, state, cube, u, rho)
-    seen = search._deflated(state, cube, Observations(u, rho, jnp.ones(4, bool)))
+    seen = search._deflate(state, cube, Observations(u, rho, jnp.ones(4, bool)))
     assert float(seen.rho[0]) > float(seen.rho[1]) > 0.3
     assert float(seen.rho[2]) > 0.1
     assert float(seen.rho[3]) == np.float32(0.3)
@@ -186,8 +186,8 @@ def test_the_gradient_is_that_of_the_raised_robustness():
 
     u = jax.random.uniform(jax.random.key(1), (4, 3), jnp.float32)
     told_of = Observations(u, jax.vmap(rho)(u), jnp.ones(4, bool), jax.vmap(jax.grad(rho))(u))
-    seen = search._deflated(state, cube, told_of)
-    wanted = jax.vmap(jax.grad(lambda p: search._raised(state, cube, p[None], rho(p)[None])[0]))(u)
+    seen = search._deflate(state, cube, told_of)
+    wanted = jax.vmap(jax.grad(lambda p: search._raise(state, cube, p[None], rho(p)[None])[0]))(u)
     assert seen.gradient is not None
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
 
@@ -201,7 +201,7 @@ def test_clauses_and_their_gradients_are_raised_alike():
         return jnp.stack([jnp.sum(u**2), u[0] - 2.0, jnp.float32(-1e9)])
 
     u = jax.random.uniform(jax.random.key(1), (4, 3), jnp.float32)
-    seen = search._deflated(
+    seen = search._deflate(
         state,
         cube,
         Observations(

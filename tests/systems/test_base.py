@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.trace import Trace
@@ -109,7 +110,8 @@ def test_what_overrides_is_offered():
 def test_what_cannot_be_called_is_refused():
     with pytest.raises(ValueError, match=r"must be a function .* -> Trace; got 3"):
         as_system(3)
-    with pytest.raises(vj.ProblemError, match=r"must be a function .* -> Trace; got 3"):
+    refused = pytest.raises(vj.ProblemError, match=r"must be a function .* -> Trace; got 3")
+    with unchecked(), refused:
         vj.Problem("three", SPACE, 3, "x <= 1")
     with pytest.raises(NotImplementedError, match=r"System has no __call__\(features, key\)"):
         System()({})

@@ -6,6 +6,7 @@ import pytest
 from verifai_jax.systems.ode import sin_cos
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("largest", [0.8, 3.2, 100.0, 1e5])
 def test_as_close_as_float32_can_tell(largest):
     angles = np.random.default_rng(0).uniform(-largest, largest, 200_000).astype(np.float32)
