@@ -13,7 +13,7 @@ from verifai_jax.search.annealing import (
     _best_to_median,
     _exchange,
     _matchings,
-    _reflected,
+    _reflect,
 )
 from verifai_jax.testing import check_search
 
@@ -82,7 +82,7 @@ def test_exchanges_follow_the_odds():
 
 def test_reflection():
     u = jnp.array([[-0.25, 0.5, 1.25, 2.25, -1.5, 1.0]])
-    np.testing.assert_allclose(_reflected(u), [[0.25, 0.5, 0.75, 0.25, 0.5, 1.0]], atol=1e-6)
+    np.testing.assert_allclose(_reflect(u), [[0.25, 0.5, 0.75, 0.25, 0.5, 1.0]], atol=1e-6)
 
 
 def test_the_spread_is_that_of_the_first_points():
