@@ -267,7 +267,7 @@ def _checked(trace: object, count: int) -> Trace:
     if not isinstance(trace, Trace):
         raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")
     for name, signal in trace.signals.items():
-        if np.ndim(signal) < 2 or np.shape(signal)[0] != count:
+        if len(np.shape(signal)) < 2 or np.shape(signal)[0] != count:
             raise ValueError(
                 f"a batch of {count} simulations must give signals [{count}, time]; {name!r} has "
                 f"shape {list(np.shape(signal))}"
