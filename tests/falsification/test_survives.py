@@ -131,7 +131,7 @@ import sys
 from pathlib import Path
 import numpy as np
 import verifai_jax as vj
-from tests.test_survives import slow_problem
+from tests.falsification.test_survives import slow_problem
 
 if __name__ == "__main__":
     folder = Path(sys.argv[2])
