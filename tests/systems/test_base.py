@@ -107,6 +107,22 @@ def test_what_overrides_is_offered():
     assert not Finer().can_fold
 
 
+def test_a_system_of_an_exact_step_has_no_finer_one():
+    class Finer(Half):
+        exact_step = True
+
+        def refined(self, factor):
+            return self
+
+    class Environment(Duck):
+        exact_step = True
+
+    assert not (Half().exact_step or as_system(Duck()).exact_step)
+    assert not Finer().can_refine
+    assert as_system(Environment()).exact_step
+    assert not as_system(Environment()).can_refine
+
+
 def test_what_cannot_be_called_is_refused():
     with pytest.raises(ValueError, match=r"must be a function .* -> Trace; got 3"):
         as_system(3)

@@ -41,6 +41,8 @@ class System:
     - `forward_up_to`: features up to which forward mode is no slower than reverse mode.
     - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
     - `dt`: the sampling period in seconds of what `fold` simulates.
+    - `exact_step`: True where the step is part of what the system is, as in an environment that its
+      authors define by a difference equation: no finer step simulates the same system.
     - `traced_factor`: True where JAX may trace the factor that `refined` takes.
     - `backends`: names of the engines that can simulate this system, for one with several.
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
@@ -53,6 +55,7 @@ class System:
     forward_up_to: int = 1
     reverse_hint: str = ""
     dt: float | None = None
+    exact_step: bool = False
     traced_factor: bool = False
     backends: tuple[str, ...] = ()
     backend: str | None = None
@@ -107,8 +110,8 @@ class System:
 
     @property
     def can_refine(self) -> bool:
-        """True for a system that has finer steps."""
-        return type(self).refined is not System.refined
+        """True for a system that has finer steps; never where `exact_step`."""
+        return type(self).refined is not System.refined and not self.exact_step
 
     def refined(self, factor: int | Int[Array, ""]) -> "System":
         """Return the same system, sampled and decided as before, at a smaller step.
@@ -165,8 +168,8 @@ class System:
 
 
 _VALUES = (
-    *("black_box", "lanes", "forward_up_to", "reverse_hint", "dt", "traced_factor"),
-    *("backends", "backend", "likely"),
+    *("black_box", "lanes", "forward_up_to", "reverse_hint", "dt", "exact_step"),
+    *("traced_factor", "backends", "backend", "likely"),
 )
 
 
@@ -223,7 +226,7 @@ class FunctionSystem(System):
 
     @property
     def can_refine(self) -> bool:
-        return self._offers("refined")
+        return self._offers("refined") and not self.exact_step
 
     def refined(self, factor: int | Int[Array, ""]) -> System:
         return as_system(self._method("refined")(factor))
