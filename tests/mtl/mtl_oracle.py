@@ -55,6 +55,7 @@ class Oracle:
                     "-": lambda: values[0] - values[1],
                     "*": lambda: values[0] * values[1],
                     "/": lambda: values[0] / values[1],
+                    "**": lambda: values[0] ** values[1],
                     "neg": lambda: -values[0],
                     "abs": lambda: abs(values[0]),
                     "sqrt": lambda: math.sqrt(values[0]),
@@ -171,6 +172,7 @@ _expressions = st.one_of(
     st.builds(abs, _signals),
     st.builds(lambda a, b: a - b, _signals, _signals),
     st.builds(lambda a, b: a * 2 + b, _signals, _quarters),
+    st.builds(lambda a, k: a**k, _signals, st.integers(0, 3)),
     st.builds(lambda a, b: a.min(b), _signals, _quarters),
     st.builds(lambda k: signal("p")[k], st.integers(0, 1)),
 )

@@ -14,6 +14,7 @@ from verifai_jax.mtl import (
     always,
     boolean,
     eventually,
+    explain,
     hard,
     parse,
     robustness,
@@ -187,6 +188,46 @@ def test_vectors():
         pytest.raises(TypeError, match=r"'p' has 2 components, counted from 0; got p\[2\]"),
     ):
         robustness("p[2] > 0", trace)
+
+
+@pytest.mark.parametrize(
+    ("text", "power"),
+    [
+        ("x**2 > y", lambda x: x**2),
+        ("x ** -3 > y", lambda x: x**-3.0),
+        ("-x**3 > y", lambda x: -(x**3)),
+        ("2**x > y", lambda x: 2**x),
+        ("x**x > y", lambda x: x**x),
+        ("abs(x)**0.5 > y", lambda x: abs(x) ** 0.5),
+        ("x**0.5 > y", lambda x: x**0.5),
+        ("x**0 > y", lambda x: x**0),
+        ("(-2)**x > y", lambda x: (-2.0) ** x),
+        ("x**(1 + 2 ** 2) > y", lambda x: x**5),
+    ],
+)
+def test_powers_are_those_of_numpy(text, power):
+    x, y = np.array([-3.0, -1.5, -1.0, 0.5, 1.0, 2.0]), np.linspace(-2, 2, 6)
+    with np.errstate(all="ignore"), jax.enable_x64(True):
+        values = robustness_signal(text, Trace({"x": x, "y": y}, dt=0.5))
+        np.testing.assert_allclose(values, power(x) - y, rtol=1e-12)
+    assert parse(str(parse(text))) == parse(text)
+
+
+@pytest.mark.parametrize(("k", "at_zero"), [(0, 0.0), (1, 1.0), (2, 0.0), (3, 0.0), (1.5, 0.0)])
+def test_gradients_of_powers_are_finite_at_zero_and_below(k, at_zero):
+    def rho(x):
+        return robustness(f"x**{k} > 0", Trace({"x": x[None]}, dt=1.0))
+
+    assert jax.grad(rho)(jnp.float32(0.0)) == at_zero
+    if k != 1.5:
+        np.testing.assert_allclose(jax.grad(rho)(jnp.float32(-2.0)), k * (-2.0) ** (k - 1))
+
+
+def test_a_power_is_explained():
+    why = explain("G (x**2 < 0.5)", Trace({"x": np.array([0.1, -0.9, 0.3])}, dt=1.0))
+    assert str(why.predicate) == "x**2 < 0.5"
+    assert why.time == 1.0
+    assert why.robustness == pytest.approx(0.5 - 0.81, abs=1e-6)
 
 
 def test_an_interval_off_the_clock_names_the_nearest_multiples():

@@ -21,6 +21,7 @@ from verifai_jax.mtl import (
     since,
     until,
 )
+from verifai_jax.mtl.expression import expression
 
 X, Y, A, B = signal("x"), signal("y"), signal("a"), signal("b")
 
@@ -50,6 +51,13 @@ X, Y, A, B = signal("x"), signal("y"), signal("a"), signal("b")
         ("norm(p) > 1 & p[1] < 2", (signal("p").norm() > 1) & (signal("p")[1] < 2)),
         ("sqrt(x) + sin(x) != cos(x)", (X.sqrt() + X.sin()).differs(X.cos())),
         ("TRUE & !FALSE", TRUE & ~FALSE),
+        ("x**2 + y ** 2 < 1", X**2 + Y**2 < 1),
+        ("-x**2 > 2**-y * 3", -(X**2) > 2 ** (-Y) * 3),
+        ("p[0]**2 / abs(x)**0.5 < (x - 1)**3", signal("p")[0] ** 2 / abs(X) ** 0.5 < (X - 1) ** 3),
+        ("a ^ b", always(A).operand ^ B),
+        ("(x > 0) ^ (y > 0)", (X > 0) ^ (Y > 0)),
+        ("x > 0 ^ y > 0", (X > 0) ^ (Y > 0)),
+        ("!a ^ always b", ~A ^ always(B)),
         ('"ego speed [m/s]" > 2', signal("ego speed [m/s]") > 2),
         ("ego.speed > 2", signal("ego.speed") > 2),
         ("s > 1 & ms < 2", (signal("s") > 1) & (signal("ms") < 2)),
@@ -75,7 +83,12 @@ def test_reads(text, formula):
         ((X > 0).weak_until(Y > 0), "(x > 0) weak_until (y > 0)"),
         ((X > 0).release(Y > 0), "(x > 0) release (y > 0)"),
         ((X > 0).iff(Y > 0), "x > 0 <-> y > 0"),
-        ((X > 0) ^ (Y > 0), "x > 0 ^ y > 0"),
+        ((X > 0) ^ (Y > 0), "x > 0 xor y > 0"),
+        (A ^ (Y > 0), "a xor y > 0"),
+        (-(X**2) < (-X) ** 2, "-x**2 < (-x)**2"),
+        ((X**2) ** 3 > X ** (Y**2), "(x**2)**3 > x**(y**2)"),
+        ((X * Y) ** -2 > (X / Y) ** (Y + 1), "(x * y)**(-2) > (x / y)**(y + 1)"),
+        (X.sqrt() ** 2 < (X * 0 - 2) ** 2, "sqrt(x)**2 < (x * 0 - 2)**2"),
         (X - (Y - 1) > -2, "x - (y - 1) > -2"),
         (signal("G") > 0, '"G" > 0'),
         (signal("a b") > 0, '"a b" > 0'),
@@ -122,7 +135,19 @@ def test_writes(formula, text):
         ("min(x) > 1", "min takes two arguments or more; got 1"),
         ("(a & b) + 1 > 2", "a number or a signal is needed here, not the formula '(a & b)'"),
         ("abs(a & b) > 2", "a number or a signal is needed here, not the formula 'a & b'"),
-        ("3", "a formula is needed here, not the number 3"),
+        ("3", "not the number 3: compare a signal with it, as in x > 3, or write TRUE or FALSE"),
+        ("always (1 + 2)", "a formula is needed here, not the number 1 + 2"),
+        ("2 < 0.5", "2 < 0.5 compares numbers and no signal"),
+        ("a & 2 < 0.5", "compare a signal, as in x < 0.5, or write TRUE or FALSE"),
+        ("always (x^2 < 0.5)", "beside arithmetic: a power is written x**2, and exclusive or (one"),
+        ("x^2 + y^2 < 1", "a power is written x**2"),
+        ("a -> x > y^2", "a power is written y**2"),
+        ("abs(x)^y < 1", "a power is written abs(x)**y"),
+        ("2 * (x + 1)^y < 1", "a power is written (x + 1)**y"),
+        ("x > 0 ^ b", "a power is written 0**b"),
+        ("x^y < 1", "a power is written x**y"),
+        ("(x^y) < 1", "not the formula '(x^y)'; a power is written x**2"),
+        ("x**y**z > 1", "a chain of '**' is ambiguous: write x ** (y ** z) or (x ** y) ** z"),
         ("a & 3", "a formula is needed here, not the number 3"),
         ("", "a formula is needed; got an empty text"),
         ("a b", "but found 'b'"),
@@ -142,6 +167,9 @@ def test_the_caret_stands_under_the_place():
         parse("x > 1 &\n  y >= >= 2")
     assert str(caught.value).split("\n")[1:] == ["    y >= >= 2", "         ^^"]
     assert caught.value.position == 15
+    with pytest.raises(FormulaSyntaxError) as caught:
+        parse("always (x^2 < 0.5)")
+    assert str(caught.value).split("\n")[1:] == ["  always (x^2 < 0.5)", "           ^"]
 
 
 def test_constants_and_definitions():
@@ -181,6 +209,12 @@ def test_python_refuses_what_makes_no_sense():
         pytest.raises(ValueError, match="a number in a formula must be finite; got nan"),
     ):
         float("nan") < X  # noqa: B015
+    with unchecked(), pytest.raises(TypeError, match=r"between formulas; a power is x\*\*2"):
+        X ^ 2
+    with unchecked(), pytest.raises(TypeError, match=r"between formulas; a power is 2\*\*x"):
+        2 ^ X
+    with pytest.raises(ValueError, match="a formula is needed here, not the number 3"):
+        always(expression(3))
     with pytest.raises(ValueError, match="only a signal has components"):
         (X + 1)[0]
     with pytest.raises(ValueError, match="without quotes or line breaks"):
@@ -204,6 +238,9 @@ def test_services():
 
 
 def test_latex():
+    assert latex(parse("-(x / 2)**2 > y**-1")) == (
+        r"-\left(\frac{\mathit{x}}{2}\right)^{2} > \mathit{y}^{-1}"
+    )
     text = latex(parse("G[0,4] (abs(x_1) <= 2 -> F (norm(p) / 2 > y & !a))"))
     assert text == (
         r"\Box_{[0, 4]} \left(\left|\mathit{x\_1}\right| \leq 2 \rightarrow "

@@ -54,6 +54,11 @@ def _expression_latex(e: Term, outer: int = 0) -> str:
             level, text = 3, f"-{_expression_latex(argument, 4)}"
         case Arithmetic("/", (left, right)):
             return rf"\frac{{{_expression_latex(left)}}}{{{_expression_latex(right)}}}"
+        case Arithmetic("**", (base, exponent)):
+            level, text = 4, _expression_latex(base, 5)
+            if isinstance(base, Arithmetic) and base.name == "/":
+                text = rf"\left({text}\right)"  # No fraction is a base without them.
+            text = f"{text}^{{{_expression_latex(exponent)}}}"
         case Arithmetic(("+" | "-" | "*") as name, (left, right)):
             level = PRECEDENCE[name]
             symbol = r"\cdot" if name == "*" else name

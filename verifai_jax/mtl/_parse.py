@@ -26,6 +26,7 @@ _UNITS = {
     "ns": Decimal("1e-9"),
     "min": Decimal(60),
 }
+_CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 _TIMED = ("always", "eventually", "historically", "once", *BINARY)
 
 
@@ -102,19 +103,18 @@ class _Builder:
 
     def _formula(self, part: _Part) -> Formula:
         if isinstance(part.value, Expression):
-            if isinstance(part.value, Number):
-                raise self._fail(
-                    f"a formula is needed here, not the number {self._source(part)}",
-                    part.start,
-                    part.end,
-                )
-            return ast.Atom(part.value)
+            try:
+                return ast.Atom(part.value)
+            except ValueError as error:
+                raise self._fail(str(error), part.start, part.end) from None
         return part.value
 
     def _expression(self, part: _Part) -> Expression:
         if isinstance(part.value, Formula):
+            source = self._source(part)
+            power = "; a power is written x**2" if "^" in source else ""
             raise self._fail(
-                f"a number or a signal is needed here, not the formula {self._source(part)!r}",
+                f"a number or a signal is needed here, not the formula {source!r}{power}",
                 part.start,
                 part.end,
             )
@@ -132,9 +132,10 @@ class _Builder:
     # Boolean connectives
 
     def _iff(self, tree: Tree) -> _Part:
+        self._refuse_powers(tree)
         parts, words = self._operands(tree)
         if len(words) > 1:
-            raise self._chained(parts, words, "either")
+            raise self._chained(parts, words)
         left, right = map(self._formula, parts)
         value = left.iff(right) if words[0].type == "IFF" else left ^ right
         return _Part(value, *self._span(tree), rule="iff")
@@ -143,7 +144,7 @@ class _Builder:
         parts, words = self._operands(tree)
         self._refuse_open(parts, words)
         if len(words) > 1:
-            raise self._chained(parts, words, "right")
+            raise self._chained(parts, words)
         left, right = map(self._formula, parts)
         return _Part(left >> right, *self._span(tree), rule="impl")
 
@@ -168,19 +169,52 @@ class _Builder:
         value = kind(tuple(map(self._formula, parts)))
         return _Part(value, *self._span(tree), rule="join")
 
+    def _refuse_powers(self, tree: Tree) -> None:
+        """Refuse `x^2 < 1`, where `^` stands beside arithmetic: it means exclusive or.
+
+        Between two comparisons it can mean nothing else, as these do not chain.
+        """
+        for k, word in enumerate(tree.children[1::2]):
+            left = self._touching(tree.children[2 * k], -1)
+            right = self._touching(tree.children[2 * k + 2], 0)
+            kinds = [None if side is None else str(side.data) for side in (left, right)]
+            if str(word) != "^" or kinds in ([None, None], ["cmp", "cmp"]):
+                continue
+            base = _text(self.text, _edge(tree.children[2 * k], -1))
+            exponent = _text(self.text, _edge(tree.children[2 * k + 2], 0))
+            raise self._fail(
+                f"'^' is exclusive or, and here it stands beside arithmetic: a power is written "
+                f"{base}**{exponent}, and exclusive or (one formula) xor (the other)",
+                word.start_pos,
+                word.start_pos + 1,
+            )
+
+    def _touching(self, tree: Tree, side: int) -> Tree | None:
+        """Return the arithmetic of an operand of `^` where it touches it; None if there is none."""
+        while tree.data in _CONNECTIVES and (side or tree.data not in ("negation", "temporal")):
+            tree = tree.children[side]
+        match tree.data:
+            case "quoted" | "true" | "false" | "negation" | "temporal":
+                return None
+            case "parens":
+                return tree if isinstance(self._build(tree).value, Expression) else None
+            case "name":
+                return tree if str(tree.children[0]) in self.constants else None
+        return tree
+
     def _bin(self, tree: Tree) -> _Part:
         parts = [self._build(c) for c in tree.children[::3]]
         words, intervals = tree.children[1::3], tree.children[2::3]
         self._refuse_open(parts, words)
         if len(words) > 1:
-            raise self._chained(parts, words, "right")
+            raise self._chained(parts, words)
         left, right = map(self._formula, parts)
         interval = self._interval(intervals[0])
         a, b = interval.start, interval.end
         value = getattr(left, words[0].type.lower())(right, a, b)
         return _Part(value, *self._span(tree), rule="bin")
 
-    def _chained(self, parts: list[_Part], words: list[Any], side: str) -> FormulaSyntaxError:
+    def _chained(self, parts: list[_Part], words: list[Any]) -> FormulaSyntaxError:
         a, b, c = map(self._source, parts[:3])
         between = [self.text[p.end : q.start].strip() for p, q in itertools.pairwise(parts)]
         first, second = between[0], between[1]
@@ -275,7 +309,10 @@ class _Builder:
                 words[1].start_pos + len(words[1]),
             )
         left, right = map(self._expression, parts)
-        value = ast.Predicate(str(words[0]), left, right)
+        try:
+            value = ast.Predicate(str(words[0]), left, right)
+        except ValueError as error:
+            raise self._fail(str(error), *self._span(tree)) from None
         return _Part(value, *self._span(tree))
 
     def _sum(self, tree: Tree) -> _Part:
@@ -286,6 +323,13 @@ class _Builder:
         return _Part(value, *self._span(tree))
 
     _product = _sum
+
+    def _power(self, tree: Tree) -> _Part:
+        parts, words = self._operands(tree)
+        if len(words) > 1:
+            raise self._chained(parts, words)
+        base, exponent = map(self._expression, parts)
+        return _Part(base**exponent, *self._span(tree))
 
     def _minus(self, tree: Tree) -> _Part:
         part = self._build(tree.children[1])
@@ -342,6 +386,15 @@ class _Builder:
     def _parens(self, tree: Tree) -> _Part:
         part = self._build(tree.children[0])
         return _Part(part.value, *self._span(tree), closed=True)
+
+
+def _edge(tree: Tree, side: int) -> Tree:
+    """Return the first (0) or last (-1) operand in a tree that is none of an open operator."""
+    while tree.data in (*_CONNECTIVES, "cmp", "sum", "product", "power"):
+        if not isinstance(tree.children[side], Tree):
+            break
+        tree = tree.children[side]
+    return tree
 
 
 def _text(text: str, tree: Tree) -> str:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.mtl import formula as ast
@@ -152,8 +153,6 @@ class Evaluator:
                 value = self._compared(comparison, a, b)
             case ast.Atom(e):
                 value = self._compared(">", self.expression(e, start, stop), 0.0)
-        if value.ndim == 0:  # A predicate over constants only.
-            value = jnp.broadcast_to(value, (stop - start + 1,) + (1,) * self.lanes)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)
@@ -363,9 +362,22 @@ def _apply(name: str, values: list[Array | float]) -> Array | float:
             return first * others[0]
         case "/":
             return first / others[0]
+        case "**":
+            return _power(first, others[0])
         case "min" | "max":
             operation = jnp.minimum if name == "min" else jnp.maximum
             for other in others:
                 first = operation(first, other)
             return first
     return {"abs": jnp.abs, "sqrt": jnp.sqrt, "sin": jnp.sin, "cos": jnp.cos}[name](first)
+
+
+def _power(base: Array | float, exponent: Array | float) -> Array | float:
+    """Compute a power; NaN for a fractional one of a negative number, like `sqrt`."""
+    if not isinstance(exponent, float):
+        return jnp.power(base, exponent)
+    if isinstance(base, float):
+        with np.errstate(all="ignore"):  # Python's own raises, or leaves the real numbers.
+            return float(np.power(base, exponent))
+    # By multiplication, whose derivative is finite for negative numbers and at zero too.
+    return base ** int(exponent) if exponent.is_integer() else jnp.power(base, exponent)

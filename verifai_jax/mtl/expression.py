@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.words import FUNCTIONS, name_text, number_text
 
-PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3}
+PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3, "**": 4}
 """Binding strength of the operators."""
 
 
@@ -45,6 +45,12 @@ class Expression(Term):
 
     def __rtruediv__(self, other: float) -> "Expression":
         return Arithmetic("/", (expression(other), self))
+
+    def __pow__(self, other: "Expression | float") -> "Expression":
+        return Arithmetic("**", (self, expression(other)))
+
+    def __rpow__(self, other: float) -> "Expression":
+        return Arithmetic("**", (expression(other), self))
 
     def __neg__(self) -> "Expression":
         return Arithmetic("neg", (self,))
@@ -108,6 +114,14 @@ class Expression(Term):
 
     def __or__(self, other: Formula | Term) -> Formula:
         return formula(self) | other
+
+    def __xor__(self, other: Formula | Term) -> Formula:
+        if not isinstance(other, Formula | Term):
+            raise TypeError(f"'^' is exclusive or, between formulas; a power is {self}**{other}")
+        return formula(self) ^ other
+
+    def __rxor__(self, other: object) -> Formula:
+        raise TypeError(f"'^' is exclusive or, between formulas; a power is {other}**{self}")
 
     def __rshift__(self, other: Formula | Term) -> Formula:
         return formula(self) >> other
@@ -194,7 +208,7 @@ class Component(Expression):
 
 @dataclass(frozen=True)
 class Arithmetic(Expression):
-    """An operator (`+ - * / neg`) or a function (see `FUNCTIONS`) of expressions."""
+    """An operator (`+ - * / ** neg`) or a function (see `FUNCTIONS`) of expressions."""
 
     name: str
     arguments: tuple[Expression, ...]
@@ -216,6 +230,10 @@ class Arithmetic(Expression):
         level = PRECEDENCE[self.name]
         if self.name == "neg":
             text = f"-{self.arguments[0].text(level + 1)}"
+        elif self.name == "**":
+            # A power of a power needs parentheses on either side, as no two tools read it alike.
+            base, exponent = (part.text(level + 1) for part in self.arguments)
+            text = f"{base}**{exponent}"
         else:
             left, right = self.arguments
             text = f"{left.text(level)} {self.name} {right.text(level + 1)}"

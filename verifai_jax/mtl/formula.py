@@ -106,7 +106,7 @@ class Formula:
         return self >> other
 
     def iff(self, other: Formulaic) -> "Formula":
-        """Return `self <-> other`; its negation is `self ^ other`."""
+        """Return `self <-> other`; its negation is `self ^ other`, in text `self xor other`."""
         other = formula(other)
         return Or((And((self, other)), And((Not(self), Not(other)))))
 
@@ -217,6 +217,13 @@ class Predicate(Formula):
     left: Term
     right: Term
 
+    def __post_init__(self) -> None:
+        if not (self.left.signals() or self.right.signals()):
+            raise ValueError(
+                f"{self} compares numbers and no signal, so that all traces are alike: compare a "
+                f"signal, as in x {self.comparison} {self.right}, or write TRUE or FALSE"
+            )
+
     def terms(self) -> tuple[Term, ...]:
         """Return both sides."""
         return self.left, self.right
@@ -231,6 +238,13 @@ class Atom(Formula):
     """A bare expression that is its own robustness; it holds where it is positive."""
 
     expression: Term
+
+    def __post_init__(self) -> None:
+        if not self.expression.signals():
+            raise ValueError(
+                f"a formula is needed here, not the number {self.expression}: compare a signal "
+                f"with it, as in x > {self.expression}, or write TRUE or FALSE"
+            )
 
     def terms(self) -> tuple[Term, ...]:
         """Return the expression."""
@@ -367,7 +381,7 @@ class Since(Formula):
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
     """Return how a formula reads: its operator's word, the operands, and the interval if any.
 
-    Sugar that was rewritten away (`->`, `<->`, `^`, weak until, release) is recognised.
+    Sugar that was rewritten away (`->`, `<->`, `xor`, weak until, release) is recognised.
     """
     match f:
         case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:

@@ -83,7 +83,10 @@ def parser() -> Any:
         ?sum: product ((PLUS | MINUS) product)*
         ?product: factor ((STAR | SLASH) factor)*
         ?factor: MINUS factor -> minus
-               | postfix
+               | power
+        ?power: postfix (POWER exponent)*
+        ?exponent: MINUS exponent -> minus
+                 | postfix
         ?postfix: atom
                 | atom "[" NUMBER "]" -> component
         ?atom: NUMBER -> number
@@ -105,6 +108,7 @@ def parser() -> Any:
         COMPARISON.3: />=|<=|==|!=|>|</
         PLUS: "+"
         MINUS: "-"
+        POWER: "**"
         STAR: "*"
         SLASH: "/"
         UNIT.5: /(?:min|ms|us|ns|s)(?!\w)/

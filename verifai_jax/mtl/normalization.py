@@ -45,7 +45,7 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
         if not (scale > 0 and np.isfinite(scale)):
             raise ValueError(f"the scale of {name!r} must be positive and finite; got {scale}")
     leaves: dict[Formula, float] = {
-        leaf: max((float(scales[name]) for name in leaf.signals()), default=1.0)
+        leaf: max(float(scales[name]) for name in leaf.signals())
         for leaf in formula.subformulas()
         if isinstance(leaf, ast.Predicate | ast.Atom)
     }

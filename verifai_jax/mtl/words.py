@@ -42,8 +42,8 @@ WORDS: dict[str, tuple[str, ...]] = {
 RESERVED = frozenset(w for words in WORDS.values() for w in words if NAME.fullmatch(w))
 """Words that a signal's name can only be in quotes."""
 
-SYMBOLS = {"and": "&", "or": "|", "implies": "->", "iff": "<->", "xor": "^"}
-"""Symbols of the Boolean connectives."""
+SYMBOLS = {"and": "&", "or": "|", "implies": "->", "iff": "<->", "xor": "xor"}
+"""Boolean connectives as they are printed: symbols, but for `^`, which is read as a power too."""
 
 
 class Text(NamedTuple):
