@@ -38,7 +38,6 @@ def test_a_box_is_found_and_measured_on_other_rows():
     assert by_feature["y"].upto == pytest.approx(-0.2, abs=0.01)
     assert rule.coverage > 0.98
     # Kept aside are four tenths of failing and safe rows; the interval is the binomial one.
-    assert found.held_out
     assert found.measured == pytest.approx(0.4 * 4000, abs=1)
     exact = binomtest(rule.precision.failures, rule.precision.simulations).proportion_ci()
     assert rule.precision.low == pytest.approx(exact.low, abs=1e-9)
@@ -110,29 +109,55 @@ def test_the_numbers_are_those_of_the_rows_kept_aside(seed):
         assert (rule.precision.failures, rule.precision.simulations) == (hits, inside.sum())
     # Nothing is learned from them: with other features there, the rules are the same.
     other = table.copy()
-    other.loc[aside.index, ["x", "y"]] = -1.0
+    for verdict in (False, True):
+        rows = aside.index[aside["violated"] == verdict]
+        other.loc[rows, "x"] = g.permutation(other.loc[rows, "x"])
+        other.loc[rows, "y"] = -1.0
     assert [r.words for r in rules(other, seed=seed).rules] == [r.words for r in found.rules]
 
 
 def test_chance_is_not_described():
     table = frame(1000)
     table["violated"] = np.random.default_rng(7).random(1000) < 0.3
-    found = rules(table)
     # Whatever fits the rows looked at does not hold on those kept aside.
-    assert found.precision is None or found.precision.low < 0.4
+    found = rules(table)
+    assert not found.rules
+    assert found.unsupported
+    assert str(found).startswith("no rule for the 3")
+    assert "does not hold on those kept aside" in str(found)
     table["violated"] = np.arange(1000) % 2 == 0
     assert "no rule describes the failures of 'table'" in str(rules(table[["same", "violated"]]))
 
 
-def test_few_failures_are_measured_where_they_were_found():
+def test_too_few_failures_are_told_instead_of_rules(tmp_path):
     table = frame(200)
-    table["violated"] = table["x"] > np.sort(table["x"])[-3]
-    found = rules(table)
-    assert not found.held_out
-    assert found.coverage == 1
-    assert "so too good: there are too few to keep some aside" in str(found)
-    table["violated"] = table["x"] == table["x"].max()
-    assert rules(table).coverage == 1
+    for count in (1, 9):
+        table["violated"] = table["x"] > np.sort(table["x"])[-1 - count]
+        found = rules(table)
+        assert not found.rules
+        assert found.table.empty
+        assert str(found).startswith(f"no rules for 'table': only {count} of 200 rows fail")
+    found.plot(tmp_path / "none.png")
+    table["violated"] = ~table["violated"]
+    assert "only 9 of 200 rows are safe" in str(rules(table))
+    table["violated"] = table["x"] > np.sort(table["x"])[-21]
+    assert [c.feature for rule in rules(table).rules for c in rule.conditions] == ["x"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_rule_is_told_without_measured_rows_that_support_it(seed):
+    table = frame(20000, seed)
+    table["violated"] = np.random.default_rng(seed).permutation(20000) < 49
+    for depth in (2, 4):
+        found = rules(table, depth=depth, seed=seed)
+        base = 49 / 20000
+        for rule in found.rules:
+            assert rule.precision.failures >= 3
+            assert rule.precision.low > base
+        text = str(found)
+        assert "covers 0 %" not in text
+        assert "no measured row inside" not in text
+        assert found.rules or "no rule" in text
 
 
 def test_absent_entries_fulfil_no_condition():

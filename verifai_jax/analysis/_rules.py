@@ -5,7 +5,7 @@ masspole > 0.31 and theta0 > 0.04: covers 92 % of the failures, precision 0.95 (
 
 A rule is a box in the feature space. Boxes come from decision trees, are freed of conditions that
 do not help, written in short numbers, and taken one by one until nearly all failures are covered.
-How well they do is measured on rows that were kept aside.
+How well they do is measured on rows that were kept aside; what these do not support is left out.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,9 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
 FEWEST = 10
-"""Failing rows, and safe rows, from which on some are kept aside."""
+"""Failing rows, and safe rows, from which on rules are made and measured."""
+SUPPORT = 3
+"""Failing rows in a rule at least, of those it is made from and of those it is measured on."""
 WORTH = 1.02
 """By how much a condition must raise the score of a rule."""
 
@@ -40,12 +42,12 @@ class Rule:
 
     **Fields:** `conditions`, all of which must be fulfilled; `coverage`: share of the measured
     failures inside; `precision`: how many of the measured rows inside fail, with its 95 %
-    Clopper-Pearson interval, None where none lies inside.
+    Clopper-Pearson interval.
     """
 
     conditions: tuple[Condition, ...]
     coverage: float
-    precision: Rate | None
+    precision: Rate
     region: Region = field(repr=False)
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
@@ -72,15 +74,16 @@ class Rule:
 class Rules:
     """Rules that together describe where a system fails, the best one first.
 
-    **Fields:** `rules`; `coverage` and `precision` of all of them together; `held_out`: whether
-    they were measured on rows kept aside; `measured`: how many rows that is; `doubt`: why
-    precision is no rate of failure, empty where it is; `samples`: all rows with a verdict.
+    **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
+    rule; `unsupported`: how many further boxes the measured rows do not support; `measured`: how
+    many rows were kept aside; `doubt`: why precision is no rate of failure, empty where it is;
+    `samples`: all rows with a verdict.
     """
 
     rules: tuple[Rule, ...]
     coverage: float
     precision: Rate | None
-    held_out: bool
+    unsupported: int
     measured: int
     doubt: str
     samples: Samples
@@ -98,7 +101,8 @@ class Rules:
         columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
         for rule in self.rules:
             rate = rule.precision
-            values = (rule.words, rule.coverage, *_numbers(rate))
+            values = (rule.words, rule.coverage, rate.estimate, rate.low, rate.high)
+            values += (rate.failures, rate.simulations)
             for name, value in zip(_COLUMNS, values, strict=True):
                 columns[name].append(value)
         return pd.DataFrame(columns)
@@ -119,32 +123,42 @@ class Rules:
 
     def __str__(self) -> str:
         if not self.rules:
-            return (
-                f"no rule describes the failures of {self.samples.name!r} much better than chance: "
-                "they lie everywhere, or depend on what is not in the table; "
-                "a greater depth allows more conditions"
-            )
+            return self._no_rule()
         lines = [str(rule) for rule in self.rules]
-        if len(self.rules) > 1:
+        if len(self.rules) > 1 and self.precision is not None:
             precision = _describe_precision(self.precision)
             lines.append(f"together: {format_percent(self.coverage)} of the failures, {precision}")
+        if self.unsupported:
+            lines.append(f"({self.unsupported} more left out: {_UNSUPPORTED})")
         lines.append(self.basis)
         return "\n".join(lines)
+
+    def _no_rule(self) -> str:
+        """Say why there is no rule."""
+        name, failures = self.samples.name, int(self.samples.failing.sum())
+        if few := _too_few(self.samples.failing):
+            return f"no rules for {name!r}: {few}"
+        if self.unsupported:
+            return (
+                f"no rule for the {failures:,} failures of {name!r}: {_UNSUPPORTED}. With more "
+                "failures there may be one"
+            )
+        return (
+            f"no rule describes the failures of {name!r} much better than chance: "
+            "they lie everywhere, or depend on what is not in the table; "
+            "a greater depth allows more conditions"
+        )
 
     @property
     def basis(self) -> str:
         """The rows that the numbers were measured on, and their meaning."""
-        measured = (
-            f"measured on {self.measured:,} rows kept aside"
-            if self.held_out
-            else f"measured on the {self.measured:,} rows that the rules were made from, so too "
-            "good: there are too few to keep some aside"
-        )
+        measured = f"measured on {self.measured:,} rows kept aside"
         if self.doubt:
             return f"({measured}; precision is no rate of failure: {self.doubt})"
         return f"({measured}; precision is the rate of failure inside)"
 
 
+_UNSUPPORTED = "what fits some failures does not hold on those kept aside"
 _COLUMNS = ("rule", "coverage", "precision", "low", "high", "failures", "rows")
 
 
@@ -165,11 +179,12 @@ def rules(
     - `depth`: features that a rule has conditions on at most.
     - `cover`: share of the failures to cover; `most` rules at most.
     - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
-      `seed` among failing and safe rows alike. With fewer than 10 failing or safe rows all of them
-      are used for both, and the result says so.
+      `seed` among failing and safe rows alike.
     - `seed`: of the rows kept aside.
 
-    **Returns:** `Rules`.
+    **Returns:** `Rules`; with fewer than 10 failing or safe rows there is none, and the result says
+    so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or failures
+    are not clearly denser (by the interval of its precision) than everywhere.
 
     A rule is chosen for the share of the remaining failures that it covers times the square of its
     precision among the remaining rows, so that a precise half is worth more than a vague whole.
@@ -185,6 +200,9 @@ def rules(
     samples = Samples.of(source, "all")
     failing = samples.failing
     check_both(samples, "rules tell failing rows from safe ones")
+    doubt = _doubt(source)
+    if _too_few(failing):
+        return Rules((), 0.0, None, unsupported=0, measured=0, doubt=doubt, samples=samples)
     aside = _aside(failing, held_out, seed)
     values, codes = samples.values(), samples.codes()
     made = ~aside
@@ -193,27 +211,36 @@ def rules(
     )
     integer = [column.integer for column in samples.ordered]
     regions = [region.round(values[made], codes[made], integer) for region in regions]
-    measured = aside if aside.any() else made
-    inside: Any = np.array([r.covers(values[measured], codes[measured]) for r in regions], bool)
-    inside = inside.reshape(len(regions), int(measured.sum()))
-    found = tuple(
-        Rule(
-            region.conditions(samples.ordered, samples.unordered),
-            *_measured(covered, failing[measured]),
-            region,
-        )
-        for region, covered in zip(regions, inside, strict=True)
-    )
-    coverage, precision = _measured(inside.any(axis=0), failing[measured])
+    found: list[Rule] = []
+    union = np.zeros(int(aside.sum()), bool)
+    for region in regions:
+        inside = region.covers(values[aside], codes[aside])
+        if (measured := _measured(inside, failing[aside])) is not None:
+            conditions = region.conditions(samples.ordered, samples.unordered)
+            found.append(Rule(conditions, *measured, region))
+            union |= inside
+    coverage, precision = _measured(union, failing[aside]) or (0.0, None)
     return Rules(
-        rules=found,
+        rules=tuple(found),
         coverage=coverage,
         precision=precision,
-        held_out=bool(aside.any()),
-        measured=int(measured.sum()),
-        doubt=_doubt(source),
+        unsupported=len(regions) - len(found),
+        measured=int(aside.sum()),
+        doubt=doubt,
         samples=samples,
     )
+
+
+def _too_few(failing: Bool[np.ndarray, " n"]) -> str:
+    """Say that there are too few failing or safe rows for rules; empty where there are enough."""
+    counts = {"fail": int(failing.sum()), "are safe": int((~failing).sum())}
+    for verb, count in counts.items():
+        if count < FEWEST:
+            return (
+                f"only {count} of {len(failing):,} rows {verb}, and rules need {FEWEST} to be made "
+                "from some and measured on others; simulate more"
+            )
+    return ""
 
 
 def _doubt(source: Source) -> str:
@@ -248,8 +275,6 @@ def check_both(samples: Samples, purpose: str) -> None:
 def _aside(failing: Bool[np.ndarray, " n"], share: float, seed: int) -> Bool[np.ndarray, " n"]:
     """Draw rows to keep aside: the same share of failing and of safe ones."""
     aside = np.zeros(len(failing), bool)
-    if min(failing.sum(), (~failing).sum()) < FEWEST:
-        return aside
     generator = np.random.default_rng(seed)
     for part in (failing, ~failing):
         rows = generator.permutation(np.flatnonzero(part))
@@ -294,7 +319,7 @@ def _select_regions(
         if score(best) == 0:
             break
         inside = best.covers(values, codes)
-        if (inside & failing & remaining).sum() < 0.02 * failing.sum():
+        if (inside & failing & remaining).sum() < max(SUPPORT, 0.02 * failing.sum()):
             break
         found.append(best)
         remaining = remaining & ~inside
@@ -314,21 +339,16 @@ def _simplify(region: Region, score: Callable[[Region], float]) -> Region:
 
 def _measured(
     inside: Bool[np.ndarray, " n"], failing: Bool[np.ndarray, " n"]
-) -> tuple[float, Rate | None]:
-    covered, hits = int(inside.sum()), int((inside & failing).sum())
-    rate = clopper_pearson(hits, covered) if covered else None
-    return hits / max(int(failing.sum()), 1), rate
+) -> tuple[float, Rate] | None:
+    """Measure coverage and precision on rows kept aside; None where these do not support it."""
+    hits = int((inside & failing).sum())
+    if hits < SUPPORT:
+        return None
+    rate = clopper_pearson(hits, int(inside.sum()))
+    return (hits / int(failing.sum()), rate) if rate.low > failing.mean() else None
 
 
-def _numbers(rate: Rate | None) -> tuple[float, float, float, int, int]:
-    if rate is None:
-        return np.nan, 0.0, 1.0, 0, 0
-    return rate.estimate, rate.low, rate.high, rate.failures, rate.simulations
-
-
-def _describe_precision(rate: Rate | None) -> str:
-    if rate is None:
-        return "no measured row inside"
+def _describe_precision(rate: Rate) -> str:
     return (
         f"precision {rate.estimate:.2f} ({rate.failures:,} of {rate.simulations:,}; "
         f"{rate.confidence * 100:g} % interval {rate.low:.2f} to {rate.high:.2f})"

@@ -38,7 +38,7 @@ def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
     for number, rule in enumerate(rules.rules, 1):
         draw_rule(axes, samples, rule, across, up, str(number))
     lines = [f"{i}  {rule}" for i, rule in enumerate(rules.rules[:3], 1)]
-    title = "\n".join(_wrapped(line) for line in lines) or f"{samples.name}: no rule"
+    title = "\n".join(_wrapped(line) for line in lines or [str(rules)])
     figure.suptitle(title, fontsize=8, x=0.02, ha="left")
     return show_or_save(figure, path)
 
