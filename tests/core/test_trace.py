@@ -73,3 +73,23 @@ def test_status_codes_are_stable():
         ("ERROR", 2),
         ("TIMEOUT", 3),
     ]
+
+
+def test_text_is_short_and_never_an_array():
+    signals = {"x": jnp.linspace(-1, 2, 201), "pose": np.zeros((201, 3)), "on": np.ones(201, bool)}
+    trace = Trace(signals, dt=0.02, valid=11, status=1)
+    assert repr(trace) == (
+        "Trace(x, pose, on; 201 samples every 0.02 s, of which 11 count, status nonfinite)"
+    )
+    assert str(trace).splitlines() == [
+        "trace of 201 samples every 0.02 s, of which 11 count, status nonfinite",
+        "  x     -1 to -0.85",
+        "  pose  [3]  0",
+        "  on    true in 100% of the samples",
+    ]
+    assert "0 s to 2 s" in repr(Trace({"x": np.array([1.0, np.nan])}, times=np.array([0.0, 2.0])))
+    batch = jax.vmap(lambda a: Trace({"x": a * jnp.ones(5)}, dt=0.1, valid=3))(jnp.ones(4))
+    forms = jax.eval_shape(lambda: trace)
+    for other in (batch, forms):
+        assert len(str(other)) < 300
+    jax.jit(lambda t: (str(t), repr(t), t.hold())[-1])(trace)

@@ -99,3 +99,32 @@ def test_on_the_host_it_is_the_same_function_in_numpy(hold, knots):
         value = host(time)
         assert isinstance(value, np.ndarray | np.float32)
         np.testing.assert_allclose(value, traced(time), rtol=1e-6)
+
+
+def test_it_is_no_number():
+    knots = jnp.ones(3)
+    for wrong in (
+        lambda: LINEAR * 2,
+        lambda: 2 - LINEAR,
+        lambda: LINEAR + LINEAR,
+        lambda: -LINEAR,
+        lambda: LINEAR > 0,
+        lambda: float(LINEAR),
+        lambda: knots @ LINEAR,
+        lambda: np.float32(2) * LINEAR,
+        lambda: np.ones(3) / LINEAR,
+        lambda: jnp.exp(LINEAR),
+        lambda: jax.jit(lambda wave: wave * 2)(LINEAR),
+    ):
+        with pytest.raises(TypeError, match="call it with a time in seconds"):
+            wrong()
+
+
+def test_text_is_short_and_never_an_array():
+    assert repr(LINEAR) == "Waveform(5 knots from -2 to 4, linear, over 2 s)"
+    assert repr(Waveform(np.ones((1000, 2)), "constant")) == (
+        "Waveform(1000 knots of shape [2], all 1, constant)"
+    )
+    assert jax.eval_shape(lambda: LINEAR).knots.shape == (5,)
+    assert repr(jax.eval_shape(lambda: LINEAR)) == "Waveform(5 knots, linear, over 2 s)"
+    jax.jit(lambda wave: (repr(wave), wave(1.0))[-1])(LINEAR)

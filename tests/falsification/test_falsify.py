@@ -217,7 +217,8 @@ class TestBlackBox:
         assert len(table) == 60
         raised = table["a"] > 0.5
         assert (table["status"] == np.where(raised, "error", "ok")).all()
-        assert set(table.loc[raised, "message"]) == {"RuntimeError: wheel fell off"}
+        (message,) = set(table.loc[raised, "message"])
+        assert message.startswith("RuntimeError: wheel fell off (tests/falsification/test_falsify")
         assert set(table.loc[~raised, "message"]) == {""}
         assert (table["violated"] == (~raised & (table["a"] >= 0.4))).all()
         assert f"{raised.sum()} error" in run.summary()
@@ -403,7 +404,7 @@ class TestRefusedBeforeAnythingCompiles:
             return vj.Trace({"x": features["c"] * jnp.ones(3)}, dt=1.0)
 
         problem = vj.Problem("misfit", space=SPACE, system=asks_for_more, spec="always x < 1")
-        with pytest.raises(vj.ProblemError, match=r"features \['a', 'b'\].*'c'"):
+        with pytest.raises(vj.ProblemError, match=r"there is no feature .c.*are a, b"):
             vj.falsify(problem, "uniform", 10)
         problem = vj.Problem("misfit", space=SPACE, system=lambda f, k: f["a"], spec="always x < 1")
         message = "must return a Trace; it returned"

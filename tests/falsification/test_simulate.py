@@ -76,3 +76,12 @@ def test_only_holds_the_others_where_it_is_told_to():
     held = problem.only("a", nominal={"w": 0.25})
     assert held.nominal == {"a": 0.5, "w": 0.25}
     assert set(vj.falsify(held, "uniform", 4, batch=4).table.all["w"]) == {0.25}
+
+
+def test_a_replay_in_words(problem):
+    again = vj.simulate(problem, {"a": 0.25, "kind": "fast"}).replay(0)
+    assert repr(again) == f"Replay(row 0 of {problem.name!r}, {again._verdict()})"
+    first, *rest = str(again).splitlines()
+    assert first == f"row 0 of {problem.name}: {again._verdict()}"
+    assert any(line.strip() == "features     a=0.25, kind=fast" for line in rest)
+    assert any("samples every" in line for line in rest)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -75,6 +76,14 @@ def test_values_as_a_person_writes_them():
     assert float(space.distance(one, other)) == expected
     assert float(space.distance(space.coerce(one), other)) == expected
     assert float(space.distance(one, one)) == 0
+
+
+def test_rows_of_a_table():
+    space = FeatureSpace({"x": Box(0, 10), "alg": Categorical("a", "b")})
+    table = pd.DataFrame({"x": [2.0, 7.0], "alg": ["a", "b"], "rho": [1.0, -1.0]})
+    expected = pytest.approx(np.sqrt(0.5**2 + 1))
+    assert float(space.distance(table.loc[0], table.loc[1])) == expected
+    assert float(space.distance(table.loc[0], {"x": 7, "alg": "b"})) == expected
 
 
 @pytest.mark.parametrize(

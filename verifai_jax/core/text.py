@@ -20,12 +20,39 @@ def format_percent(share: float) -> str:
     return f"{percent:.3g} %"
 
 
+MOST_ENTRIES = 4
+"""Numbers of one feature that are written one by one; of more, their range."""
+
+
 def format_features(features: Mapping[str, object]) -> str:
-    """Write features with four digits: `x0=0.1353, alg=sac`."""
-    return ", ".join(
-        f"{name}={value:.4g}" if isinstance(value, (float, np.floating)) else f"{name}={value}"
-        for name, value in features.items()
-    )
+    """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
+
+    Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written.
+    """
+    entries: dict[str, list[tuple[str, object]]] = {}
+    for name, value in features.items():
+        stem = name.partition("[")[0] if name.endswith("]") and _is_real(value) else name
+        entries.setdefault(stem, []).append((name, value))
+    parts = []
+    for stem, columns in entries.items():
+        there = [value for _, value in columns if value == value]
+        if len(columns) <= MOST_ENTRIES or not there:
+            parts += [f"{name}={_format_value(value)}" for name, value in columns]
+            continue
+        values = np.array([value for _, value in columns], float)
+        values = values[~np.isnan(values)]  # Items that there are not.
+        low, high = (_format_value(float(end(values))) for end in (np.min, np.max))
+        span = f"all {low}" if low == high else f"from {low} to {high}"
+        parts.append(f"{stem}={len(values)} values {span}")
+    return ", ".join(parts)
+
+
+def _is_real(value: object) -> bool:
+    return isinstance(value, float | int | np.number) and not isinstance(value, bool)
+
+
+def _format_value(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def format_error(error: BaseException) -> str:

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Int, Real
 
 Samples: TypeAlias = (
@@ -22,6 +23,10 @@ Samples: TypeAlias = (
     | Bool[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
 )
 """A signal or its form, one row a sample; truth values count as +1 and -1."""
+
+
+Leaf: TypeAlias = Array | np.ndarray | jax.ShapeDtypeStruct | np.integer | int | None
+"""A part of a trace."""
 
 
 class Status(enum.IntEnum):
@@ -121,6 +126,59 @@ class Trace:
 
     def __getitem__(self, name: str) -> Samples:
         return self.signals[name]
+
+    def __repr__(self) -> str:
+        return f"Trace({', '.join(self.signals)}; {self._span()})"
+
+    def __str__(self) -> str:
+        width = max(map(len, self.signals))
+        lines = [f"trace of {self._span()}"]
+        lines += [f"  {n:<{width}}  {_range(s, self.valid)}" for n, s in self.signals.items()]
+        return "\n".join(lines)
+
+    def _span(self) -> str:
+        """Return the number of samples, the clock, and how it ended."""
+        count = f"{self.length} sample{'s' * (self.length != 1)}"
+        if self.dt is not None:
+            text = f"{count} every {self.dt:g} s"
+        else:
+            known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
+            ends = f" from {self.times[0]:.4g} s to {self.times[-1]:.4g} s" if known else ""  # pyright: ignore[reportOptionalSubscript]
+            text = f"{count}{ends}"
+        for name in ("valid", "status"):
+            code = getattr(self, name)
+            if code is None or np.shape(code) or not _is_known(code):
+                continue
+            if name == "valid" and int(code) < self.length:
+                text += f", of which {int(code)} count"
+            if name == "status" and int(code) != Status.OK:
+                text += f", status {Status(int(code)).name.lower()}"
+        return text
+
+
+def _is_known(value: Leaf) -> bool:
+    """Return whether a value is a concrete one, not a placeholder of JAX."""
+    plain = isinstance(value, jax.Array | np.ndarray | np.generic | int)
+    return plain and not isinstance(value, Tracer)
+
+
+def _range(signal: Samples, valid: Leaf) -> str:
+    """Return the shape of a signal and its range where it counts, in words."""
+    shape: tuple[int, ...] = signal.shape
+    text = "" if len(shape) == 1 else f"[{', '.join(map(str, shape[1:]))}]  "
+    if not _is_known(signal):
+        return f"{text}{getattr(signal, 'dtype', '')}".strip()
+    values = np.asarray(signal)
+    if _is_known(valid) and not np.ndim(valid):  # pyright: ignore[reportArgumentType]
+        values = values[: int(valid)]  # pyright: ignore[reportArgumentType]
+    if values.dtype == bool:
+        return f"{text}true in {values.mean():.0%} of the samples"
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return f"{text}not finite"
+    low, high = float(finite.min()), float(finite.max())
+    some = "" if finite.size == values.size else ", not finite in places"
+    return f"{text}{f'{low:.4g}' if low == high else f'{low:.4g} to {high:.4g}'}{some}"
 
 
 _CHILDREN = ("times", "valid", "status")

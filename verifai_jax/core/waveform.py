@@ -12,6 +12,7 @@ from typing import Any, TypeGuard, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.checks import is_number
@@ -84,6 +85,25 @@ class Waveform:
         share = (place - left).astype(knots.dtype)
         return knots[left] * (1 - share) + knots[left + 1] * share
 
+    def __repr__(self) -> str:
+        over = "" if self.duration is None else f", over {self.duration:g} s"
+        return f"Waveform({self._outline()}, {self.hold}{over})"
+
+    def _outline(self) -> str:
+        """Return the number of control points and the range of their values, never an array."""
+        shape = getattr(self.knots, "shape", None)
+        if not shape:  # A placeholder of JAX.
+            return "knots"
+        text = f"{shape[0]} knots"
+        if len(shape) > 1:
+            text += f" of shape {list(shape[1:])}"
+        known = isinstance(self.knots, np.ndarray | jax.Array)
+        if not known or isinstance(self.knots, Tracer) or not all(shape):
+            return text
+        values = np.asarray(self.knots, np.float64)
+        low, high = values.min(), values.max()
+        return f"{text}, all {low:.4g}" if low == high else f"{text} from {low:.4g} to {high:.4g}"
+
     def refined(self, factor: int) -> "Waveform":
         """Return the same function by more control points; see `Signal.refined`."""
         knots = jnp.asarray(self.knots)
@@ -93,6 +113,27 @@ class Waveform:
         between = knots[:-1, None] * (1 - share) + knots[1:, None] * share
         inner = between.reshape(-1, *knots.shape[1:]).astype(knots.dtype)
         return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
+
+
+IS_CALLED = (
+    "a Signal is a function of time and not a number: call it with a time in seconds, as in "
+    "features['wind'](time); its control points are its .knots"
+)
+"""Advice for who takes a function of time for a number."""
+
+
+def _refuse(self: Waveform, *_: object) -> None:
+    raise TypeError(IS_CALLED)
+
+
+# Without these Python would speak of operand types, and JAX of arrays. NumPy's own conversion stays
+# as it is: a list of waveforms is an array of objects.
+for _operator in (
+    *("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"),
+    *("radd", "rsub", "rmul", "rtruediv", "rfloordiv", "rmod", "rpow", "rmatmul"),
+    *("neg", "pos", "abs", "lt", "le", "gt", "ge", "float", "int", "jax_array"),
+):
+    setattr(Waveform, f"__{_operator}__", _refuse)
 
 
 def check_duration(duration: object) -> float:

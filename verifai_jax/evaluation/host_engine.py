@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import (
     RowVerdict,
@@ -144,7 +145,7 @@ class HostEngine:
             trace = _checked(self.system.simulate_batch(features, keys), count)
             rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
         except Exception as error:
-            rows.messages[:] = [_message(error)] * count
+            rows.messages[:] = [format_user_error(error)] * count
 
     def _one_by_one(
         self,
@@ -184,7 +185,7 @@ class HostEngine:
             try:
                 yield i, Outcome(self.system(each, seed))
             except Exception as error:
-                yield i, Outcome(None, Status.ERROR, _message(error))
+                yield i, Outcome(None, Status.ERROR, format_user_error(error))
 
     def _block_verdicts(self, traces: Sequence[Trace]) -> list[RowVerdict]:
         filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
@@ -193,7 +194,7 @@ class HostEngine:
             rho, status, holds = self.monitor(stacked, BLOCK)
         except Exception as error:
             # The monitor refuses traces of this form: their signals, or their clock.
-            return [_without_verdict(Status.ERROR, _message(error))] * len(traces)
+            return [_without_verdict(Status.ERROR, format_user_error(error))] * len(traces)
         return [RowVerdict(rho[i], int(status[i]), holds[i], "") for i in range(len(traces))]
 
 
@@ -256,11 +257,7 @@ def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
     try:
         return None if trace is None else pad_trace(trace), _without_verdict(status, message)
     except Exception as error:
-        return None, _without_verdict(Status.ERROR, _message(error))
-
-
-def _message(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"
+        return None, _without_verdict(Status.ERROR, format_user_error(error))
 
 
 def _checked(trace: object, count: int) -> Trace:

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Key
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import Explanation, explain
@@ -63,6 +64,30 @@ class Replay:
             raise ValueError(f"no verdict to explain: the simulation is {self.status.name.lower()}")
         formula = self.problem.formulas[self.worst]
         return explain(formula, self.trace, end=self.problem.end)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the features as a row of a table has them, by column."""
+        one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.features)
+        return {name: column[0] for name, column in self.problem.space.rows(one).items()}
+
+    def __repr__(self) -> str:
+        which = "" if self.row is None else f"row {self.row} of "
+        return f"Replay({which}{self.problem.name!r}, {self._verdict()})"
+
+    def __str__(self) -> str:
+        which = "a simulation" if self.row is None else f"row {self.row}"
+        lines = [f"{which} of {self.problem.name}: {self._verdict()}"]
+        if len(self.rho) > 1 and self.status == Status.OK:
+            lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
+        lines.append(f"  {'features':<12} {format_features(self.columns())}")
+        span, *signals = str(self.trace).splitlines()
+        return "\n".join([*lines, f"  {span}", *(f"  {line}" for line in signals)])
+
+    def _verdict(self) -> str:
+        if self.status != Status.OK:
+            return f"no verdict, {self.status.name.lower()}"
+        verb = "violates" if self.violated else "keeps"
+        return f"{verb} the property, robustness {min(self.rho.values()):.4g}"
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the signals with the violated bound and instant marked; returns the figure."""

@@ -17,6 +17,7 @@ from verifai_jax._version import __version__
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.run import Run, load, write_record
@@ -349,7 +350,7 @@ def _run_rounds(
     except KeyboardInterrupt:
         stopped = "interrupted"
     except Exception as error:
-        stopped, cause = f"{type(error).__name__}: {error}", error
+        stopped, cause = format_user_error(error), error
     result = run(stopped)
     try:
         rounds.table.close()
@@ -366,7 +367,8 @@ def _run_rounds(
 
 
 def _failure_message(name: str, simulations: int, place: Path | None, cause: Exception) -> str:
-    message = f"the run of {name!r} broke down after {simulations} simulations: {cause}. "
+    why = str(cause) if isinstance(cause, OSError) else explain_user_error(cause)
+    message = f"the run of {name!r} broke down after {simulations} simulations: {why}. "
     if place is None:
         return f"{message}They are in the .run of this error"
     if isinstance(cause, OSError):

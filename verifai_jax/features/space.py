@@ -267,7 +267,9 @@ class FeatureSpace:
             total += len(accepted)
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
 
-    def distance(self, one: Mapping[str, Any], other: Mapping[str, Any]) -> Float[Array, ""]:
+    def distance(
+        self, one: Mapping[str, Any] | Row, other: Mapping[str, Any] | Row
+    ) -> Float[Array, ""]:
         """Return the distance between two points of the space: Euclidean over unit coordinates.
 
         That is by probability in continuous coordinates, by difference of places (from 0 to 1)
@@ -277,7 +279,8 @@ class FeatureSpace:
         **Arguments:**
 
         - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
-          lists, choices, dictionaries by name; constant and fixed ones may be left out).
+          lists, choices, dictionaries by name; constant and fixed ones may be left out), or rows of
+          a table.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, for values that a person wrote.
@@ -413,8 +416,10 @@ class FeatureSpace:
             for row in rows
         )
 
-    def _point(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
+    def _point(self, features: Mapping[str, Any] | Row) -> Float[Array, " dim"]:
         """Return the point of these features, checked unless a system sees them so."""
+        if isinstance(features, Row) and not isinstance(features, Mapping):
+            features = self.from_row(features)  # Of pandas, which is no mapping.
         leaves = jax.tree.leaves(features, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
         if not all(isinstance(leaf, jax.Array) for leaf in leaves):
             self.root.check(self._completed(features), "")

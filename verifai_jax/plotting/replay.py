@@ -1,7 +1,6 @@
 """One simulation: its signals, the bounds they must keep, and the instant that decided."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -55,7 +54,7 @@ def plot_replay(replay: Replay, path: str | Path | None = None) -> Figure:
         _mark(panels[shown.index(decisive[0])], trace, *decisive)
     panels[-1].set_xlabel("time [s]")
     verdict = "violated" if replay.violated else replay.status.name.lower()
-    where = format_features(_flat(replay))
+    where = format_features(replay.columns())
     figure.suptitle(
         f"{formula}\nrobustness {replay.rho[name]:.4g} ({verdict}) at {where}"[:400],
         fontsize=9,
@@ -153,10 +152,3 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
         color=FAILING,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
     )
-
-
-def _flat(replay: Replay) -> dict[str, Any]:
-    import jax
-
-    one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], replay.features)
-    return {name: column[0] for name, column in replay.problem.space.rows(one).items()}

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
+from verifai_jax.core.user_errors import defined_at, explain_user_error
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
@@ -175,23 +176,52 @@ class Problem:
         not produce.
         """
         features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
-        self.system.check(features)
+        try:
+            self.system.check(features)
+        except ValueError:
+            raise
+        except Exception as error:
+            raise self._wrong_system(error, features) from error
+        trace = self.form()
+        if trace is None:
+            return
+        for formula in self.formulas.values():
+            jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
+
+    def form(self) -> Trace | None:
+        """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.
+
+        None where nothing but a simulation can tell.
+
+        **Raises:** `ProblemError` for a system that raises, or returns no `Trace`.
+        """
+        return self.programs.get(FORM, None, self._form)
+
+    @property
+    def duration(self) -> float | None:
+        """Seconds of a whole trace; None where nothing but a simulation can tell."""
+        form = self.form()
+        return None if form is None or form.dt is None else (form.length - 1) * form.dt
+
+    def _form(self) -> Trace | None:
+        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
         try:
             trace = self.system.abstract(features)
         except Exception as error:
-            raise ProblemError(
-                f"the system of problem {self.name!r} raised {type(error).__name__} when JAX "
-                f"traced it with features {list(features)}: {error}"
-            ) from error
+            raise self._wrong_system(error, features) from error
         if trace is None and self.black_box:
-            return
+            return None
         if not isinstance(trace, Trace):
+            function = getattr(self.system, "__wrapped__", self.system)
             raise ProblemError(
                 f"the system of problem {self.name!r} must return a Trace; "
-                f"it returned {type(trace).__name__}"
+                f"it returned {type(trace).__name__}{defined_at(function)}"
             )
-        for formula in self.formulas.values():
-            jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
+        return trace
+
+    def _wrong_system(self, error: Exception, features: Mapping[str, Any]) -> ProblemError:
+        why = explain_user_error(error, features)
+        return ProblemError(f"the system of problem {self.name!r} cannot be simulated: {why}")
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.description}" if self.description else self.name]
@@ -200,6 +230,9 @@ class Problem:
         lines.append(f"  features: {', '.join(self.space.columns)}")
         return "\n".join(lines)
 
+
+FORM: Slot[None, Trace | None] = Slot("form")
+"""The form of the traces of a problem's system."""
 
 BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""

@@ -48,7 +48,11 @@ def check_like(got: PyTree, wanted: PyTree, origin: str, role: str, note: str = 
             have.weak_type and jnp.promote_types(have.dtype, want.dtype) == want.dtype
         )
         if not fits:
-            raise ValueError(f"{must}; {_name(path)} must be {want.dtype}, got {have.dtype}{note}")
+            real = jnp.issubdtype(have.dtype, jnp.floating)
+            hint = ", so begin with a real number, such as 0.0" if real else ""
+            raise ValueError(
+                f"{must}; {_name(path)} must be {want.dtype}, got {have.dtype}{hint}{note}"
+            )
 
 
 def default_signals(state: PyTree, control: PyTree) -> dict[str, Array]:

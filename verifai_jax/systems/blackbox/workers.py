@@ -27,6 +27,7 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.systems.base import Features, Outcome
 
 log = logging.getLogger("verifai_jax.workers")
@@ -390,7 +391,7 @@ def work(fd: int) -> None:
                 _import(module, file)
         simulation = pickle.loads(pickled)
     except BaseException as error:
-        problem = f"a worker process could not import the simulator: {_text(error)}"
+        problem = f"a worker process could not import the simulator: {format_user_error(error)}"
         if _guard() in str(error):
             problem = _guard()
     _preparing = False
@@ -405,12 +406,8 @@ def work(fd: int) -> None:
         try:
             reply = pickle.dumps(Outcome(simulation(features, seed)))
         except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
-            reply = pickle.dumps(Outcome(None, Status.ERROR, _text(error)))
+            reply = pickle.dumps(Outcome(None, Status.ERROR, format_user_error(error)))
         pipe.send_bytes(reply)
-
-
-def _text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
 
 
 def _import(module: str, file: str | None) -> None:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import defined_at
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
@@ -259,16 +260,16 @@ class _Rollout:
             else:
                 decided = jax.eval_shape(loop.controller, time, state, memory, self.features)
                 role = "(control, memory), its memory in the form of controller_memory"
+                note = defined_at(loop.controller)
                 if not _is_pair(decided):
-                    raise ValueError(f"controller must return {role}; got {outline(decided)}")
+                    raise ValueError(f"controller must return {role}; got {outline(decided)}{note}")
                 control = decided[0]
-                check_like(decided[1], memory, "controller", role)
+                check_like(decided[1], memory, "controller", role, note)
         derivative = jax.eval_shape(
             lambda control: loop.dynamics(time, state, control, self.features), control
         )
-        check_like(
-            derivative, state, "dynamics", "the state's derivative, in the form of the state"
-        )
+        role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
+        check_like(derivative, state, "dynamics", role, note)
         parts, finite = jax.tree.leaves(state), []
 
         def sample_signals(control: PyTree) -> Any:
@@ -281,7 +282,10 @@ class _Rollout:
         if loop.terminate is not None:
             ended = jax.eval_shape(loop.terminate, state, self.features)
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:
-                raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
+                raise ValueError(
+                    f"terminate must return one truth value; got {outline(ended)}"
+                    f"{defined_at(loop.terminate)}"
+                )
         return tuple(finite)
 
 

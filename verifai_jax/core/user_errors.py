@@ -1,0 +1,272 @@
+"""Errors that code of a user raises, in words, with the line of the user's own file.
+
+    try:
+        system(features, key)
+    except Exception as error:
+        explain_user_error(error, features)     # 'sim.py, line 12, in simulate (`f["mas"]`): there
+                                                # is no feature 'mas'; did you mean 'mass'? ...'
+        format_user_error(error)                # the same in one bounded line, with its type
+
+Where an error comes from is read from its traceback: the innermost line that is neither of this
+package, nor of Python, nor of an installed library.
+"""
+
+import ast
+import linecache
+import os
+import sysconfig
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from types import CodeType, FrameType, TracebackType
+from typing import Any, NamedTuple
+
+import jax
+
+from verifai_jax.core.errors import nearest_names
+from verifai_jax.core.text import shorten
+from verifai_jax.core.waveform import IS_CALLED
+
+MOST_CODE = 80
+"""Characters of a line of code that a message quotes."""
+MOST_MESSAGE = 300
+"""Characters of what a library or a simulator says."""
+MOST_NAMES = 12
+"""Names that a message lists."""
+
+ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
+AS_PYTHON = "or run the system as plain Python, without gradients, by vj.blackbox"
+
+TRACING: tuple[tuple[type[Exception], str], ...] = (
+    (
+        jax.errors.TracerBoolConversionError,
+        f"it asks whether a value is true, and {ONCE_FOR_ALL}. Choose between values by "
+        "jnp.where(condition, one, other), between computations by jax.lax.cond, and join "
+        f"conditions by & and | instead of and and or; {AS_PYTHON}",
+    ),
+    (
+        jax.errors.TracerIntegerConversionError,
+        f"it uses a value as a plain integer, an index of a list or a count, and {ONCE_FOR_ALL}. "
+        "Index jnp.array(the_list) instead of the list, and count by jax.lax.fori_loop; "
+        f"{AS_PYTHON}",
+    ),
+    (
+        jax.errors.TracerArrayConversionError,
+        f"it gives a value to NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np; {AS_PYTHON}",
+    ),
+    (
+        jax.errors.NonConcreteBooleanIndexError,
+        f"it selects entries by a condition, and {ONCE_FOR_ALL}, so neither is their number. Use "
+        f"jnp.where(condition, values, other); {AS_PYTHON}",
+    ),
+    (
+        jax.errors.UnexpectedTracerError,
+        "it uses a value that was kept from another call, in a variable outside the function or "
+        "an attribute. Return such values, and hand them on as state or memory",
+    ),
+    (
+        jax.errors.ConcretizationTypeError,
+        f"it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
+        f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp in place of math, and "
+        f"jax.lax.fori_loop for a number of turns; {AS_PYTHON}",
+    ),
+)
+"""Errors of JAX about values that it traces, each with what to do; the special before the general.
+"""
+
+
+class UserLine(NamedTuple):
+    """A line of a user's file.
+
+    - `file`: its path, relative where it lies below the working directory.
+    - `line`: its number.
+    - `function`: name of the function around it.
+    - `code`: the text of the line; empty where the file cannot be read.
+    """
+
+    file: str
+    line: int
+    function: str
+    code: str
+
+    def __str__(self) -> str:
+        where = f"{self.file}, line {self.line}"
+        return where if self.function.startswith("<") else f"{where}, in {self.function}"
+
+
+def user_line(error: BaseException) -> UserLine | None:
+    """Return the innermost line of the user's own code that an error passed; None without one."""
+    step = _user_step(error)
+    return None if step is None else _line(step.tb_frame.f_code, step.tb_lineno)
+
+
+def defined_at(function: Callable[..., object] | None) -> str:
+    """Write where a function is defined, ` (sim.py, line 3)`; empty where it is not known."""
+    code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
+    if not isinstance(code, CodeType) or not _is_user_file(code.co_filename):
+        return ""
+    return f" ({_shown_file(code.co_filename)}, line {code.co_firstlineno})"
+
+
+def explain_user_error(error: BaseException, features: object = None) -> str:
+    """Write what a user's code did, where, and what to do about it, in one line.
+
+    **Arguments:**
+
+    - `error`: as the code raised it.
+    - `features`: that the code was called with, to tell a misspelt one from another missing key.
+    """
+    step = _user_step(error)
+    if step is None:
+        return _said(error)
+    line = _line(step.tb_frame.f_code, step.tb_lineno)
+    code = f" (`{shorten(line.code, MOST_CODE)}`)" if line.code else ""
+    return f"{line}{code}: {_sentence(error, step, features)}"
+
+
+def format_user_error(error: BaseException) -> str:
+    """Write an error in one bounded line: its type, what it says, and the user's line.
+
+    `RuntimeError: no road (sim.py, line 12, in simulate)`.
+    """
+    line = user_line(error)
+    return f"{_said(error)}{'' if line is None else f' ({line})'}"
+
+
+def _sentence(error: BaseException, step: TracebackType, features: object) -> str:
+    for kind, advice in TRACING:
+        if isinstance(error, kind):
+            return advice
+    if isinstance(error, TypeError) and "Waveform" in str(error):
+        return f"{_said(error)}: {IS_CALLED}"
+    if isinstance(error, KeyError) and error.args:
+        return _missing_key(error.args[0], step, features) or _said(error)
+    if isinstance(error, AttributeError) and error.name:
+        name, owner = error.name, error.obj
+        if isinstance(owner, Mapping) and name in owner:
+            return f"{name!r} is read by [{name!r}], not by .{name}"
+        if hasattr(owner, "_fields"):
+            fields: list[str] = [*getattr(owner, "_fields", ())]
+            return f"there is no {name!r}{_known('It has', name, fields)}"
+    return _said(error)
+
+
+def _missing_key(key: object, step: TracebackType, features: object) -> str:
+    """Write which mapping lacks a key, and what it has; empty where that is not known."""
+    text, mapping = _subscripted(step)
+    if mapping is None:
+        # Without the text of the line: features that the function holds are the likeliest.
+        held = [v for v in step.tb_frame.f_locals.values() if isinstance(v, Mapping)]
+        mapping = next((m for m in held if _same_names(m, features) and key not in m), None)
+        if mapping is None:
+            return ""
+    names = [str(name) for name in mapping]
+    if _same_names(mapping, features):
+        return f"there is no feature {key!r}{_known('The features are', key, names)}"
+    return f"`{text}` has no {key!r}{_known('It has', key, names)}"
+
+
+def _known(begin: str, name: object, names: list[str]) -> str:
+    more = f", ... ({len(names)} in all)" if len(names) > MOST_NAMES else ""
+    listing = f"{begin} {', '.join(names[:MOST_NAMES])}{more}" if names else "It has none"
+    return f"{nearest_names(name, names) or '.'} {listing}"
+
+
+def _subscripted(step: TracebackType) -> tuple[str, Mapping[Any, Any] | None]:
+    """Return the text of the mapping that a failing `mapping[key]` looked into, and the mapping."""
+    frame = step.tb_frame
+    text = _source_of_instruction(frame.f_code, step.tb_lasti)
+    try:
+        node = ast.parse(text.strip(), mode="eval").body if text else None
+    except SyntaxError:
+        return "", None
+    if not isinstance(node, ast.Subscript):
+        return "", None
+    found = _value(node.value, frame)
+    return ast.unparse(node.value), found if isinstance(found, Mapping) else None
+
+
+def _value(node: ast.expr, frame: FrameType) -> object:
+    """Return the value of a name, or of constant subscripts of one; None for anything else."""
+    if isinstance(node, ast.Name):
+        return {**frame.f_globals, **frame.f_locals}.get(node.id)
+    if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+        outer: Any = _value(node.value, frame)
+        if isinstance(outer, Mapping | list | tuple):
+            try:
+                return outer[node.slice.value]  # pyright: ignore[reportArgumentType, reportCallIssue]
+            except (LookupError, TypeError):
+                return None
+    return None
+
+
+def _source_of_instruction(code: CodeType, offset: int) -> str:
+    """Return the text of the expression that an instruction belongs to; empty if unknown."""
+    places = [*code.co_positions()]
+    # An instruction takes two bytes.
+    first, last, begin, end = places[offset // 2] if offset // 2 < len(places) else (None,) * 4
+    if first is None or last is None or begin is None or end is None:
+        return ""
+    lines = [linecache.getline(code.co_filename, n, None) for n in range(first, last + 1)]
+    if not all(lines):
+        return ""
+    # Columns count bytes of UTF-8.
+    raw = [line.encode() for line in lines]
+    raw[-1] = raw[-1][:end]
+    raw[0] = raw[0][begin:]
+    return b"".join(raw).decode(errors="replace")
+
+
+def _same_names(one: Mapping[Any, Any], other: object) -> bool:
+    return isinstance(other, Mapping) and one.keys() == other.keys()
+
+
+def _said(error: BaseException) -> str:
+    """Return the type of an error and what it says, in one line of bounded length."""
+    # JAX appends advice about its own tracebacks.
+    words = " ".join(str(error).partition("\n------")[0].split())
+    if len(words) > MOST_MESSAGE:
+        words = f"{words[: MOST_MESSAGE - 3]}..."
+    kind = type(error).__name__
+    return f"{kind}: {words}" if words else kind
+
+
+def _user_step(error: BaseException) -> TracebackType | None:
+    """Return the innermost step of an error's traceback that lies in a user's file."""
+    found, step = None, error.__traceback__
+    while step is not None:
+        if _is_user_file(step.tb_frame.f_code.co_filename):
+            found = step
+        step = step.tb_next
+    return found
+
+
+def _line(code: CodeType, number: int) -> UserLine:
+    text = linecache.getline(code.co_filename, number).strip()
+    return UserLine(_shown_file(code.co_filename), number, code.co_name, text)
+
+
+@cache
+def _is_user_file(file: str) -> bool:
+    if file.startswith("<") and not file.startswith(("<stdin", "<string", "<ipython")):
+        return False
+    if "ipykernel_" in file:
+        return True
+    place = Path(file).absolute()
+    return not any(place.is_relative_to(folder) for folder in _libraries())
+
+
+@cache
+def _libraries() -> tuple[Path, ...]:
+    """Return the folders of this package, of Python and of what is installed."""
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    folders = {Path(sysconfig.get_path(name)) for name in names}
+    folders |= {Path(__file__).parents[1], Path(os.__file__).parent, Path(jax.__file__).parents[1]}
+    return tuple(folders | {folder.resolve() for folder in folders})
+
+
+def _shown_file(file: str) -> str:
+    if "ipykernel_" in file or file.startswith("<ipython"):
+        return "a notebook cell"
+    place, here = Path(file), Path(os.getcwd())
+    return str(place.relative_to(here)) if place.is_relative_to(here) else str(place)
