@@ -79,7 +79,9 @@ class Waveform:
             return self.knots[min(max(int(np.floor(place * count + 1e-5)), 0), count - 1)]
         place = min(max(place, 0.0), 1.0) * (count - 1)
         left = min(int(place), count - 2)
-        return self.knots[left] + (self.knots[left + 1] - self.knots[left]) * (place - left)
+        begin, end, share = self.knots[left], self.knots[left + 1], place - left
+        value = begin * (1 - share) + end * share
+        return np.clip(value, np.minimum(begin, end), np.maximum(begin, end))
 
 
 def serve(

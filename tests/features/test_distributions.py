@@ -191,7 +191,7 @@ class TestRefused:
             (Normal(0, 1), "x", "f must be a number; got 'x'"),
             (TruncatedNormal(0, 1, -1, 1), 2, r"f must lie in \[-1, 1\]; got 2"),
             (LogUniform(1, 10), 0.5, r"f must lie in \[1, 10\]; got 0.5"),
-            (EXPONENTIAL, -1, "so far in the tail"),
+            (EXPONENTIAL, -1, "f must be finite and at least 0; got -1"),
         ],
     )
     def test_values_outside(self, domain, value, message):

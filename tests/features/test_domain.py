@@ -15,6 +15,7 @@ DOMAINS = [
     Box(-0.05, 0.05),
     Box(1e6, 1e6 + 2),
     Box([0, -1, 5], [10, 1, 5.5]),
+    Box(0, 61.2, closed="left"),
     DiscreteBox(1, 4),
     DiscreteBox(-3, -3),
     DiscreteBox(0, 2**20 - 1),

@@ -83,7 +83,7 @@ class Waveform:
         place = xp.clip(place, 0.0, 1.0) * (count - 1)
         left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
         share = (place - left).astype(knots.dtype)
-        return knots[left] * (1 - share) + knots[left + 1] * share
+        return _between(knots[left], knots[left + 1], share, xp)
 
     def __repr__(self) -> str:
         over = "" if self.duration is None else f", over {self.duration:g} s"
@@ -110,8 +110,8 @@ class Waveform:
         if self.hold == "constant" or knots.shape[0] == 1:
             return replace(self, knots=jnp.repeat(knots, factor, axis=0))
         share = np.arange(factor).reshape((1, factor) + (1,) * (knots.ndim - 1)) / factor
-        between = knots[:-1, None] * (1 - share) + knots[1:, None] * share
-        inner = between.reshape(-1, *knots.shape[1:]).astype(knots.dtype)
+        between = _between(knots[:-1, None], knots[1:, None], share.astype(knots.dtype), jnp)
+        inner = between.reshape(-1, *knots.shape[1:])
         return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
 
 
@@ -134,6 +134,19 @@ for _operator in (
     *("neg", "pos", "abs", "lt", "le", "gt", "ge", "float", "int", "jax_array"),
 ):
     setattr(Waveform, f"__{_operator}__", _refuse)
+
+
+def _between(left: Any, right: Any, share: Any, xp: Any) -> Any:
+    """Return `left` where the share is 0 and `right` where it is 1, never beyond them."""
+    value = left * (1 - share) + right * share
+    # Between two knots at the end of their domain the sum may be rounded to a value outside.
+    least, most = xp.minimum(left, right), xp.maximum(left, right)
+    if xp is np:
+        return np.clip(value, least, most)
+    least, most, zero = *jax.lax.stop_gradient((least, most)), value - jax.lax.stop_gradient(value)
+    # The derivative is that of the line, also where both knots are the same.
+    value = jnp.where(value < least, least + zero, value)
+    return jnp.where(value > most, most + zero, value)
 
 
 def check_duration(duration: object) -> float:

@@ -53,7 +53,8 @@ class FlattenedFeatures(FeatureSpace):
             )
             for part, leaf in zip(parts, self._leaves, strict=True)
         ]
-        return jax.tree.unflatten(self._tree, leaves)
+        # Features in double precision may have been rounded across an end of their domain.
+        return self.root.coerce(jax.tree.unflatten(self._tree, leaves))
 
 
 class DoublePrecisionEvaluator:

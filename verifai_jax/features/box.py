@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from verifai_jax.features.domain import (
@@ -22,28 +23,46 @@ from verifai_jax.features.domain import (
     indexed,
     short,
 )
+from verifai_jax.features.ends import (
+    Reals,
+    check_closed,
+    clip_to_ends,
+    ends_within,
+    replace_where,
+    round_inwards,
+    rounded_ends,
+)
+
+NARROW = 16
+"""Roundings across a box up to which the map from the unit cube may step over an end."""
 
 
 @dataclass(frozen=True, repr=False)
 class Box(Domain):
     """Real numbers from `low` to `high`, uniform; vectors if the ends are sequences.
 
-    `Box(-1, 1)`, `Box([0, 0], [10, 5])`. A value is a real number, or an array with shape
-    `[entries]`.
+    `Box(-1, 1)`, `Box([0, 0], [10, 5])`, `Box(0, 1, closed="left")`. A value is a real number, or
+    an array with shape `[entries]`. It is never outside the interval, in single precision neither:
+    the greatest value of `Box(0, 61.2)` is then 61.199997, since 61.2 itself would be rounded up.
 
     **Arguments:**
 
     - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.
+    - `closed`: which ends may be values: `"both"`, `"left"` (the range is half-open, without
+      `high`), `"right"` or `"neither"`. Next to an end that is left out come the nearest numbers
+      of the precision.
 
     **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
-    farther apart or nearer than float32 can hold, or of different lengths.
+    farther apart or nearer than float32 can hold, or of different lengths; for an unknown `closed`.
     """
 
     low: float | Sequence[float] | np.ndarray
     high: float | Sequence[float] | np.ndarray
+    closed: str = "both"
 
     def __post_init__(self) -> None:
         shown = f"got (low={self.low!r}, high={self.high!r})"
+        check_closed(self.closed)
         for name, end in zip(("low", "high"), _ends("Box", self.low, self.high), strict=True):
             object.__setattr__(self, name, end)
         for low, high in zip(np.ravel(self.low), np.ravel(self.high), strict=True):
@@ -58,6 +77,9 @@ class Box(Domain):
                 raise ValueError(f"low must be below high in a Box; {shown}")
             if max(high - low, abs(low), abs(high)) > MOST_REAL or high - low < LEAST_REAL:
                 raise ValueError(f"a Box must fit into float32, as must its width; {shown}")
+        first, last = self.ends(np.float32)
+        if np.any(first > last):
+            raise ValueError(f"a Box must have a float32 number inside; {shown}")
 
     @classmethod
     def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
@@ -75,34 +97,56 @@ class Box(Domain):
     def levels(self) -> tuple[int, ...]:
         return (0,) * np.size(self.low)
 
+    def ends(self, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the greatest value in this precision."""
+        return ends_within(self.low, self.high, dtype, self.closed)  # pyright: ignore[reportArgumentType]
+
     def from_unit(self, u: Float[Array, " size"]) -> Float[Array, "*entries"]:
         low, high, _, width = self._limits(u.dtype)
         u = u.reshape(low.shape)
-        # From the nearer end: exact at both ends and never outside, whatever the rounding.
-        return jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
+        # From the nearer end: exact at both ends and, but for a narrow box, never beyond them.
+        value = jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
+        first, last = self.ends(u.dtype)
+        eps = jnp.finfo(u.dtype).eps
+        narrow = width < NARROW * eps * np.maximum(np.abs(low), np.abs(high))
+        if np.any(narrow | (low != first) | (high != last)):
+            value = clip_to_ends(value, first, last)
+        return value
 
     def to_unit(self, value: Numbers) -> Float[Array, " size"]:
         value = as_real(value)
         low, high, middle, width = self._limits(value.dtype)
         u = jnp.where(value < middle, (value - low) / width, 1 - (high - value) / width)
+        first, last = self.ends(value.dtype)
+        if np.any((low != first) | (high != last)):
+            u = replace_where(replace_where(u, value == first, 0.0), value == last, 1.0)
         return jnp.ravel(u)
 
     def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
-        return as_real(value)
+        return self.rounded(as_real(value))
+
+    def rounded(self, value: Reals) -> Reals:
+        """Return real numbers, those that their precision has rounded over an end at that end."""
+        return round_inwards(value, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
 
     def check(self, value: object, name: str) -> None:
         numbers = as_numbers(value, name)
         _check_shape(numbers, self.low, name)
-        # A bound that float32 has rounded is still inside.
-        slack = np.finfo(np.float32).eps * np.maximum(np.abs(self.low), np.abs(self.high))
-        inside = (numbers >= self.low - slack) & (numbers <= self.high + slack)
+        first, last = self.ends(np.float64)
+        under, over = rounded_ends(self.low, self.high)  # pyright: ignore[reportArgumentType]
+        inside = (numbers >= first) & (numbers <= last)
+        # An end that was rounded to float32 is that end, if it belongs to the box.
+        inside |= (numbers == under) & (self.closed in ("both", "left"))
+        inside |= (numbers == over) & (self.closed in ("both", "right"))
+        opening = "[" if self.closed in ("both", "left") else "("
+        closing = "]" if self.closed in ("both", "right") else ")"
         for column, ok, x, low, high in zip(
             self.columns(name), *map(np.ravel, (inside, numbers, self.low, self.high)), strict=True
         ):
             if not ok:
                 raise ValueError(
-                    f"{column} must lie in [{short(low.item())}, {short(high.item())}]; "
-                    f"got {short(x.item())}"
+                    f"{column} must lie in {opening}{short(low.item())}, "
+                    f"{short(high.item())}{closing}; got {short(x.item())}"
                 )
 
     def columns(self, name: str) -> tuple[str, ...]:
@@ -115,7 +159,8 @@ class Box(Domain):
 
     def from_columns(self, row: Row, name: str) -> Float[Array, "*entries"]:
         entries = [as_numbers(row[column], column).item() for column in self.columns(name)]
-        return as_real(entries[0] if np.ndim(self.low) == 0 else entries)
+        numbers = np.asarray(entries[0] if np.ndim(self.low) == 0 else entries)
+        return jnp.asarray(self.rounded(numbers.astype(jnp.result_type(float))))
 
     def _limits(self, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return low, high, middle and width in this precision."""
@@ -124,7 +169,8 @@ class Box(Domain):
         return tuple(np.asarray(end, dtype) for end in ends)  # pyright: ignore[reportReturnType]
 
     def __repr__(self) -> str:
-        return f"Box({short(self.low)}, {short(self.high)})"
+        closed = "" if self.closed == "both" else f", closed={self.closed!r}"
+        return f"Box({short(self.low)}, {short(self.high)}{closed})"
 
 
 @dataclass(frozen=True, repr=False)

@@ -146,11 +146,11 @@ class Struct(Domain):
     def _runs(self) -> tuple[tuple[tuple[str, ...], Domain], ...]:
         """Fields, with neighbouring scalar boxes merged into a vector: 200 cost one operation."""
         runs: list[tuple[tuple[str, ...], Domain]] = []
-        for scalar, group in groupby(self.fields, lambda field: _is_scalar_box(field[1])):
+        for closed, group in groupby(self.fields, lambda field: _scalar_box_closed(field[1])):
             names, domains = zip(*group, strict=True)
-            if scalar and len(names) > 1:
-                box = Box([domain.low for domain in domains], [domain.high for domain in domains])
-                runs.append((names, box))
+            if closed is not None and len(names) > 1:
+                low, high = ([getattr(box, end) for box in domains] for end in ("low", "high"))
+                runs.append((names, Box(low, high, closed)))
             else:
                 runs += [((name,), domain) for name, domain in zip(names, domains, strict=True)]
         return tuple(runs)
@@ -163,5 +163,6 @@ class Struct(Domain):
         return f"Struct({{{fields}}})"
 
 
-def _is_scalar_box(domain: Domain) -> bool:
-    return isinstance(domain, Box) and np.ndim(domain.low) == 0
+def _scalar_box_closed(domain: Domain) -> str | None:
+    """Return which ends of a box of numbers belong to it; None for any other domain."""
+    return domain.closed if isinstance(domain, Box) and np.ndim(domain.low) == 0 else None

@@ -16,8 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
-from jaxtyping import Array, Bool, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
+from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import (
     LEAST_REAL,
     MOST_REAL,
@@ -28,6 +30,14 @@ from verifai_jax.features.domain import (
     as_numbers,
     as_real,
     short,
+)
+from verifai_jax.features.ends import (
+    Reals,
+    clip_to_ends,
+    ends_within,
+    replace_where,
+    round_inwards,
+    rounded_ends,
 )
 
 OUTERMOST = 2.0**-26
@@ -56,27 +66,43 @@ class Continuous(Domain):
     def levels(self) -> tuple[int, ...]:
         return (0,)
 
+    def ends(self, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the greatest value in this precision; they may be infinite."""
+        return ends_within(*self.support, dtype)
+
     def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
-        return self.quantile(u[0]).astype(u.dtype)
+        value = self.quantile(u[0]).astype(u.dtype)
+        return clip_to_ends(value, *self.ends(u.dtype)) if self._bounded else value
 
     def to_unit(self, value: Numbers) -> Float[Array, "1"]:
-        return jnp.clip(self.probability(as_real(value)), 0, 1)[None]
+        value = as_real(value)
+        u = jnp.clip(self.probability(value), 0, 1)
+        if self._bounded:
+            first, last = self.ends(value.dtype)
+            u = replace_where(replace_where(u, value == first, 0.0), value == last, 1.0)
+        return u[None]
 
     def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
-        return as_real(value)
+        return self.rounded(as_real(value))
+
+    def rounded(self, value: Reals) -> Reals:
+        """Return real numbers, those that their precision has rounded over an end at that end."""
+        return round_inwards(value, *self.support)
+
+    @property
+    def _bounded(self) -> bool:
+        return bool(np.any(np.isfinite(self.support)))
 
     def check(self, value: object, name: str) -> None:
         number = as_numbers(value, name)
         if number.shape != ():
             raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
         low, high = self.support
-        eps = np.finfo(np.float32).eps
-        inside = (
-            low * (1 - math.copysign(eps, low)) <= number <= high * (1 + math.copysign(eps, high))
-        )
+        under, over = rounded_ends(low, high)
+        # An end that was rounded to float32 is that end.
+        inside = low <= number <= high or number in (under, over)
         if not (inside and np.isfinite(number)):
-            bounds = "be finite" if math.isinf(high) else f"lie in [{short(low)}, {short(high)}]"
-            raise ValueError(f"{name} must {bounds}; got {short(number.item())}")
+            raise ValueError(f"{name} must {_bounds_text(low, high)}; got {short(number.item())}")
         nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
         lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))
         if abs(nearest - number) > 0.1 * (upper - lower) + 1e-5 * abs(number):
@@ -94,7 +120,8 @@ class Continuous(Domain):
         return {name: np.asarray(values)}
 
     def from_columns(self, row: Row, name: str) -> Float[Array, ""]:
-        return as_real(as_numbers(row[name], name).item())
+        number = as_numbers(row[name], name).astype(jnp.result_type(float))
+        return jnp.asarray(self.rounded(number))
 
 
 @dataclass(frozen=True, repr=False)
@@ -208,8 +235,8 @@ class TruncatedNormal(Continuous):
         z = ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
         low, high = np.asarray([self.low, self.high], u.dtype)
-        x = _but(x, (u <= 0) | (x < low), low)
-        return _but(x, (u >= 1) | (x > high), high)
+        x = replace_where(x, (u <= 0) | (x < low), low)
+        return replace_where(x, (u >= 1) | (x > high), high)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         low, high = np.asarray([self.low, self.high], value.dtype)
@@ -221,7 +248,7 @@ class TruncatedNormal(Continuous):
         right = jnp.where(z < 0, below_high - tail, tail - above_high)
         left, right = (right, left) if self._mirrored else (left, right)
         u = jnp.where(left < 0.5, left, 1 - right)
-        return _but(_but(u, value <= low, 0), value >= high, 1)
+        return replace_where(replace_where(u, value <= low, 0), value >= high, 1)
 
     def __repr__(self) -> str:
         shown = ", ".join(short(x) for x in (self.mean, self.std, self.low, self.high))
@@ -298,6 +325,7 @@ class Distribution(Continuous):
     cdf: Callable[[Array], Array]
     name: str = "custom"
     _range: tuple[float, float] = field(default=(0.0, 1.0), init=False, compare=False)
+    _ends: tuple[float, float] = field(default=(-math.inf, math.inf), init=False, compare=False)
 
     def __post_init__(self) -> None:
         for role in ("inverse_cdf", "cdf"):
@@ -308,6 +336,7 @@ class Distribution(Continuous):
             raise ValueError(f"name of a Distribution must be a text; got {self.name!r}")
         with jax.ensure_compile_time_eval():
             object.__setattr__(self, "_range", self._measured_range())
+            object.__setattr__(self, "_ends", self._measured_ends())
 
     def _measured_range(self) -> tuple[float, float]:
         """Check both functions and return the probabilities that the coordinates 0 and 1 mean."""
@@ -333,6 +362,15 @@ class Distribution(Continuous):
         finite &= np.isfinite(self._sampled("inverse_cdf", jax.grad(self.inverse_cdf), ends))
         return 0.0 if finite[0] else OUTERMOST, 1.0 if finite[1] else 1 - 2.0**-24
 
+    def _measured_ends(self) -> tuple[float, float]:
+        """Return the values at 0 and 1 in double precision, infinite where there is no end."""
+        with in_precision("float64"):
+            low, high = self._sampled("inverse_cdf", self.inverse_cdf, np.array([0.0, 1.0]))
+        return (
+            float(low) if np.isfinite(low) else -math.inf,
+            float(high) if np.isfinite(high) else math.inf,
+        )
+
     def _sampled(
         self, role: str, function: Callable[[Array], Array], points: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
@@ -351,17 +389,26 @@ class Distribution(Continuous):
 
     @property
     def support(self) -> tuple[float, float]:
-        return (-math.inf, math.inf)
+        return self._ends
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         low, high = self._range
-        return jnp.asarray(self.inverse_cdf(_but(_at_least(u, low), u > high, high)))
+        return jnp.asarray(self.inverse_cdf(replace_where(_at_least(u, low), u > high, high)))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.asarray(self.cdf(value))
 
     def __repr__(self) -> str:
         return f"Distribution(name={self.name!r})"
+
+
+def _bounds_text(low: float, high: float) -> str:
+    """Describe the ends of a distribution for a message."""
+    if math.isfinite(low) and math.isfinite(high):
+        return f"lie in [{short(low)}, {short(high)}]"
+    if math.isfinite(low):
+        return f"be finite and at least {short(low)}"
+    return f"be finite and at most {short(high)}" if math.isfinite(high) else "be finite"
 
 
 def _check_numbers(domain: Domain, *names: str) -> None:
@@ -393,14 +440,4 @@ def _check_ends(domain: Domain, low: float, high: float) -> None:
 
 
 def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
-    return _but(x, x < least, least)
-
-
-def _but(
-    x: Float[Array, ""], condition: Bool[Array, ""], value: float | np.floating
-) -> Float[Array, ""]:
-    """Replace `x` by `value` where the condition holds, and keep the derivative of `x` there.
-
-    A search that stands at an end of the coordinate can so leave it.
-    """
-    return jnp.where(condition, value + (x - jax.lax.stop_gradient(x)), x)
+    return replace_where(x, x < least, least)

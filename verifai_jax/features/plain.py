@@ -61,6 +61,8 @@ def to_plain(domain: Domain) -> dict[str, Any]:
     for name in FIELDS[type(domain)]:
         value = getattr(domain, name)
         data[name] = to_plain(value) if isinstance(value, Domain) else _lists(value)
+    if isinstance(domain, Box) and domain.closed != "both":
+        data["closed"] = domain.closed
     return data
 
 
@@ -117,6 +119,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
         for name in FIELDS[KINDS[kind]]
     }
+    if kind == "Box" and "closed" in data:
+        arguments["closed"] = data["closed"]
     return KINDS[kind](**arguments)
 
 

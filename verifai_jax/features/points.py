@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.waveform import Waveform
+from verifai_jax.features.arrays import Array, Items, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Continuous
@@ -40,24 +41,31 @@ def features_of_rows(
             raise unknown_name("column", name, rows)
     columns = {name: np.asarray(rows[name]) for name in names}
     with in_precision(precision):
-        batch = {name: _batch(domain, columns, name) for name, domain in domains.items()}
+        batch = {name: _batch(domain, columns, name, precision) for name, domain in domains.items()}
         return jax.tree.map(lambda leaf: _cast(leaf, precision), batch)
 
 
 def _cast(leaf: np.ndarray, precision: str) -> np.ndarray:
-    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
+    inexact = jnp.issubdtype(leaf.dtype, jnp.inexact) and leaf.dtype != precision
+    return leaf.astype(precision) if inexact else leaf
 
 
-def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str) -> PyTree:
+def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str, precision: str) -> PyTree:
     names = domain.columns(name)
     if isinstance(domain, Struct):
-        return {part: _batch(inner, columns, dotted(name, part)) for part, inner in domain.fields}
+        return {
+            part: _batch(inner, columns, dotted(name, part), precision)
+            for part, inner in domain.fields
+        }
     if isinstance(domain, Box | Continuous):
         # In NumPy: a first use of JAX takes longer than the simulation.
         values = [as_numbers(columns[column], column) for column in names]
-        return values[0] if np.ndim(getattr(domain, "low", 0.0)) == 0 else np.stack(values, axis=1)
+        scalar = np.ndim(getattr(domain, "low", 0.0)) == 0
+        stacked = values[0] if scalar else np.stack(values, axis=1)
+        return domain.rounded(stacked.astype(precision))
     if isinstance(domain, Signal):
-        knots = [_batch(domain.domain, columns, knot) for knot in indexed(name, domain.knots)]
+        each = indexed(name, domain.knots)
+        knots = [_batch(domain.domain, columns, knot, precision) for knot in each]
         return Waveform(np.stack(knots, axis=1), domain.hold, domain.duration)  # pyright: ignore[reportArgumentType]
     # One row at a time, but equal ones once.
     rows = list(zip(*(columns[column].tolist() for column in names), strict=True))
@@ -74,7 +82,7 @@ def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str) -> PyTr
 def nudged(domains: Mapping[str, Domain], features: Mapping[str, PyTree]) -> dict[str, PyTree]:
     """Return the same features `[n, ...]`, their real numbers one rounding of float32 away.
 
-    They stay in their domains; choices and constants stay as they are.
+    They stay in their domains; choices, constants and features that are fixed stay as they are.
     """
     return {name: _nudged(domain, features[name]) for name, domain in domains.items()}
 
@@ -84,9 +92,21 @@ def _nudged(domain: Domain, value: PyTree) -> PyTree:
         return {name: _nudged(part, value[name]) for name, part in domain.fields}
     if isinstance(domain, Signal):
         return replace(value, knots=_nudged(domain.domain, value.knots))
+    if isinstance(domain, Array):
+        return _nudged(domain.domain, value)
+    if isinstance(domain, VariableArray):
+        present = np.asarray(value.mask)
+
+        def where_present(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+            axes = (1,) * (np.ndim(new) - present.ndim)
+            return np.where(present.reshape(present.shape + axes), new, old)
+
+        moved = _nudged(domain.domain, value.values)
+        return Items(jax.tree.map(where_present, moved, value.values), value.length)
     if isinstance(domain, Box | Continuous):
-        low, high = domain.support if isinstance(domain, Continuous) else (domain.low, domain.high)
-        away = (value * (1 + ROUNDING)).astype(value.dtype)
-        inside = (away >= np.asarray(low)) & (away <= np.asarray(high))
-        return np.where(inside, away, (value * (1 - ROUNDING)).astype(value.dtype))
+        first, last = domain.ends(value.dtype)
+        farther, nearer = ((value * (1 + sign * ROUNDING)).astype(value.dtype) for sign in (1, -1))
+        # In a box of few numbers neither may be inside.
+        stays = np.where((nearer >= first) & (nearer <= last), nearer, value)
+        return np.where((farther >= first) & (farther <= last), farther, stays)
     return value

@@ -82,6 +82,9 @@ def probe_values(domain: Domain) -> list[tuple[Any, str]]:
         case DiscreteBox(int(low), int(high)) if high - low < _MOST_PROBES:
             inner = [(value, "a value") for value in range(low + 1, high)]
             return [(domain.low, "the lower end"), *inner, (domain.high, "the upper end")]
+        case Box(closed="left" | "right" | "neither"):
+            low, high = domain.ends(np.float64)
+            return [(low.tolist(), "the lower end"), (high.tolist(), "the upper end")]
         case Box() | DiscreteBox() | LogUniform() | TruncatedNormal():
             # The ends as they were written, not rounded to float32.
             return [(domain.low, "the lower end"), (domain.high, "the upper end")]

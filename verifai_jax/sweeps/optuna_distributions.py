@@ -27,8 +27,8 @@ def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
         case Categorical():
             return distributions.CategoricalDistribution([plain_choice(c) for c in domain.choices])
         case Box() if domain.size == 1:
-            low, high = np.ravel(domain.low)[0], np.ravel(domain.high)[0]
-            return distributions.FloatDistribution(float(low), float(high))
+            low, high = map(np.ravel, domain.ends(np.float64))
+            return distributions.FloatDistribution(float(low[0]), float(high[0]))
     return None
 
 

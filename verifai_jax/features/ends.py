@@ -1,0 +1,137 @@
+"""Ends of intervals in the precision of a simulation: no value lies outside, whatever is rounded.
+
+    first, last = ends_within(0.0, 61.2, np.float32)        # 0.0 and 61.199997
+    clip_to_ends(x, first, last)                            # jax.grad sees x itself
+    round_inwards(np.float32(61.2), 0.0, 61.2)              # 61.199997
+
+Nearest to 61.2 in single precision is 61.20000076. A model that switches at 61.2 would be in its
+other mode there, and so would a replay in double precision, which takes the values of the table.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
+
+from verifai_jax.core.errors import unknown_name
+
+CLOSED = ("both", "left", "right", "neither")
+"""Which ends of an interval belong to it, in the words of pandas."""
+
+End: TypeAlias = float | tuple[float, ...]
+"""An end of an interval, or of several; infinite where there is none."""
+
+Reals = TypeVar("Reals", jax.Array, np.ndarray)
+"""Real numbers, of JAX or of NumPy."""
+
+
+def check_closed(closed: object) -> None:
+    """Refuse what does not say which ends belong to an interval.
+
+    **Raises:** `UnknownNameError` for a word that is none of `CLOSED`.
+    """
+    if closed not in CLOSED:
+        raise unknown_name("value of closed", str(closed), CLOSED)
+
+
+def ends_within(
+    low: End, high: End, dtype: DTypeLike, closed: str = "both"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest number of a precision within intervals.
+
+    They are zero or normal numbers: XLA takes a subnormal one for zero.
+
+    **Arguments:**
+
+    - `low`, `high`: the ends.
+    - `dtype`: of the precision.
+    - `closed`: which ends belong to the intervals, one of `CLOSED`.
+    """
+    ends = _ends(low, high, np.dtype(dtype), closed)
+    return ends.first, ends.last
+
+
+def clip_to_ends(
+    x: Float[Array, "*shape"], first: np.ndarray, last: np.ndarray
+) -> Float[Array, "*shape"]:
+    """Return numbers moved to the ends that they are beyond, with the derivative of `x` there.
+
+    A search that stands at an end can so leave it.
+    """
+    return replace_where(replace_where(x, x < first, first), x > last, last)
+
+
+def replace_where(
+    x: Float[Array, "*shape"], condition: Any, value: float | np.floating | np.ndarray
+) -> Float[Array, "*shape"]:
+    """Return `value` where the condition holds, and `x` elsewhere, with the derivative of `x`."""
+    return jnp.where(condition, value + (x - jax.lax.stop_gradient(x)), x)
+
+
+def rounded_ends(low: End, high: End) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends rounded to single precision, as numbers of double precision."""
+    ends = _ends(low, high, np.dtype(np.float64), "both")
+    return ends.under, ends.over
+
+
+def round_inwards(
+    value: Reals,
+    low: End,
+    high: End,
+    closed: str = "both",
+) -> Reals:
+    """Return numbers, of which those at an end that was rounded outwards are at the end within.
+
+    Others stay as they are, those that are farther outside too.
+
+    **Arguments:**
+
+    - `value`: numbers in single or double precision.
+    - `low`, `high`, `closed`: as in `ends_within`.
+    """
+    first, last, under, over, inside = _ends(low, high, np.dtype(value.dtype), closed)
+    if inside:
+        return value
+    xp: Any = np if isinstance(value, np.ndarray) else jnp
+    value = xp.where((value < first) & (value == under), first, value)
+    return xp.where((value > last) & (value == over), last, value)
+
+
+class _Ends(NamedTuple):
+    """The ends of intervals in a precision.
+
+    - `first`, `last`: the least and the greatest number within.
+    - `under`, `over`: the ends as they are rounded to single precision.
+    - `inside`: True where these are within.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    under: np.ndarray
+    over: np.ndarray
+    inside: bool
+
+
+@lru_cache(maxsize=4096)
+def _ends(low: End, high: End, dtype: np.dtype, closed: str) -> _Ends:
+    lowest, highest = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    first = _at_least(lowest, dtype, closed in ("both", "left"))
+    last = np.asarray(-_at_least(np.asarray(-highest), dtype, closed in ("both", "right")))
+    under, over = (end.astype(np.float32).astype(dtype) for end in (lowest, highest))
+    inside = bool(np.all(under >= first) and np.all(over <= last))
+    return _Ends(first, last, under, over, inside)
+
+
+def _at_least(bound: Float[np.ndarray, "*shape"], dtype: DTypeLike, included: bool) -> np.ndarray:
+    """Return the least number of a precision that is not below a bound, or that is above it."""
+    x = bound.astype(dtype)
+    back = x.astype(np.float64)
+    outside = back < bound if included else back <= bound
+    x = np.where(outside, np.nextafter(x, np.asarray(np.inf, dtype)), x)
+    tiny = np.asarray(jnp.finfo(dtype).tiny, dtype)
+    x = np.where((x > 0) & (x < tiny), tiny, x)
+    return np.where((x < 0) & (x > -tiny), np.zeros_like(x), x)
