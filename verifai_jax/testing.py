@@ -381,9 +381,13 @@ def _same_type(before: PyTree, after: PyTree, step: str = "tell") -> None:
     assert jax.tree.structure(before) == jax.tree.structure(after), (
         f"{step} must keep the state's form"
     )
-    for one, two in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        assert jax.typeof(one) == jax.typeof(two), (
-            f"{step} must keep the types of the state; {jax.typeof(one)} became {jax.typeof(two)}"
+    pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
+    for (path, one), two in pairs:
+        # A weak type, of what was made from Python's numbers only, is no difference to a run.
+        assert (one.shape, one.dtype) == (two.shape, two.dtype), (
+            f"{step} must keep the types of the state; its part "
+            f"{jax.tree_util.keystr(path) or 'state'} was {one.dtype}{list(one.shape)} and became "
+            f"{two.dtype}{list(two.shape)}"
         )
 
 

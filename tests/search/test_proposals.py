@@ -1,5 +1,7 @@
 """Constraints under every search: only accepted points, at most once each, and none for nothing."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,9 @@ import pytest
 from scipy import stats
 
 import verifai_jax as vj
-from verifai_jax.search import Grid, named, names
+from verifai_jax.search import Grid, Search, named, names
 from verifai_jax.search.proposals import ConstraintError, Proposals
+from verifai_jax.testing import check_search
 
 DOMAINS = {"x": vj.Box(0, 1), "y": vj.Box(0, 1), "kind": vj.Categorical("a", "b", "c")}
 
@@ -124,3 +127,76 @@ def test_the_cube_of_a_space():
     assert cube.ordered == (True, False, True, True, True, True)
     assert cube.names[2:4] == ("cars.length", "cars[0].x")
     assert cube.lengths == (2,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Own(Search):
+    """A search of a user, who gets one thing wrong."""
+
+    wrong: str = ""
+
+    def init(self, key, cube, batch):
+        # Weakly typed, as jnp.full of a Python number is.
+        return {"key": key, "centre": jnp.full(cube.dim, 0.5)}
+
+    def ask(self, state, cube, batch):
+        key, now = jax.random.split(state["key"])
+        u = jax.random.uniform(now, (batch, cube.dim))
+        match self.wrong:
+            case "shape":
+                u = u.T
+            case "dtype":
+                u = (u > 0.5).astype(jnp.int32)
+            case "range":
+                u = u.at[3, 1].set(1.7)
+            case "nan":
+                u = u.at[2, 0].set(jnp.nan)
+            case "no tuple":
+                return u
+            case "branch":
+                u = u if u[0, 0] > 0.5 else 1 - u
+        return u, {**state, "key": key}
+
+    def tell(self, state, cube, observations):
+        best = observations.u[jnp.argmin(observations.score)]
+        if self.wrong == "state":
+            best = best[0]
+        return {**state, "centre": best}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ("shape", r"must return points float32\[16, 2\].*\(a, b\); got float32\[2, 16\]"),
+        ("dtype", r"must return points float32\[16, 2\].*got int32\[16, 2\]"),
+        ("no tuple", r"ask of search Own\(wrong='no tuple'\) must return \(points, state\)"),
+        ("state", r"tell.*its part \['centre'\] was float32\[2\] and became float32\[\]"),
+        ("branch", r"ask.*test_proposals.py, line \d+, in ask \(`u = u if .*jnp.where.*jax.lax.c"),
+    ],
+)
+def test_a_search_of_ones_own_with_wrong_forms(wrong, message):
+    problem = vj.Problem("p", {"a": vj.Box(0, 1), "b": vj.Box(0, 1)}, lambda f, key: None, "x < 2")
+    with pytest.raises(ValueError, match=message) as raised:
+        vj.falsify(problem, Own(wrong), 64)
+    assert "\n" not in str(raised.value)
+    assert "vj.blackbox" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [("range", "in row 3 y is 1.7. Clip"), ("nan", "in row 2 x is nan. Clip")],
+)
+def test_a_search_of_ones_own_that_leaves_the_cube(wrong, message):
+    cube = vj.FeatureSpace({"x": vj.Box(0, 1), "y": vj.Box(0, 1)}).cube
+    with pytest.raises(ValueError, match=message):
+        Proposals(Own(wrong), cube, 16, KEY).next(16)
+
+
+def test_a_search_of_ones_own_that_is_right():
+    cube = vj.FeatureSpace({"x": vj.Box(0, 1), "y": vj.Box(0, 1)}).cube
+    check_search(Own(), cube)
+    proposals = Proposals(Own(), cube, 16, KEY)
+    for _ in range(2):
+        points = proposals.next(16)
+        proposals.tell(np.ones(16, np.float32), np.ones(16, bool), None)
+    assert points.shape == (16, 2)

@@ -15,6 +15,7 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
+from verifai_jax.search.contract import check_contract
 from verifai_jax.statistics.stopping import StoppingRule
 from verifai_jax.systems.base import System
 
@@ -79,6 +80,7 @@ def check_search(problem: object, search: object) -> Search:
         check_gradient(problem, search)
     problem.space.check_where()
     search.check(problem.space.cube)
+    check_contract(search, problem.space.cube)
     return search
 
 

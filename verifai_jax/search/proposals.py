@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Diverse, Observations, Plan, Search
+from verifai_jax.search.contract import check_points, is_own
 
 TRIES = 32
 """Asks in one round at most until every row of a search that learns is accepted."""
@@ -55,6 +56,7 @@ class Proposals:
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
         self._program = _program(search, self.cube, batch)
+        self._checked = is_own(search)
         self._accepts = accepts
         if self._accepts is not None:
             # Compiled now, in the shape that it will be asked in.
@@ -195,6 +197,8 @@ class Proposals:
 
     def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
+        if self._checked:
+            check_points(self.search, self.cube, points)
         if self.total is not None:
             points = points[: max(0, self.total - self.proposed)]
         return points
