@@ -124,7 +124,11 @@ def test_what_is_not_finite_is_a_status_not_a_verdict():
     assert table["rho"].isna().equals(table["status"] == "nonfinite")
     assert len(run.table.counterexamples) == ((table["a"] > 0.4) & (table["a"] <= 0.5)).sum()
     assert f"{len(run.table.failed)} nonfinite" in run.summary()
-    assert run.failure_rate.simulations == 400 - len(run.table.failed)
+    rate = run.failure_rate
+    assert (rate.simulations, rate.undecided) == (400, len(run.table.failed))
+    assert rate.low < 0.1
+    assert rate.high > 0.6
+    assert f"violate the property; {len(run.table.failed)} have no verdict" in run.summary()
 
 
 def test_infinite_signals_are_not_counterexamples():

@@ -23,6 +23,7 @@ from verifai_jax.analysis._pca import pca
 from verifai_jax.analysis._rules import rules
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
+from verifai_jax.analysis.data.verdicts import unconfirmed
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
@@ -197,13 +198,16 @@ def _part(name: str, reason: str, analysis: Callable[[], Any]) -> Part:
 
 def _describe_failures(source: object, samples: Samples) -> str:
     rows, failures = len(samples.table), int(samples.failing.sum())
-    lines = [f"{failures:,} of {rows:,} simulations violate the property"]
-    if len(samples) < rows:
-        lines[0] += f"; {rows - len(samples):,} have no verdict"
+    doubtful = int(unconfirmed(samples.table).sum())
+    lines = [f"{failures + doubtful:,} of {rows:,} simulations violate the property"]
+    if doubtful:
+        lines[0] += f"; {doubtful:,} of them are not claimed, as closer replays disagree"
+    if len(samples) + doubtful < rows:
+        lines[0] += f"; {rows - len(samples) - doubtful:,} have no verdict"
     if isinstance(source, Run):
         rate = source.failure_rate
         lines.append(
-            f"failure rate {rate}"
+            f"failure rate {rate} as simulated"
             if rate is not None
             else f"failure rate not given: {source.search} stopped by {source.stopped}"
             if source.prior

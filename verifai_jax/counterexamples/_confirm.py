@@ -18,25 +18,24 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.counterexamples.selection import Row
-from verifai_jax.evaluation.confirmation import IN_WORDS, MOST, VERDICTS, Checked, Confirmer
+from verifai_jax.evaluation.confirmation import (
+    IN_WORDS,
+    MEANING,
+    MOST,
+    VERDICTS,
+    Checked,
+    Confirmer,
+)
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
 BLOCK = 128
 """Rows of a run that are checked at once; what is finished survives Ctrl-C."""
 SHOWN = 5
-"""Doubtful rows listed in words."""
+"""Reasons of doubtful rows listed in words."""
 
 Simulator: TypeAlias = Callable[..., Any] | Problem | str | None
 """A system, a problem with one, or the name of a backend."""
-
-MEANING = {
-    "confirmed": "it fails in every replay",
-    "fragile": "numerically fragile",
-    "refuted": "an artefact of the simulation",
-    "unchecked": "nothing finer to check it with",
-    "unexamined": "not replayed",
-}
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,7 +46,7 @@ class Confirmation:
 
     - `name`: of the problem.
     - `row`: its number in the table; None for features without one.
-    - `verdict`: `"confirmed"`, `"fragile"`, `"refuted"` or `"unchecked"`.
+    - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"`, `"raised"` or `"unchecked"`.
     - `rho`: robustness `as_run`, NaN where that is not known, and of each check by name.
     - `band`: how far the robustness moved between the replays.
     - `why`: the reason of the verdict, in words.
@@ -92,11 +91,13 @@ class Confirmations:
     - `table`: a row each, indexed by row number: `verdict`, `rho` as run, `rho.NAME` of each check,
       `band`, `why`.
     - `notes`: checks that could not be made, and why.
+    - `checked`: the checks that a confirmed row has passed, in words.
     """
 
     name: str
     table: pd.DataFrame = field(repr=False)
     notes: tuple[str, ...]
+    checked: str = ""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -115,13 +116,22 @@ class Confirmations:
     def __str__(self) -> str:
         if not len(self):
             return f"{self.name}: no counterexample to confirm"
-        counts = ", ".join(f"{count} {verdict}" for verdict, count in self.counts.items())
+        counts = ", ".join(
+            f"{count} {verdict}{f' {self.checked}' if verdict == 'confirmed' else ''}"
+            for verdict, count in self.counts.items()
+        )
         lines = [f"{self.name}: of {_counted(len(self))}, {counts}"]
         doubtful = self.table.loc[~self.table["verdict"].isin(["confirmed", "unexamined"])]
-        for row, entry in doubtful.head(SHOWN).iterrows():
-            lines.append(f"  row {row} {entry['verdict']}: {entry['why']}")
-        if len(doubtful) > SHOWN:
-            lines.append(f"  and {len(doubtful) - SHOWN} more: see .table")
+        reasons = [
+            (rows.index, str(verdict), str(why))
+            for (verdict, why), rows in doubtful.groupby(["verdict", "why"], sort=False)  # pyright: ignore[reportGeneralTypeIssues]
+        ]
+        for rows, verdict, why in reasons[:SHOWN]:
+            more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
+            lines.append(f"  row {rows[0]}{more} {verdict}: {why}")
+        if len(reasons) > SHOWN:
+            rest = sum(len(rows) for rows, _, _ in reasons[SHOWN:])
+            lines.append(f"  and {rest} more: see .table")
         lines += [f"  note: {note}" for note in self.notes]
         if len(self.confirmed):
             worst = self.confirmed["rho"].idxmin()
@@ -249,7 +259,7 @@ def _all(run: Run, confirmer: Confirmer) -> Confirmations:
         frame.iloc[block, frame.columns.get_loc("verdict")] = checked.verdict
         frame.iloc[block, frame.columns.get_loc("why")] = np.array(checked.why, object)
     notes = tuple(dict.fromkeys(note for _, checked in parts for note in checked.notes))
-    return Confirmations(run.name, frame, (*notes, *stopped))
+    return Confirmations(run.name, frame, (*notes, *stopped), confirmer.checked)
 
 
 def _placed(

@@ -22,16 +22,29 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.replays import HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
-VERDICTS = ("confirmed", "fragile", "refuted", "unchecked", "unexamined")
+VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unchecked", "unexamined")
 """Verdicts of closer replays; see `Checked`."""
+UNDECIDED = ("fragile", "raised", "unchecked", "unexamined")
+"""Verdicts that leave open whether the failure is the system's or the simulation's."""
+MEANING = {
+    "confirmed": "it fails in every replay",
+    "refuted": "an artefact of the simulation",
+    "fragile": "closer replays disagree",
+    "raised": "it could not be replayed",
+    "unchecked": "there is nothing finer to check it with",
+    "unexamined": "it was not replayed",
+}
+"""Each verdict as people read it."""
 FINER = {"half_step": 2, "quarter_step": 4}
 """Checks at a finer step, and how many times finer."""
+RAISED = (Status.ERROR, Status.TIMEOUT)
+"""Ends of a simulation that gave no trace."""
 SINGLE = "quarter_step_float32"
 """Name of the check at the finest step in single precision."""
 AMPLIFIED = 4.0
@@ -39,6 +52,10 @@ AMPLIFIED = 4.0
 roundings into any of its outcomes, and two or three programs may agree by chance."""
 MOST = 256
 """Rows that are examined in any case; each costs as much as 15 simulations of the run."""
+LIMIT = 1024
+"""Rows that a falsification examines at most, ..."""
+SHARE = 50
+"""... or one for so many simulations, where that is more."""
 SAFE = 10.0
 """Further rows stay unexamined if they are so many times farther from zero than replays have moved
 any row."""
@@ -56,14 +73,45 @@ IN_WORDS = {
 """Each check as people read it."""
 
 
+def describe_checks(checks: Sequence[str], exact_step: bool = False) -> str:
+    """Describe the checks that a confirmed row has passed, in words.
+
+    **Arguments:**
+
+    - `checks`: their names, as in `Checked.rho`.
+    - `exact_step`: whether the step belongs to the system, so that there is no finer one.
+
+    **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
+    the step`; empty without a check.
+    """
+    parts = []
+    if "float64" in checks:
+        parts.append("in double precision")
+    elif "again" in checks:
+        parts.append("when simulated again")
+    if "quarter_step" in checks:
+        parts.append("at a half and a quarter of the step")
+    if "nudged" in checks:
+        parts.append("one rounding of the features away")
+    if "simulator" in checks:
+        parts.append("in the other simulator")
+    words = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    if words and "quarter_step" not in checks:
+        words += (
+            "; the step belongs to the system" if exact_step else "; no finer step could be tried"
+        )
+    return words
+
+
 class Checked(NamedTuple):
     """Verdicts of closer replays of `n` rows.
 
-    - `verdict`: `confirmed`: it fails in every check, and by more than replays move it; `fragile`:
-      the checks disagree, one of them gave no robustness, or it fails by less than that;
-      `refuted`: none of the finer checks fails (half and quarter of the step and the other
-      simulator, or where the step stays, double precision); `unchecked`: there was nothing finer to
-      check with; `unexamined`: left out, see `Confirmer`.
+    - `verdict`: `confirmed`: it fails in every check, at least one of which is finer than the run,
+      and by more than replays move it; `refuted`: none of the finer checks fails (half and quarter
+      of the step and the other simulator, or where the step stays, double precision); `fragile`:
+      the checks disagree, one of them gave no robustness, or it fails by less than that; `raised`:
+      a check raised, and the others fail; `unchecked`: there was nothing finer to check with;
+      `unexamined`: left out, see `Confirmer`.
     - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
       are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
       `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
@@ -98,6 +146,9 @@ class Confirmer:
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`.
 
+    Once rows were examined, `checked` says which checks a confirmed row has passed, and `raised`
+    what a replay raised first, if any did.
+
     **Raises:** what `Problem.check` does, for a simulator that does not fit.
     """
 
@@ -116,15 +167,24 @@ class Confirmer:
         self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
         self.other = None if simulator is None else _other(problem, simulator)
         self.examined, self.band = 0, 0.0
+        self.checked = ""
+        self.raised: tuple[str, ...] = ()
         self._plan: _Plan | None = None
 
-    def __call__(self, rows: Mapping[str, Any], numbers: Sequence[int] | np.ndarray) -> Checked:
+    def __call__(
+        self,
+        rows: Mapping[str, Any],
+        numbers: Sequence[int] | np.ndarray,
+        limit: int | None = None,
+    ) -> Checked:
         """Check these rows of the table.
 
         **Arguments:**
 
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
+        - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
+          the worst row and those nearest to zero are.
 
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
@@ -133,20 +193,36 @@ class Confirmer:
         if not len(numbers):
             return Checked(np.empty(0, object), {}, np.zeros(0), [], ())
         run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
-        order = np.arange(len(numbers)) if run is None else np.argsort(np.abs(run), kind="stable")
+        order = np.arange(len(numbers)) if run is None else _order(run)
         parts: list[tuple[np.ndarray, _Decision]] = []
         while len(order):
             free = self.most - self.examined
             if run is None:
                 free = len(order)
-            elif free <= 0 and self.far(float(run[order[0]])):
+            elif free <= 0 and self.far(float(np.min(np.abs(run[order])))):
                 break
-            block, order = np.split(order, [max(free, BLOCK)])
+            size = max(free, BLOCK)
+            if limit is not None:
+                size = min(size, limit - self.examined)
+                if size <= 0:
+                    break
+            block, order = np.split(order, [size])
             taken = {name: column[block] for name, column in rows.items()}
             parts.append((block, self._examine(taken, numbers[block], taken.get("rho"))))
             self.examined += len(block)
+            lost = np.flatnonzero(parts[-1][1].verdict == "raised")
+            if len(lost) and not self.raised:
+                self.raised = (f"not confirmed: {parts[-1][1].why[lost[0]]}",)
             self.band = max(self.band, float(np.max(parts[-1][1].band)))
         return self._join(parts, order, run)
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds that its replays have spent compiling."""
+        if self._plan is None:
+            return 0.0
+        replays = {id(check.replays): check.replays for check in self._plan.checks.values()}
+        return sum(each.compile_seconds for each in replays.values())
 
     @property
     def finer(self) -> bool:
@@ -171,6 +247,8 @@ class Confirmer:
     ) -> "_Decision":
         if self._plan is None:
             self._plan = _make_plan(self, rows)
+            exact = self.problem.system.exact_step
+            self.checked = describe_checks(tuple(self._plan.checks), exact)
         features: dict[str, Any] = {}
         found = {}
         for name, check in self._plan.checks.items():
@@ -187,10 +265,11 @@ class Confirmer:
     ) -> Checked:
         """Join the rows of all parts in their order, and those that were left out."""
         count = sum(len(block) for block, _ in parts) + len(rest)
-        assert self._plan is not None
         verdict = np.full(count, "unexamined", object)
-        rho = {name: np.full(count, np.nan) for name in self._plan.checks}
-        band, why, notes = np.full(count, np.nan), [""] * count, list(self._plan.notes)
+        # A run that goes on may have examined enough rows before it was interrupted.
+        checks, said = ((), ()) if self._plan is None else (self._plan.checks, self._plan.notes)
+        rho = {name: np.full(count, np.nan) for name in checks}
+        band, why, notes = np.full(count, np.nan), [""] * count, list(said)
         for block, found in parts:
             verdict[block], band[block] = found.verdict, found.band
             for name in rho:
@@ -199,11 +278,15 @@ class Confirmer:
                 why[place] = reason
         if len(rest):
             assert run is not None
-            nearest = np.min(np.abs(run[rest]))
-            note = (
-                f"{len(rest)} of {count} were not replayed: {nearest:.3g} or more from zero, where "
-                f"none of {self.examined} replays moved a row by more than {self.band:.2g}"
-            )
+            nearest = float(np.min(np.abs(run[rest])))
+            note = f"{len(rest)} of {count} were not replayed"
+            if self.far(nearest):
+                note += (
+                    f": {nearest:.3g} or more from zero, where none of {self.examined} replays "
+                    f"moved a row by more than {self.band:.2g}"
+                )
+            else:
+                note += f", as {self.examined} rows of this run were before"
             notes.append(note)
             for place in rest.tolist():
                 why[place] = note
@@ -219,17 +302,25 @@ class _Check(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """The checks by name, notes on those left out, and whether any says more than the run did."""
+    """The checks that are made.
+
+    - `checks`: by name.
+    - `notes`: on those left out.
+    - `independent`: whether any says more than the run did.
+    - `raised`: what raised already when it was traced; empty where nothing did.
+    """
 
     checks: dict[str, _Check]
     notes: tuple[str, ...]
     independent: bool
+    raised: str = ""
 
 
 def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
     problem, run = confirmer.problem, confirmer.precision
     checks: dict[str, _Check] = {}
-    base, precision, notes = _replays(problem, confirmer, rows)
+    own = _replays(problem, confirmer, rows)
+    base, precision, notes, raised = own.replays, own.precision, list(own.notes), own.raised
     refined = False
     if base is not None:
         name = "float64" if precision == "float64" else "again"
@@ -248,38 +339,56 @@ def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
         if not problem.black_box:
             checks["nudged"] = _Check(base, FINER["quarter_step"] if refined else 1, precision)
     if confirmer.other is not None:
-        other, precision, said = _replays(confirmer.other, confirmer, rows)
-        notes += [f"the other simulator: {note}" for note in said]
-        if other is not None:
-            checks["simulator"] = _Check(other, 1, precision)
+        other = _replays(confirmer.other, confirmer, rows)
+        notes += [f"the other simulator: {note}" for note in other.notes]
+        raised = raised or (other.raised and f"the other simulator: {other.raised}")
+        if other.replays is not None:
+            checks["simulator"] = _Check(other.replays, 1, other.precision)
     finer = refined or "simulator" in checks or ("float64" in checks and run != "float64")
-    # A black box that is asked again may well answer something else.
-    return _Plan(checks, tuple(notes), finer or (problem.black_box and base is not None))
+    return _Plan(checks, tuple(notes), finer, raised)
 
 
-def _replays(
-    problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarray]
-) -> tuple[Any, str, list[str]]:
-    """Return the replays of a problem's rows, their precision, and notes on what is left out."""
+class _Base(NamedTuple):
+    """The replays of a problem's rows at its own step.
+
+    - `replays`: None where they cannot be traced.
+    - `precision`: of the replays.
+    - `notes`: on what is left out.
+    - `raised`: what raised when it was traced; empty where nothing did.
+    """
+
+    replays: Any
+    precision: str
+    notes: tuple[str, ...]
+    raised: str = ""
+
+
+def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Base:
+    """Return the replays of a problem's rows in the finest precision that it can be traced in."""
     run, key = confirmer.precision, run_keys(confirmer.seed)[1]
     if problem.black_box:
-        return HostReplays(problem, run, key), run, ["not checked in float64: a black box"]
+        notes = ("not checked in float64: a black box",)
+        return _Base(HostReplays(problem, run, key), run, notes)
     # All of one form: one row is enough to trace.
     first = {name: column[:1] for name, column in rows.items()}
-    notes: list[str] = []
+    raised = ""
     try:
         replays = Replays(problem, "float64", key, problem.space.features_of(first, "float64"))
         if not (replays.draws and run != "float64"):
-            return replays, "float64", notes
-        notes.append("not checked in float64: in it the system would draw other random numbers")
+            return _Base(replays, "float64", ())
+        note = "not checked in float64: in it the system would draw other random numbers"
     except Exception as error:
-        notes.append(f"not checked in float64: {format_error(error)}")
+        raised = f"the replay in float64 raised: {format_error(error)}"
+        note = f"not checked in float64: {format_error(error)}"
         if run == "float64":
-            return None, run, notes
+            return _Base(None, run, (note,), raised)
     try:
-        return Replays(problem, run, key, problem.space.features_of(first, run)), run, notes
+        replays = Replays(problem, run, key, problem.space.features_of(first, run))
+        return _Base(replays, run, (note,), raised)
     except Exception as error:
-        return None, run, [*notes, f"not simulated again: {format_error(error)}"]
+        again = f"not simulated again: {format_error(error)}"
+        raised = raised or f"the replay raised: {format_error(error)}"
+        return _Base(None, run, (note, again), raised)
 
 
 class _Decision(NamedTuple):
@@ -306,21 +415,42 @@ def _decide(
     if run is not None and base:
         rounding = np.maximum(rounding, _moved(run, rho[base]))
     band = np.maximum(step, rounding)
-    if not plan.independent:
-        reason = "; ".join(plan.notes) or "the run was in float64 already"
-        return _Decision(np.full(count, "unchecked", object), band, [reason] * count, found)
+    nothing_finer = "; ".join(plan.notes) or "the run was in float64 already"
+    if not found:
+        verdict = np.full(count, "raised" if plan.raised else "unchecked", object)
+        return _Decision(verdict, band, [plan.raised or nothing_finer] * count, found)
     deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
     deciding = [name for name in (*deciding, "simulator") if name in found]
     failing = {name: replayed.violated for name, replayed in found.items()}
     holding = {name: r.proper & ~r.violated for name, r in found.items()}
+    raised = {name: np.isin(r.status, RAISED) for name, r in found.items()}
     clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
-    confirmed = np.all(list(failing.values()), axis=0) & clear
-    refuted = np.all([holding[name] for name in deciding], axis=0) & (deciding[0] != "again")
-    verdict = np.where(confirmed, "confirmed", np.where(refuted, "refuted", "fragile"))
+    fails = np.all(list(failing.values()), axis=0)
+    refuted = np.all([holding[name] for name in deciding], axis=0) & plan.independent
+    refuted &= deciding[0] != "again"
+    lost = np.any(list(raised.values()), axis=0) | bool(plan.raised)
+    lost &= np.all([failing[name] | raised[name] for name in found], axis=0)
+    verdict = np.select(
+        [lost, fails & clear & plan.independent, refuted, fails & (not plan.independent)],
+        ["raised", "confirmed", "refuted", "unchecked"],
+        "fragile",
+    )
     why = [""] * count
-    for i in np.flatnonzero(~confirmed).tolist():
-        why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
+    for i in np.flatnonzero(verdict != "confirmed").tolist():
+        if verdict[i] == "unchecked":
+            why[i] = nothing_finer
+        elif verdict[i] == "raised" and plan.raised:
+            why[i] = plan.raised
+        else:
+            why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
     return _Decision(verdict.astype(object), band, why, found)
+
+
+def _order(run: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Return the rows in the order in which they are examined: the worst one, then from zero on."""
+    order = np.argsort(np.abs(run), kind="stable")
+    worst = int(np.argmin(run))
+    return np.concatenate([[worst], order[order != worst]])
 
 
 def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -332,9 +462,12 @@ def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.n
 def _reason(i: int, found: dict[str, Verdicts], rho: float, band: float) -> str:
     lost = [name for name, replayed in found.items() if not replayed.proper[i]]
     if lost:
-        messages = [m[i] for name in lost if (m := found[name].messages)]
-        message = next(filter(None, messages), "")
-        return f"no verdict {_and(lost)}{f': {message}' if message else ', it is not finite'}"
+        raised = [name for name in lost if found[name].status[i] in RAISED]
+        if raised:
+            messages = [m[i] for name in raised if (m := found[name].messages)]
+            message = next(filter(None, messages), "out of time")
+            return f"the replay {_and(raised)} raised: {message}"
+        return f"the replay {_and(lost)} is not finite"
     holds = [name for name, replayed in found.items() if not replayed.violated[i]]
     if len(holds) == len(found):
         return "it holds in every replay"

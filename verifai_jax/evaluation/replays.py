@@ -54,6 +54,8 @@ class Refiner:
     def why_not(self, factors: Iterable[int]) -> str | None:
         """Say why the step cannot be made smaller; None where it can."""
         if not self.system.can_refine:
+            if self.system.exact_step:
+                return "the step belongs to the system"
             return "the system has no refined(factor)"
         for factor in factors:
             try:
@@ -73,8 +75,8 @@ class Replays:
     - `key`: of the run's simulations, from `run_keys`.
     - `features`: of some rows, whose form all others have.
 
-    `draws` is whether the system uses its random key. One program is traced at once, and what that
-    raises is raised here.
+    `draws` is whether the system uses its random key, and `compile_seconds` what its programs took
+    to compile. One program is traced at once, and what that raises is raised here.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class Replays:
     ) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
+        self.compile_seconds = 0.0
         self._form = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), features
         )
@@ -106,6 +109,7 @@ class Replays:
         count = len(numbers)
         together = 1 if count <= ONE_BY_ONE else LANES * len(jax.local_devices())
         engine, parts = self._engine(factor, together), []
+        compiled = engine.compile_seconds
         for start in range(0, count, together):
             block = slice(start, start + together)
             rows = jax.tree.map(lambda leaf, block=block: leaf[block], features)
@@ -114,6 +118,7 @@ class Replays:
                 parts.append(engine.evaluate(rows, keys, shared=np.int32(factor)))
             except Exception as error:
                 parts.append(_raised(len(numbers[block]), len(self.problem.formulas), error))
+        self.compile_seconds += engine.compile_seconds - compiled
         return Verdicts.concatenate([part._replace(features=None) for part in parts])
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
@@ -155,6 +160,7 @@ class HostReplays:
     """
 
     draws = False
+    compile_seconds = 0.0
 
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
         self.problem, self.precision, self.key = problem, precision, key

@@ -93,9 +93,10 @@ def falsify(
     - `precision`: `"float32"` or `"float64"`, of simulations and verdicts.
     - `backend`: of a system that has several (`"mjx"`, `"native"`); the faster one that the search
       can use when left out, as measured here. Name it for the same table on every machine.
-    - `confirm`: replay what violates the property in double precision and at a half and a quarter
-      of the step, and claim only what still does (`vj.confirm` says more of a row). The others
-      stay in the table, as `unconfirmed`.
+    - `confirm`: replay what violates the property in double precision and, where the system has
+      finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
+      stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 50
+      simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
     - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
       failures that are far from each other (`search.Diverse`).
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
@@ -251,6 +252,8 @@ def resume(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm
     )
 
+    rounds.confirm_seconds, rounds.checked = run.confirm_seconds, run.checked
+
     def prepare() -> None:
         if checkpoint:
             rounds.resume(checkpoint)
@@ -268,7 +271,7 @@ class _Ending(NamedTuple):
     max_seconds: float | None
     stop_after: int | None
     stop_when: StoppingRule | None
-    earlier: float = 0.0  # Seconds that an earlier part of the run has taken.
+    earlier: float = 0.0  # Seconds of simulation that an earlier part of the run has taken.
 
     @property
     def seconds(self) -> float:
@@ -278,7 +281,9 @@ class _Ending(NamedTuple):
         """Return the condition that ends the run after this round, if any does."""
         if self.stop_after is not None and rounds.distinct >= self.stop_after:
             return "stop_after"
-        if self.stop_when is not None and self.stop_when.done(rounds.found, rounds.judged):
+        if self.stop_when is not None and self.stop_when.done(
+            rounds.violating, len(rounds.table), rounds.without_verdict
+        ):
             return "stop_when"
         if len(rounds.table) >= self.budget:
             return "budget"
@@ -302,6 +307,10 @@ def _run_rounds(
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
     chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
+    confirmed_before = rounds.confirm_seconds
+
+    def confirmed() -> float:
+        return rounds.confirm_seconds - confirmed_before
 
     def run(stopped: str) -> Run:
         return Run(
@@ -313,7 +322,9 @@ def _run_rounds(
             batch=rounds.batch,
             stopped=stopped,
             compile_seconds=rounds.compile_seconds,
-            run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds,
+            run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds - confirmed(),
+            confirm_seconds=rounds.confirm_seconds,
+            checked=rounds.checked,
             version=__version__,
             prior=search.samples_prior,
             folder=place,

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -38,8 +38,10 @@ MOST_WARM = 2048
 class Rounds:
     """The rounds of one run; `compile` first, then `advance` as often as wanted.
 
-    `found` counts the counterexamples and `judged` the simulations with a verdict; `best` is the
-    least robustness.
+    `found` counts the counterexamples that are claimed, `violating` the simulations that violate
+    the property, and `without_verdict` those that have none; `best` is the least robustness.
+    `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
+    which they were.
     """
 
     def __init__(
@@ -79,9 +81,10 @@ class Rounds:
             else None
         )
         self.search_key = run_keys(seed)[0]
-        self.found = self.judged = 0
+        self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
-        self.compile_seconds = 0.0
+        self.compile_seconds = self.confirm_seconds = 0.0
+        self.checked = ""
         self.checkpoint: dict[str, Any] = {}
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
@@ -116,7 +119,8 @@ class Rounds:
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engines that a user may not expect."""
         more = () if self._differentiate is None else self._differentiate.notes
-        return (*self.evaluate.notes, *more)
+        raised = () if self._confirmer is None else self._confirmer.raised
+        return (*self.evaluate.notes, *more, *raised)
 
     @property
     def exhausted(self) -> bool:
@@ -155,7 +159,8 @@ class Rounds:
         self._tell(objective, verdicts)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
-        self.judged += int(np.sum(verdicts.proper))
+        self.violating += int(np.sum(verdicts.violated))
+        self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
 
@@ -190,7 +195,12 @@ class Rounds:
             verdict[rows] = "unchecked"
             return verdict, greatest
         own = {name: column[rows] for name, column in columns.items()}
-        checked = confirmer(own, first + rows)
+        started, compiled = time.perf_counter(), confirmer.compile_seconds
+        checked = confirmer(own, first + rows, max(LIMIT, (first + len(verdict)) // SHARE))
+        compiled = confirmer.compile_seconds - compiled
+        self.compile_seconds += compiled
+        self.confirm_seconds += time.perf_counter() - started - compiled
+        self.checked = confirmer.checked or self.checked
         verdict[rows] = checked.verdict
         if checked.rho:
             most = np.nanmax(np.stack([*checked.rho.values(), own["rho"]]), axis=0)
@@ -259,7 +269,8 @@ class Rounds:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
         table = self.table.all
-        self.judged = len(table) - len(self.table.failed)
+        self.without_verdict = len(self.table.failed)
+        self.violating = len(self.table.violating)
         self.found = len(self.table.counterexamples)
         self.best = float(np.fmin.reduce(table["rho"].to_numpy(), initial=np.nan))
         self._keep()

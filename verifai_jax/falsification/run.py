@@ -16,7 +16,6 @@ import numpy as np
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
-from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import read_checkpoint, write_checkpoint
 from verifai_jax.falsification.table import ErrorTable
@@ -46,7 +45,8 @@ class Run:
     - `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`, `"exhausted"` (a finite
       search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
       was cut off.
-    - `compile_seconds`, `run_seconds`: time spent compiling, and in everything else.
+    - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
+      and in everything else.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
     - `folder`: on disk; None for a run in memory.
@@ -59,6 +59,7 @@ class Run:
     - `backend`: the engine that simulated; None for a system that has one only.
     - `notes`: decisions that were made without the user.
     - `confirm`: whether violations were replayed more finely before they were claimed.
+    - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
     """
 
     name: str
@@ -84,6 +85,8 @@ class Run:
     backend: str | None = None
     notes: Sequence[str] = ()
     confirm: bool = False
+    confirm_seconds: float = 0.0
+    checked: str = ""
 
     @property
     def simulations(self) -> int:
@@ -111,19 +114,44 @@ class Run:
     def failure_rate(self) -> Rate | None:
         """Failures per simulation with a 95 % interval.
 
-        Clopper-Pearson where the number of simulations was not decided by their outcomes, else
-        one that holds whenever sampling stops. None unless the rows are independent samples of
-        the feature space and at least one of them has a verdict: an active search may refute, it
-        never certifies. Simulations without a verdict do not count.
+        It is the rate as simulated, whatever closer replays say of single rows. Clopper-Pearson
+        where the number of simulations was not decided by their outcomes, else one that holds
+        whenever sampling stops. A simulation without a verdict is taken for safe at the lower end
+        of the interval and for failing at the upper end. None unless the rows are independent
+        samples of the feature space and at least one of them has a verdict: an active search may
+        refute, it never certifies.
         """
-        # The rate is that of the system as simulated: what is not confirmed counts as a failure.
-        failures = len(self.table.counterexamples) + len(self.table.unconfirmed)
-        safe = len(self.table.safe)
-        if not self.prior or failures + safe == 0:
+        return self._rate(len(self.table.violating), 0)
+
+    @property
+    def confirmed_failure_rate(self) -> Rate | None:
+        """Confirmed failures per simulation with a 95 % interval; as `failure_rate`.
+
+        Refuted rows are taken for safe. Those that closer replays left undecided, or did not reach,
+        are taken for safe at the lower end of the interval and for failing at the upper end. None
+        where no row was decided.
+        """
+        counts = self.verdict_counts
+        if not any(counts.get(verdict) for verdict in ("confirmed", "refuted", "fragile")):
             return None
-        if self.stopped in ("stop_after", "stop_when"):
-            return anytime_interval(failures, failures + safe)
-        return clopper_pearson(failures, failures + safe)
+        confirmed = counts.get("confirmed", 0)
+        return self._rate(confirmed, sum(counts.values()) - confirmed - counts.get("refuted", 0))
+
+    def _rate(self, failures: int, undecided: int) -> Rate | None:
+        without = len(self.table.failed)
+        if not self.prior or self.simulations == without:
+            return None
+        stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
+        interval = anytime_interval if stopped_by_outcomes else clopper_pearson
+        return interval(failures, self.simulations, undecided=undecided + without)
+
+    @property
+    def verdict_counts(self) -> dict[str, int]:
+        """Number of violating rows by the verdict of closer replays; empty without `confirm`."""
+        violating = self.table.violating
+        if "verdict" not in violating:
+            return {}
+        return {str(name): int(n) for name, n in violating["verdict"].value_counts().items()}
 
     @property
     def front(self) -> "pd.DataFrame":
@@ -178,7 +206,7 @@ class Run:
 
     def summary(self) -> str:
         """Write what failed, how often, the worst case and how to see it again."""
-        return _summary(self)
+        return late("verifai_jax.falsification.summary", "summarize")(self)
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
@@ -230,6 +258,8 @@ _ADDED = (
     "backend",
     "notes",
     "confirm",
+    "confirm_seconds",
+    "checked",
 )
 
 
@@ -276,69 +306,3 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         **{name: record[name] for name in _RECORDED},
         **{name: record[name] for name in _ADDED if name in record},
     )
-
-
-def _summary(run: Run) -> str:
-    failures, failed = len(run.table.counterexamples), run.table.failed
-    lines = [f"{run.name}: {failures} of {run.simulations} simulations violate the property"]
-    for name, text in run.formulas.items():
-        lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
-    if verdicts := _verdict_counts(run):
-        lines.append(f"  confirmed    {verdicts}")
-    rate = run.failure_rate
-    if rate is not None:
-        lines.append(f"  failure rate {rate}")
-    elif not run.prior:
-        lines.append(
-            "  failure rate not given: this search goes where failures are; "
-            "use search='uniform' for a rate"
-        )
-    if failures + len(run.table.safe) + len(run.table.unconfirmed):
-        best = run.best
-        where = format_features({name: best[name] for name in run.table.features})
-        lines.append(
-            f"  {'worst' if failures else 'nearest':<13}row {best.name}, "
-            f"robustness {best['rho']:.4g} at {where}"
-        )
-    if len(failed):
-        counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
-        lines.append(f"  no verdict   {counts}")
-        if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
-            number, message = raised.index[0], raised["message"].iloc[0]
-            lines.append(f"               first in row {number}: {message}")
-    if "gradient_finite" in run.table.all:
-        lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
-        if lost:
-            lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
-    lines.extend(f"  note         {note}" for note in run.notes)
-    if run.acceptance is not None:
-        lines.append(
-            f"  constraint   let through {format_percent(run.acceptance)} of all proposals"
-        )
-    speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
-    lines.append(
-        f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to run: "
-        f"{speed:,.0f} simulations/s; stopped by {run.stopped}"
-    )
-    lines.append(f"  search       {run.search}, seed {run.seed}")
-    return "\n".join(lines)
-
-
-def _verdict_counts(run: Run) -> str:
-    """Count the verdicts of closer replays of the rows that violate the property."""
-    table = run.table.all
-    if "verdict" not in table:
-        return ""
-    counts = table.loc[table["violated"], "verdict"].value_counts().to_dict()
-    parts = [
-        f"{counts[verdict]} {words}"
-        for verdict, words in (
-            ("confirmed", "in double precision and at a quarter of the step"),
-            ("unexamined", "so far from zero that no replay was needed"),
-            ("unchecked", "could not be replayed more finely"),
-            ("fragile", "fragile and not claimed: closer replays disagree"),
-            ("refuted", "refuted and not claimed: closer replays hold"),
-        )
-        if verdict in counts
-    ]
-    return "; ".join(parts)

@@ -1,8 +1,9 @@
 """The error table: one row a simulation, written to disk while it grows.
 
     table.all               every simulation: features, rho, violated, status
-    table.counterexamples   rows that ended properly and broke the property, confirmed if asked
-    table.unconfirmed       rows that broke it, and not when looked at closely
+    table.violating         rows that ended properly and broke the property, as simulated
+    table.counterexamples   those among them that a closer look did not refute
+    table.unconfirmed       the others: refuted, or not sure
     table.safe              rows that ended properly and kept it
 
 On disk a growing table is an Arrow stream, to which each batch is appended; a process that dies
@@ -118,12 +119,17 @@ class ErrorTable:
         """Rows that violate the property as simulated, and not surely when looked at closely."""
         return self._violating(claimed=False)
 
-    def _violating(self, claimed: bool) -> "pd.DataFrame":
+    @property
+    def violating(self) -> "pd.DataFrame":
+        """Rows that violate the property as simulated, whatever a closer look said."""
         table = self.all
-        chosen = (table["status"] == "ok") & table["violated"]
-        if "verdict" in table:
-            return table.loc[chosen & (table["verdict"].isin(NOT_CLAIMED) != claimed)]
-        return table.loc[chosen if claimed else chosen & False]
+        return table.loc[(table["status"] == "ok") & table["violated"]]
+
+    def _violating(self, claimed: bool) -> "pd.DataFrame":
+        violating = self.violating
+        if "verdict" in violating:
+            return violating.loc[violating["verdict"].isin(NOT_CLAIMED) != claimed]
+        return violating if claimed else violating.iloc[:0]
 
     @property
     def safe(self) -> "pd.DataFrame":

@@ -9,7 +9,15 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.figure import Axes, Figure
 from verifai_jax.falsification.run import Run
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    NOT_CLAIMED,
+    SAFE,
+    new_figure,
+    show_or_save,
+    tidy,
+)
 
 DOTS = 4000
 """Simulations drawn as dots at most; the lines are exact."""
@@ -64,7 +72,15 @@ def _one(axes: Axes, run: Run) -> None:
     axes.scatter(number[shown], rho[shown], c=colors, s=5, alpha=0.5, linewidths=0)
     axes.plot(number, np.fmin.accumulate(rho), color=BOUND, linewidth=1.6, label="best so far")
     _mark_first(axes, rho, failing)
-    axes.set_title(f"{run.name}: {len(failing):,} of {len(rho):,} simulations violate the property")
+    doubtful = run.table.unconfirmed.index.to_numpy()
+    violating = len(run.table.violating)
+    title = f"{run.name}: {violating:,} of {len(rho):,} simulations violate the property"
+    if len(doubtful):
+        axes.scatter(
+            number[doubtful[:DOTS]], rho[doubtful[:DOTS]], c=NOT_CLAIMED, s=12, marker="^",
+            linewidths=0, label=f"{len(doubtful):,} not claimed",
+        )  # fmt: skip
+    axes.set_title(title)
     axes.legend(frameon=False, loc="upper right")
 
 

@@ -11,6 +11,7 @@ from verifai_jax.core.figure import Figure
 from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.style import (
     FAILING,
+    NOT_CLAIMED,
     SAFE,
     WITHOUT_VERDICT,
     new_figure,
@@ -29,6 +30,9 @@ def plot_features(
     most: int = 4,
 ) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
+
+    Those that fail as simulated, and that closer replays did not confirm, are amber triangles;
+    those without a verdict are grey crosses.
 
     **Arguments:**
 
@@ -57,37 +61,49 @@ def plot_features(
     rows = -(-len(pairs) // columns)
     figure = new_figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    groups = [
+        (f"{len(part):,} {name}", part, color, size, marker)
+        for name, part, color, size, marker in (
+            ("safe", run.table.safe, SAFE, 5, "o"),
+            ("without a verdict", run.table.failed, WITHOUT_VERDICT, 12, "x"),
+            ("not claimed", run.table.unconfirmed, NOT_CLAIMED, 12, "^"),
+            ("failing", run.table.counterexamples, FAILING, 9, "o"),
+        )
+        if len(part)
+    ]
     for axes, (across, up) in zip(panels, pairs, strict=False):
-        for part, color, size in (
-            (run.table.safe, SAFE, 5),
-            (run.table.failed, WITHOUT_VERDICT, 8),
-            (run.table.counterexamples, FAILING, 9),
-        ):
-            shown = (
-                part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))]
-                if len(part)
-                else part
-            )
+        for label, part, color, size, marker in groups:
+            shown = part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))]
             axes.scatter(
                 _positions(table, shown, across),
                 _positions(table, shown, up),
                 c=color,
                 s=size,
+                marker=marker,
                 alpha=0.55,
-                linewidths=0,
+                linewidths=0.8 if marker == "x" else 0,
+                label=label,
             )
         axes.set_xlabel(across)
         axes.set_ylabel("" if across == up else up)
         tidy(axes)
     for axes in panels[len(pairs) :]:
         axes.set_visible(False)
-    failing, safe = len(run.table.counterexamples), len(run.table.safe)
     rate = run.failure_rate
-    source = f"search {run.search.split('(')[0]}" if rate is None else f"failure rate {rate}"
+    by_search = f"search {run.search.split('(')[0]}"
+    source = by_search if rate is None else f"failure rate {rate} as simulated"
+    violating = len(run.table.violating)
     figure.suptitle(
-        f"{run.name}: {failing:,} failing (red) and {safe:,} safe (green) samples\n{source}",
+        f"{run.name}: {violating:,} of {run.simulations:,} simulations violate the property\n"
+        f"{source}",
         fontsize=10,
     )
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=len(handles), fontsize=8,
+            frameon=False, markerscale=2,
+        )  # fmt: skip
     return show_or_save(figure, path)
 
 

@@ -1,4 +1,4 @@
-"""One look for all pictures; the two colours are told apart by colour-blind readers too."""
+"""One look for all pictures; its colours are told apart by colour-blind readers too."""
 
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from verifai_jax.core.figure import Axes, Figure
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
 WITHOUT_VERDICT = "#7f7f7f"
+NOT_CLAIMED = "#e0a030"
 BOUND = "#30323d"
 DPI = 110
 

@@ -22,10 +22,12 @@ class Rate:
     """A failure rate estimated from independent samples of the prior.
 
     - `failures`: samples that failed.
-    - `simulations`: samples in all.
+    - `simulations`: samples in all, those without a verdict included.
     - `low`, `high`: bounds of the true rate.
     - `confidence`: probability with which the bounds hold.
     - `at_any_time`: whether they hold whatever decided when sampling ended.
+    - `undecided`: further samples of which it is open whether they failed; the lower bound takes
+      them for safe and the upper one for failed.
     """
 
     failures: int
@@ -34,6 +36,7 @@ class Rate:
     high: float
     confidence: float
     at_any_time: bool = False
+    undecided: int = 0
 
     @property
     def estimate(self) -> float:
@@ -41,14 +44,18 @@ class Rate:
         return self.failures / self.simulations
 
     def __str__(self) -> str:
+        most = (self.failures + self.undecided) / self.simulations
+        range_ = f" to {format_percent(most)}" if self.undecided else ""
         return (
-            f"{format_percent(self.estimate)} ({format_percent(self.confidence)} interval "
+            f"{format_percent(self.estimate)}{range_} ({format_percent(self.confidence)} interval "
             f"{format_percent(self.low)} to {format_percent(self.high)}"
             f"{', whenever stopped' if self.at_any_time else ''})"
         )
 
 
-def clopper_pearson(failures: int, simulations: int, confidence: float = 0.95) -> Rate:
+def clopper_pearson(
+    failures: int, simulations: int, confidence: float = 0.95, undecided: int = 0
+) -> Rate:
     """Compute the exact two-sided binomial interval.
 
     **Arguments:**
@@ -56,24 +63,25 @@ def clopper_pearson(failures: int, simulations: int, confidence: float = 0.95) -
     - `failures`: samples that failed.
     - `simulations`: samples in all, a number fixed beforehand.
     - `confidence`: probability with which the interval is to hold.
+    - `undecided`: further samples that may have failed: without a verdict, for instance.
 
     **Returns:** the `Rate`.
 
-    **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
-    `0 < confidence < 1`.
+    **Raises:** `ValueError` unless `0 <= failures <= failures + undecided <= simulations`,
+    `simulations >= 1` and `0 < confidence < 1`.
 
     Source: Clopper and Pearson, The use of confidence or fiducial limits illustrated in the case
     of the binomial, Biometrika 26 (1934).
     """
-    check_counts(failures, simulations)
+    check_counts(failures, simulations, undecided)
     check_fraction("confidence", confidence)
     from scipy.special import betaincinv
 
     tail = (1 - confidence) / 2
-    k, n = failures, simulations
+    k, most, n = failures, failures + undecided, simulations
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
-    return Rate(k, n, low, high, confidence)
+    high = 1.0 if most == n else float(betaincinv(most + 1, n - most, 1 - tail))
+    return Rate(k, n, low, high, confidence, undecided=undecided)
 
 
 def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
@@ -137,11 +145,17 @@ def simulations_until(
     return high
 
 
-def check_counts(failures: int, simulations: int) -> None:
+def check_counts(failures: int, simulations: int, undecided: int = 0) -> None:
     """Check the counts of a rate.
 
-    **Raises:** `ValueError` unless `0 <= failures <= simulations` and `simulations >= 1`.
+    **Raises:** `ValueError` unless `0 <= failures <= simulations` and `simulations >= 1`, also
+    with those that are undecided counted as failures.
     """
+    if undecided and not 0 <= undecided <= simulations - failures:
+        raise ValueError(
+            "a rate needs undecided >= 0 and failures + undecided <= simulations; "
+            f"got (failures={failures}, undecided={undecided}, simulations={simulations})"
+        )
     if simulations < 1 or not 0 <= failures <= simulations:
         raise ValueError(
             "a rate needs 0 <= failures <= simulations and at least one simulation; "

@@ -46,7 +46,9 @@ Counts = Real[np.ndarray, "*#n"] | float
 """Numbers of samples, one or many; fractions where they are expectations."""
 
 
-def anytime_interval(failures: int, simulations: int, confidence: float = 0.95) -> Rate:
+def anytime_interval(
+    failures: int, simulations: int, confidence: float = 0.95, undecided: int = 0
+) -> Rate:
     """Compute an interval that holds at all times, for samples stopped by their own outcomes.
 
     The rates at which a mixture of binomial likelihoods over a Beta(1/2, 1/2) prior has not grown
@@ -60,23 +62,23 @@ def anytime_interval(failures: int, simulations: int, confidence: float = 0.95) 
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
     `0 < confidence < 1`.
     """
-    check_counts(failures, simulations)
+    check_counts(failures, simulations, undecided)
     check_fraction("confidence", confidence)
-    k, n = failures, simulations
-    mixture = (
-        math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1) - math.log(math.pi)
-    )
-    limit = mixture + math.log(1 - confidence)
+    n = simulations
 
-    low, high = (
-        _border(
+    def border(k: int, end: float) -> float:
+        mixture = (
+            math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1) - math.log(math.pi)
+        )
+        limit = mixture + math.log(1 - confidence)
+        return _border(
             k / n,
             end,
             lambda rate: _log_power(rate, k) + _log_power(1 - rate, n - k) >= limit,
         )
-        for end in (0.0, 1.0)
-    )
-    return Rate(k, n, low, high, confidence, at_any_time=True)
+
+    low, high = border(failures, 0.0), border(failures + undecided, 1.0)
+    return Rate(failures, n, low, high, confidence, at_any_time=True, undecided=undecided)
 
 
 def simultaneous_interval(

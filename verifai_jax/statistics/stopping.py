@@ -18,13 +18,14 @@ from verifai_jax.statistics.confidence_sequences import anytime_interval
 class StoppingRule(Protocol):
     """A rule that ends a run of prior samples; `falsify(..., stop_when=rule)`."""
 
-    def done(self, failures: int, simulations: int) -> bool:
+    def done(self, failures: int, simulations: int, without_verdict: int) -> bool:
         """Return whether to stop; called after every batch.
 
         **Arguments:**
 
-        - `failures`: samples that failed so far.
-        - `simulations`: samples with a verdict so far.
+        - `failures`: samples that failed so far, as simulated.
+        - `simulations`: samples so far.
+        - `without_verdict`: those among them that have no verdict.
         """
         ...
 
@@ -47,11 +48,11 @@ class Within:
             raise ValueError(f"half_width must lie between 0 and 0.5; got {self.half_width}")
         check_fraction("confidence", self.confidence)
 
-    def done(self, failures: int, simulations: int) -> bool:
+    def done(self, failures: int, simulations: int, without_verdict: int = 0) -> bool:
         """Return whether the interval is short enough."""
         if simulations < 1:
             return False
-        rate = anytime_interval(failures, simulations, self.confidence)
+        rate = anytime_interval(failures, simulations, self.confidence, without_verdict)
         return rate.high - rate.low <= 2 * self.half_width
 
 
@@ -72,9 +73,9 @@ class Decided:
         check_fraction("rate", self.rate)
         check_fraction("confidence", self.confidence)
 
-    def done(self, failures: int, simulations: int) -> bool:
+    def done(self, failures: int, simulations: int, without_verdict: int = 0) -> bool:
         """Return whether the interval excludes `rate`."""
         if simulations < 1:
             return False
-        interval = anytime_interval(failures, simulations, self.confidence)
+        interval = anytime_interval(failures, simulations, self.confidence, without_verdict)
         return not interval.low <= self.rate <= interval.high

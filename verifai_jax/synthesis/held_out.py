@@ -29,9 +29,10 @@ class HeldOut:
     - `simulations` made.
     - `failures`: simulations that broke a formula.
     - `short`: simulations that kept it, but by less than the wanted margin.
-    - `without_verdict`: simulations that did not end properly; they are in no rate.
+    - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
+      takes them for failures.
     - `least` robustness, None without a verdict.
-    - `rate`: of failures among the simulations with a verdict, with its 95 % interval.
+    - `rate`: of failures, with its 95 % interval; None without any verdict.
     """
 
     simulations: int
@@ -51,7 +52,8 @@ class HeldOut:
         """A number that the failure probability is below, with 95 % confidence."""
         if self.rate is None:
             return None
-        return clopper_pearson(self.rate.failures, self.rate.simulations, 0.9).high
+        rate = self.rate
+        return clopper_pearson(rate.failures, rate.simulations, 0.9, rate.undecided).high
 
     def describe(self, what: str = "environments") -> str:
         """Describe the verdicts: `0 of 2000 held-out environments fail: ...`."""
@@ -59,8 +61,7 @@ class HeldOut:
             return f"no time was left for held-out {what}"
         if self.rate is None:
             return f"none of {self.simulations} held-out {what} gave a verdict"
-        verdicts = self.rate.simulations
-        text = f"{self.failures} of {verdicts} held-out {what} fail"
+        text = f"{self.failures} of {self.simulations} held-out {what} fail"
         if self.failures:
             text += f": failure probability {self.rate}"
         else:
@@ -68,7 +69,7 @@ class HeldOut:
         if self.short:
             text += f"; {self.short} more keep less than the margin"
         if self.without_verdict:
-            text += f"; {self.without_verdict} more gave no verdict and are in no rate"
+            text += f"; {self.without_verdict} gave no verdict and may have failed"
         return text
 
 
@@ -112,7 +113,9 @@ def held_out(
         short=int(short.sum()),
         without_verdict=len(rho) - verdicts,
         least=float(np.min(rho[proper])) if verdicts else None,
-        rate=clopper_pearson(failures, verdicts) if verdicts else None,
+        rate=clopper_pearson(failures, len(rho), undecided=len(rho) - verdicts)
+        if verdicts
+        else None,
     )
 
 

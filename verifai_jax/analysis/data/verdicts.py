@@ -1,14 +1,20 @@
-"""Verdicts of the rows of a table: violated, safe, or none."""
+"""Verdicts of the rows of a table: a counterexample, safe, not claimed, or none."""
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
+from verifai_jax.falsification.table import NOT_CLAIMED
+
 
 def verdicts(
     table: pd.DataFrame,
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return the rows that violate the property, and those that keep it."""
+    """Return the counterexamples and the rows that keep the property.
+
+    A row that violates it, and whose column `verdict` says that closer replays did not confirm it,
+    is neither.
+    """
     ended = np.ones(len(table), bool)
     if "status" in table:
         ended = np.asarray(table["status"] == "ok", bool)
@@ -20,7 +26,14 @@ def verdicts(
         violated = rho < 0
     else:
         violated = np.ones(len(table), bool)
-    return ended & violated, ended & ~violated
+    return ended & violated & ~unconfirmed(table), ended & ~violated
+
+
+def unconfirmed(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    """Return the rows that violate the property and are not claimed to."""
+    if "verdict" not in table:
+        return np.zeros(len(table), bool)
+    return np.asarray(table["verdict"].isin(NOT_CLAIMED), bool)
 
 
 def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
@@ -30,7 +43,9 @@ def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
         return violating
     if which == "safe":
         return safe
-    return violating | safe if which == "all" else ~(violating | safe)
+    if which == "all":
+        return violating | safe
+    return ~(violating | safe | unconfirmed(table))
 
 
 def explain_empty(table: pd.DataFrame, which: str) -> str:
@@ -38,9 +53,12 @@ def explain_empty(table: pd.DataFrame, which: str) -> str:
     if not len(table):
         return "the table is empty: there are no simulations to analyse"
     violating, safe = (int(part.sum()) for part in verdicts(table))
+    doubtful = int(unconfirmed(table).sum())
+    more = f"{doubtful:,} not claimed, " if doubtful else ""
     what = {"safe": "safe rows", "failed": "rows without a verdict", "all": "rows with a verdict"}
     return (
         f"no {what.get(which, which)} among {len(table):,} simulations ({violating:,} "
-        f"counterexamples, {safe:,} safe, {len(table) - violating - safe:,} without a verdict); "
+        f"counterexamples, {safe:,} safe, {more}{len(table) - violating - safe - doubtful:,} "
+        "without a verdict); "
         "which=... looks at other rows"
     )

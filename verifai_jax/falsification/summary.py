@@ -1,0 +1,124 @@
+"""The summary of a run: how many simulations fail, how many of them surely, how often, the worst.
+
+balance: 604 of 20000 simulations violate the property
+property     always[0,4] (abs(x) <= 2.4 & abs(theta) <= 0.20944)
+of these     334 confirmed in double precision, 102 refuted and not claimed, 168 undecided (...)
+failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
+"""
+
+import numpy as np
+
+from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.evaluation.confirmation import UNDECIDED
+from verifai_jax.falsification.run import Run
+
+
+def summarize(run: Run) -> str:
+    """Write the summary of a run, every number of it from its table."""
+    violating, failed = len(run.table.violating), run.table.failed
+    lines = [f"{run.name}: {_headline(run, violating)}"]
+    for name, text in run.formulas.items():
+        lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
+        if len(run.formulas) > 1 and violating:
+            lines[-1] += f" (fails in {_failing_alone(run, name):,})"
+    if violating and (verdicts := _closer_look(run)):
+        lines.append(f"  of these     {verdicts}")
+    lines += _rates(run)
+    if len(failed) < run.simulations:
+        best = run.best.to_dict()
+        where = format_features({name: best[name] for name in run.table.features})
+        verdict = best.get("verdict", "")
+        lines.append(
+            f"  {'worst' if best['violated'] else 'nearest':<13}row {run.best.name}"
+            f"{f' ({verdict})' if verdict else ''}, robustness {best['rho']:.4g} at {where}"
+        )
+    if len(failed):
+        counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
+        lines.append(f"  no verdict   {counts}")
+        if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
+            number, message = raised.index[0], raised["message"].iloc[0]
+            lines.append(f"               first in row {number}: {message}")
+    if "gradient_finite" in run.table.all:
+        lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
+        if lost:
+            lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
+    lines.extend(f"  note         {note}" for note in run.notes)
+    if run.acceptance is not None:
+        lines.append(
+            f"  constraint   let through {format_percent(run.acceptance)} of all proposals"
+        )
+    speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
+    confirming = f", {run.confirm_seconds:.2f} s to confirm" if run.checked else ""
+    lines.append(
+        f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to "
+        f"simulate ({speed:,.0f} simulations/s){confirming}; stopped by {run.stopped}"
+    )
+    lines.append(f"  search       {run.search}, seed {run.seed}")
+    return "\n".join(lines)
+
+
+def _headline(run: Run, violating: int) -> str:
+    """Write how many simulations violate the property, and whatever makes that number doubtful."""
+    without = len(run.table.failed)
+    if run.simulations and without == run.simulations:
+        return f"no verdict: none of {run.simulations} simulations ended properly"
+    text = f"{violating} of {run.simulations} simulations violate the property"
+    if without:
+        text += f"; {without} have no verdict"
+    counts = run.verdict_counts
+    if counts.get("raised") and counts["raised"] == violating - counts.get("unexamined", 0):
+        text += "; every replay to confirm them raised"
+    return text
+
+
+def _closer_look(run: Run) -> str:
+    """Count the violating rows by what closer replays say of them."""
+    counts = run.verdict_counts
+    if not counts:
+        return ""
+    parts = []
+    if counts.get("confirmed"):
+        parts.append(f"{counts['confirmed']} confirmed {run.checked}".rstrip())
+    if counts.get("refuted"):
+        parts.append(f"{counts['refuted']} refuted and not claimed: they hold in finer replays")
+    undecided = {name: counts[name] for name in UNDECIDED if counts.get(name)}
+    if undecided:
+        why = "; ".join(
+            f"{count} {name}: {_UNDECIDED_IN_WORDS[name]}" for name, count in undecided.items()
+        )
+        parts.append(f"{sum(undecided.values())} undecided ({why})")
+    return ", ".join(parts)
+
+
+_UNDECIDED_IN_WORDS = {
+    "fragile": "not claimed, as closer replays disagree",
+    "raised": "a replay raised",
+    "unchecked": "there is nothing finer to check with",
+    "unexamined": "not replayed",
+}
+
+
+def _failing_alone(run: Run, name: str) -> int:
+    """Count the rows that violate one of several formulas."""
+    violating = run.table.violating
+    rho = violating[[f"rho.{each}" for each in run.formulas]].to_numpy(np.float64)
+    own = violating[f"rho.{name}"].to_numpy(np.float64)
+    # At exactly zero the row does not say which formula is strict, unless there is only one.
+    alone = (own == 0) & (np.sum(rho <= 0, axis=1) == 1)
+    return int(np.sum((own < 0) | alone))
+
+
+def _rates(run: Run) -> list[str]:
+    """Write the failure rate as simulated, and that of confirmed failures where it differs."""
+    if not run.prior:
+        return [
+            "  failure rate not given: this search goes where failures are; "
+            "use search='uniform' for a rate"
+        ]
+    if run.failure_rate is None:
+        return []
+    lines = [f"  failure rate {run.failure_rate} as simulated"]
+    confirmed = run.confirmed_failure_rate
+    if confirmed is not None and confirmed.failures < len(run.table.violating):
+        lines.append(f"               {confirmed} confirmed")
+    return lines
