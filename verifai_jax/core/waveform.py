@@ -77,9 +77,7 @@ class Waveform:
         if count == 1:
             return knots[0]
         if self.hold == "constant":
-            # An instant at which a piece begins belongs to it, whatever its rounding.
-            piece = xp.floor(place * count + 1e-5).astype(np.int32)
-            return knots[xp.clip(piece, 0, count - 1)]
+            return knots[_piece(place, count, _slack(knots), xp)]
         place = xp.clip(place, 0.0, 1.0) * (count - 1)
         left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
         share = (place - left).astype(knots.dtype)
@@ -113,6 +111,49 @@ class Waveform:
         between = _between(knots[:-1, None], knots[1:, None], share.astype(knots.dtype), jnp)
         inner = between.reshape(-1, *knots.shape[1:])
         return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class WaveformWithinStep(Waveform):
+    """A waveform that is held, as an integrator reads it at `now` in a step that began at `begin`.
+
+    At any time of the step it has the value of its beginning. A method of high order evaluates the
+    end of a step too, where the next piece may begin, and would lose its order there.
+    """
+
+    __no_type_check__ = True
+
+    begin: Any = 0.0
+    now: Any = 0.0
+
+    def __call__(
+        self, time: Real[Array | np.ndarray, "*times"] | np.number | float
+    ) -> Float[Array | np.ndarray, "*shape"] | np.floating:
+        constant = isinstance(self.now, Tracer) and not isinstance(time, Tracer)
+        if self.duration is None or constant or not isinstance(time, jax.Array):
+            return super().__call__(time)
+        knots = jnp.asarray(self.knots)
+        inside = (time >= self.begin) & (time <= self.now)
+        place = jnp.where(inside, self.begin, time).astype(knots.dtype) / self.duration
+        # Another time (a delay) moves with the stages as well: behind the beginning of the step, a
+        # piece that begins just there belongs to the next step.
+        before = (self.now > self.begin) & ~inside
+        slack = jnp.where(before, -_slack(knots), _slack(knots))
+        return knots[_piece(place, knots.shape[0], slack, jnp)]
+
+
+def _slack(knots: Any) -> float:
+    """Return the part of a piece up to which an instant counts as that at which one begins."""
+    # A time in seconds, its division and its product have each been rounded.
+    return max(1e-5, 4 * float(jnp.finfo(knots.dtype).eps) * knots.shape[0])
+
+
+def _piece(place: Any, count: int, slack: Any, xp: Any) -> Any:
+    """Return the index of the piece at a place from 0 to 1."""
+    # An instant at which a piece begins belongs to it, whatever its rounding.
+    piece = xp.floor(place * count + slack).astype(np.int32)
+    return xp.clip(piece, 0, count - 1)
 
 
 IS_CALLED = (
@@ -166,6 +207,20 @@ def set_durations(features: Features, duration: float) -> Features:
         return leaf.over(duration) if is_waveform(leaf) and leaf.duration is None else leaf
 
     return jax.tree.map(bind, features, is_leaf=is_waveform)
+
+
+def within_step(features: Features, begin: Any, now: Any) -> Features:
+    """Return the features for an integrator at `now`, in a step that began at `begin` seconds.
+
+    Waveforms that are held keep their value during the step.
+    """
+
+    def hold(leaf: object) -> object:
+        if not is_waveform(leaf) or leaf.hold != "constant" or np.shape(leaf.knots)[:1] == (1,):
+            return leaf
+        return WaveformWithinStep(leaf.knots, leaf.hold, leaf.duration, begin, now)
+
+    return features if now is begin else jax.tree.map(hold, features, is_leaf=is_waveform)
 
 
 def is_waveform(value: object) -> TypeGuard[Waveform]:

@@ -5,6 +5,7 @@ import pytest
 
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.core.trace import Status
+from verifai_jax.core.waveform import Waveform
 from verifai_jax.systems.ode import ode
 
 KEY = jax.random.key(0)
@@ -35,6 +36,76 @@ def test_error_shrinks_with_the_order_of_the_method(method, order):
             x = system({"x0": 1.5, "w": 2.0}, KEY)["x"]
             errors.append(abs(float(x[-1]) - 1.5 * np.cos(2.0)))
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
+
+
+def held_exactly(knots, x, delay=0.0, until=1.0):
+    """The end of dx/dt = u - x under a held u, piece by piece."""
+    length, time = 1.0 / len(knots), 0.0
+    while time < until - 1e-9:
+        u = knots[max(int((time - delay) / length + 1e-6), 0)]
+        x, time = u + (x - u) * np.exp(-length), time + length
+    return x
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+@pytest.mark.parametrize("delay", [0.0, 0.25])
+def test_a_held_input_keeps_the_order_of_the_method(substeps, delay):
+    # A last stage that reads the next piece's value leaves an error of order 1.
+    knots = [0.5, 0.55, -1.0, 2.0]
+    with jax.enable_x64():
+        features = {"u": Waveform(jnp.asarray(knots), "constant", 1.0)}
+        errors = []
+        for steps in (8, 16):
+            system = ode(
+                lambda t, s, u, f: {"x": f["u"](t - delay) - s["x"]},
+                lambda f, key: {"x": 0.3},
+                dt=1 / steps,
+                duration=1.0,
+            )
+            x = system.refined(substeps)(features, KEY)["x"]
+            errors.append(abs(float(x[-1]) - held_exactly(knots, 0.3, delay)))
+        assert np.log2(errors[0] / errors[1]) == pytest.approx(4, abs=0.2)
+
+
+def test_a_held_input_stays_within_a_step():
+    def level(dynamics, **options):
+        system = ode(dynamics, lambda f, k: {"x": 0.0}, **options)
+        return np.asarray(system({"u": Waveform(jnp.asarray([0.5, 1.0]), "constant")}, KEY)["x"])
+
+    # Whether a piece begins at the end of a step or in the middle of one.
+    reads = lambda t, s, u, f: {"x": f["u"](t)}  # noqa: E731
+    np.testing.assert_allclose(level(reads, dt=0.5, steps=2), [0, 0.25, 0.75])
+    np.testing.assert_allclose(level(reads, dt=1 / 3, steps=3), [0, 1 / 6, 1 / 3, 2 / 3], rtol=1e-6)
+    # A fixed time is read as it is, in every stage.
+    fixed = lambda t, s, u, f: {"x": f["u"](0.5) + 0 * t}  # noqa: E731
+    np.testing.assert_allclose(level(fixed, dt=0.5, steps=2), [0, 0.5, 1.0])
+
+
+@pytest.mark.parametrize("steps", [(8, 16), (6, 12)])
+def test_a_linear_input_converges(steps):
+    # The kinks at 0.25, 0.5 and 0.75 are at steps, or within them.
+    knots = np.array([0.5, 0.55, -1.0, 2.0, 0.0])
+
+    def system(count):
+        wave = Waveform(jnp.asarray(knots), "linear", 1.0)
+        loop = ode(lambda t, s, u, f: {"x": wave(t) - s["x"]}, start_x, dt=1 / count, steps=count)
+        return float(loop({}, KEY)["x"][-1])
+
+    def start_x(features, key):
+        return {"x": jnp.asarray(0.3)}
+
+    with jax.enable_x64():
+        exact = system(4096)
+        errors = [abs(system(count) - exact) for count in steps]
+    order = np.log2(errors[0] / errors[1])
+    assert order == pytest.approx(4, abs=0.2) if steps[0] % 4 == 0 else order > 1
+
+
+def test_a_piece_begins_on_time_among_very_many():
+    knots = jnp.arange(3000.0)
+    wave = Waveform(knots, "constant", 300.0)
+    begins = jnp.arange(3000, dtype=jnp.float32) * 0.1
+    np.testing.assert_array_equal(jax.vmap(wave)(begins), knots)
 
 
 def test_semi_implicit_euler_is_the_hand_computed_step_and_keeps_the_energy():

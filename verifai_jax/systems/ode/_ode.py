@@ -21,11 +21,11 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import defined_at
-from verifai_jax.core.waveform import set_durations
+from verifai_jax.core.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
-from verifai_jax.systems.ode.integrators import Time, check_factor, integrator
+from verifai_jax.systems.ode.integrators import Derivative, Time, check_factor, integrator
 from verifai_jax.systems.pytree_checks import (
     as_floating,
     check_like,
@@ -229,15 +229,20 @@ class _Rollout:
         count = self.loop.substeps
         advance = integrator(self.loop.method)
 
-        def derivative(time: Time, state: PyTree) -> Any:
-            return self.loop.dynamics(time, state, control, self.features)
+        def derivative_from(begin: Time) -> Derivative:
+            def derivative(now: Time, state: PyTree) -> Any:
+                features = within_step(self.features, begin, now)
+                return self.loop.dynamics(now, state, control, features)
+
+            return derivative
 
         if isinstance(count, int) and count == 1:
-            return advance(derivative, time, state, self.loop.dt)
+            return advance(derivative_from(time), time, state, self.loop.dt)
         dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
 
         def substep(j: Int[Array, ""], state: PyTree) -> Any:
-            return advance(derivative, time + j.astype(dt.dtype) * dt, state, dt)
+            begin = time + j.astype(dt.dtype) * dt
+            return advance(derivative_from(begin), begin, state, dt)
 
         return jax.lax.fori_loop(0, count, substep, state)
 
@@ -331,7 +336,8 @@ def ode(
     **Arguments:**
 
     - `dynamics(time, state, control, features) -> derivative`: d state / d time, in the form of the
-      state; `time` in seconds; `control` is None without a controller.
+      state; `time` in seconds; `control` is None without a controller. A `Signal` that is held
+      keeps its value within a step; a piece that begins within one begins with the next.
     - `initial(features, key) -> state`: any pytree of real numbers, all made one float dtype.
     - `controller(time, state, features) -> control`: any pytree.
     - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
