@@ -5,11 +5,13 @@
 Both sides simulate the same 200 steps of CartPole-v1's dynamics under the same linear controller
 over four features and take the least of the two two-sided bounds; their robustness values are
 compared first. NumPy runs at its best batch size, in float64 (its default) and in float32 (what
-the engine computes in). Rounds alternate between the sides; the ratio is the median of the ratios
+the engine computes in). `falsify(uniform)` is the call of a user with all defaults, confirmation
+included. Rounds alternate between the sides; the ratio is the median of the ratios
 of neighbouring rounds, which a noisy machine disturbs least. Compilation is excluded.
 """
 
 import argparse
+import importlib
 import statistics
 import time
 
@@ -108,10 +110,15 @@ def main():
             engine.evaluate(u[first : first + options.batch], key, first)
         return time.perf_counter() - started
 
-    def loop_round():
-        return vj.falsify(problem, "uniform", n, batch=options.batch, progress=False).run_seconds
+    def loop_round(**settings):
+        run = vj.falsify(problem, "uniform", n, progress=False, **settings)
+        return run.run_seconds + run.confirm_seconds
 
-    sides = {"engine": engine_round, "falsify(uniform)": loop_round}
+    sides = {
+        "engine": engine_round,
+        "falsify(uniform)": loop_round,
+        "without confirm": lambda: loop_round(confirm=False),
+    }
     batches = {}
     for dtype in (np.float64, np.float32):
         batches[dtype] = batch = best_numpy_batch(u, dtype)
@@ -132,10 +139,10 @@ def main():
     )
     for name, values in seconds.items():
         extra = "".join(f"  batch {b}" for d, b in batches.items() if name.endswith(d.__name__))
-        if name in ("engine", "falsify(uniform)"):
+        if name == "engine":
             extra = f"  batch {options.batch}"
         print(f"  {name:<18}{n / statistics.median(values):>12,.0f} simulations/s{extra}")
-    for side in ("engine", "falsify(uniform)"):
+    for side in ("engine", "falsify(uniform)", "without confirm"):
         for dtype in ("float64", "float32"):
             ratios = [b / a for a, b in zip(seconds[side], seconds[f"numpy {dtype}"], strict=True)]
             print(
@@ -146,6 +153,26 @@ def main():
         f"  engine / VerifAI's 10 simulations/s: "
         f"{n / statistics.median(seconds['engine']) / 10:,.0f}x"
     )
+    shares()
+
+
+def shares():
+    """Print how long the phases of a run take, with all defaults, on four problems."""
+    print("uniform, 20 000 simulations, second run of the process:")
+    for module, name in (
+        ("specs.cartpole", "balance"),
+        ("specs.lane_keeping", "ice"),
+        ("specs.arch.automatic_transmission", "at1"),
+        ("specs.arch.neural_network_controller", "nn"),
+    ):
+        problem = getattr(importlib.import_module(module), name)
+        vj.falsify(problem, "uniform", 20_000, progress=False)
+        run = vj.falsify(problem, "uniform", 20_000, seed=1, progress=False)
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in run.verdict_counts.items())
+        print(
+            f"  {name:<10}simulate {run.run_seconds:.2f} s, confirm {run.confirm_seconds:.2f} s: "
+            f"{len(run.table.violating)} violate{f' ({counts})' if counts else ''}"
+        )
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax.evaluation import engine as engine_module
 from verifai_jax.falsification._falsify import RunError
+from verifai_jax.falsification.validation import usual_batch
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)}
 T = 8
@@ -46,6 +47,9 @@ def test_rows_are_what_was_simulated(problem):
 
 def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     assert vj.falsify(problem, "uniform", 3000).batch == 1024
+    # A search that does not learn, and that nothing but the budget ends, has few rounds.
+    batches = [usual_batch(vj.search.Uniform(), n, whole=True) for n in (10_000, 131_072, 10**7)]
+    assert batches == [1024, 16_384, 32_768]
     assert vj.falsify(problem, "cross_entropy", 1000).batch == 32
     assert vj.falsify(problem, "cross_entropy", 5).batch == 5
     assert vj.search.Bayes().most_at_once == 16

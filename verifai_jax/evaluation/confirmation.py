@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
@@ -54,12 +54,12 @@ MOST = 256
 """Rows that are examined in any case; each costs as much as 15 simulations of the run."""
 LIMIT = 1024
 """Rows that a falsification examines at most, ..."""
-SHARE = 50
+SHARE = 128
 """... or one for so many simulations, where that is more."""
 SAFE = 10.0
 """Further rows stay unexamined if they are so many times farther from zero than replays have moved
 any row."""
-BLOCK = 64
+BLOCK = 512
 """Rows examined between two looks at whether the rest may stay unexamined."""
 IN_WORDS = {
     "float64": "in float64",
@@ -201,7 +201,7 @@ class Confirmer:
                 free = len(order)
             elif free <= 0 and self.far(float(np.min(np.abs(run[order])))):
                 break
-            size = max(free, BLOCK)
+            size = free if free > 0 else BLOCK
             if limit is not None:
                 size = min(size, limit - self.examined)
                 if size <= 0:
@@ -435,6 +435,7 @@ def _decide(
         ["raised", "confirmed", "refuted", "unchecked"],
         "fragile",
     )
+    proper = {name: r.proper for name, r in found.items()}
     why = [""] * count
     for i in np.flatnonzero(verdict != "confirmed").tolist():
         if verdict[i] == "unchecked":
@@ -442,7 +443,7 @@ def _decide(
         elif verdict[i] == "raised" and plan.raised:
             why[i] = plan.raised
         else:
-            why[i] = _reason(i, found, float(rho[finest][i]), float(band[i]))
+            why[i] = _reason(i, found, proper, float(rho[finest][i]), float(band[i]))
     return _Decision(verdict.astype(object), band, why, found)
 
 
@@ -459,8 +460,14 @@ def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.n
         return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)
 
 
-def _reason(i: int, found: dict[str, Verdicts], rho: float, band: float) -> str:
-    lost = [name for name, replayed in found.items() if not replayed.proper[i]]
+def _reason(
+    i: int,
+    found: dict[str, Verdicts],
+    proper: dict[str, Bool[np.ndarray, " n"]],
+    rho: float,
+    band: float,
+) -> str:
+    lost = [name for name in found if not proper[name][i]]
     if lost:
         raised = [name for name in lost if found[name].status[i] in RAISED]
         if raised:

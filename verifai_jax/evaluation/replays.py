@@ -11,7 +11,7 @@ by JAX, and one program replays at every step.
 """
 
 from collections.abc import Iterable
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -33,8 +33,8 @@ from verifai_jax.systems.base import System
 
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
-LANES = 64
-"""Rows that a device replays together, where there are more."""
+LANES = (64, 256)
+"""Rows that a device replays together, where there are more: the second number for very many."""
 
 
 class Refiner:
@@ -85,6 +85,8 @@ class Replays:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
         self.compile_seconds = 0.0
+        self._make_keys = jax.jit(jax.vmap(partial(simulation_key, key)))
+        self._any_keys = cache(lambda count: jnp.repeat(key[None], count))
         self._form = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), features
         )
@@ -107,7 +109,7 @@ class Replays:
         - `numbers`: of the rows, which their random keys come from.
         """
         count = len(numbers)
-        together = 1 if count <= ONE_BY_ONE else LANES * len(jax.local_devices())
+        together = self._together(count)
         engine, parts = self._engine(factor, together), []
         compiled = engine.compile_seconds
         for start in range(0, count, together):
@@ -121,12 +123,21 @@ class Replays:
         self.compile_seconds += engine.compile_seconds - compiled
         return Verdicts.concatenate([part._replace(features=None) for part in parts])
 
+    @staticmethod
+    def _together(count: int) -> int:
+        """Return how many of so many rows are replayed in one call."""
+        if count <= ONE_BY_ONE:
+            return 1
+        some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
+        return many if count > 2 * some else some
+
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
-        if together == 1 and not self.draws:
-            return self.key[None]  # Any key will do.
+        if not self.draws:
+            # Any keys will do.
+            return self.key[None] if together == 1 else self._any_keys(together)
         # Always as many, so that one program makes the keys.
         many = numbers[np.minimum(np.arange(together), len(numbers) - 1)]
-        return jax.vmap(partial(simulation_key, self.key))(jnp.asarray(many, jnp.int32))
+        return self._make_keys(jnp.asarray(many, jnp.int32))
 
     def _engine(self, factor: int, together: int) -> Engine:
         traced = self.refiner.traced

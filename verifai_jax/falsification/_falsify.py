@@ -81,7 +81,8 @@ def falsify(
     - `budget`: simulations at most; the last batch is cut to fit.
     - `batch`: simulations a round. Active searches learn once a round: a small batch spends
       fewer simulations, a large one less time. By default 1024, and for a search that learns at
-      most a twentieth of the budget, so that it can (16 for `bayes`).
+      most a twentieth of the budget, so that it can (16 for `bayes`); for one that does not, and
+      that only the budget ends, an eighth of a budget over 8192.
     - `seed`: the same seed gives the same table, bit for bit, on the same machine.
     - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
     - `stop_after`: stop after the round in which that many counterexamples are reached.
@@ -95,7 +96,7 @@ def falsify(
       can use when left out, as measured here. Name it for the same table on every machine.
     - `confirm`: replay what violates the property in double precision and, where the system has
       finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
-      stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 50
+      stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
       simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
     - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
       failures that are far from each other (`search.Diverse`).
@@ -118,7 +119,9 @@ def falsify(
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
     # Far from what is found already takes rounds, more than many at once.
-    usual = min(16, budget) if diverse else usual_batch(search, budget, stop_after)
+    whole = stop_after is None and stop_when is None and max_seconds is None
+    usual = usual_batch(search, budget, stop_after, whole and not problem.black_box)
+    usual = min(16, budget) if diverse else usual
     batch = min(usual if batch is None else batch, budget)
     choice = resolved(
         problem, gradient=needs_gradient(search), batch=batch, budget=budget, precision=precision,

@@ -35,15 +35,30 @@ def writing(place: Path | None) -> Iterator[None]:
         ) from error
 
 
-def usual_batch(search: Search, budget: int, stop_after: int | None = None) -> int:
+MOST_AT_ONCE = 32_768
+"""Simulations of a round at most, by default; more are no faster."""
+
+
+def usual_batch(
+    search: Search, budget: int, stop_after: int | None = None, whole: bool = False
+) -> int:
     """Return the default batch: twenty rounds or more for a search that learns.
 
     A power of two, so that shapes are few.
 
     One that stops at few counterexamples gets small batches: it is likely to end in its first.
+
+    **Arguments:**
+
+    - `search`: that of the run.
+    - `budget`: simulations of the run.
+    - `stop_after`: counterexamples at which it ends, if it does.
+    - `whole`: whether the budget alone ends the run; a search that does not learn then has eight
+      rounds, where these are not too large.
     """
     if not search.learns:
-        return search.most_at_once
+        eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
+        return max(search.most_at_once, min(MOST_AT_ONCE, eighth) if whole else 0)
     most = search.most_at_once if stop_after is None else min(search.most_at_once, 16 * stop_after)
     return min(1 << (most.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
 
