@@ -324,6 +324,10 @@ def cartpole(
     - `terminate`: end where CartPole-v1 would; otherwise the pole may fall and the cart run on.
     - `method`, `dt`: CartPole-v1 has explicit Euler with 0.02 s. The controller runs every 0.02 s
       at any step, which must divide it.
+
+    CartPole-v1 is this difference equation and no continuous cart, so with its own method and step
+    these belong to the system (`exact_step`), and no finer step is another look at the same one.
+    With others the result approximates the continuous plant, as `envs.mujoco_cartpole` does.
     """
     return ode(
         dynamics,
@@ -335,4 +339,5 @@ def cartpole(
         method=method,
         signals=lambda time, state, force, features: {**state._asdict(), "force": force},
         terminate=terminated if terminate else None,
+        exact_step=method == "euler" and dt == DT,
     )

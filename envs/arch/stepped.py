@@ -39,7 +39,7 @@ class Stepped(System):
     - `dt`: the sampling period in seconds.
     - `nominal`: the features that the model has, with their values where they are not given.
     - `finer(factor) -> Stepped`: the same model with so many times as many integration steps; None
-      where there is nothing to integrate.
+      where there is nothing to integrate: the step belongs to the model (`exact_step`).
     - `traced_factor`: whether `finer` takes a factor that JAX traces, so that one program replays
       at every step; see `repeated`.
 
@@ -61,14 +61,22 @@ class Stepped(System):
         """Simulated seconds."""
         return self.steps * self.dt
 
+    @property
+    def exact_step(self) -> bool:
+        """True for a model without an integration: no finer step simulates it."""
+        return self.finer is None
+
     def refined(self, factor: int) -> "Stepped":
         """Return the same model, sampled and decided as before, at a `factor` times smaller step.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer.
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for a model whose
+        step belongs to it.
         """
+        if self.finer is None:
+            raise ValueError("the step belongs to this model, which integrates nothing")
         if not (self.traced_factor and isinstance(factor, jax.Array)):
             check_factor(factor)
-        return self if self.finer is None else self.finer(factor)
+        return self.finer(factor)
 
     def check(self, features: Features) -> None:
         """Refuse features that the model does not have; it would ignore them."""

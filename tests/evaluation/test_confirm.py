@@ -61,6 +61,18 @@ def checked(problem, values, seed=0, **options):
     return Confirmer(problem, seed=seed, **options)({"x": values}, np.arange(len(values)))
 
 
+def test_a_step_that_belongs_to_the_system_is_not_made_finer(circles):
+    published = replace(circles.problem, system=replace(circles.problem.system, exact_step=True))
+    failing = circles.table.violating
+    columns = {name: failing[name].to_numpy() for name in failing.columns}
+    found = Confirmer(published)(columns, failing.index.to_numpy())
+    assert set(found.rho) == {"float64", "nudged"}
+    assert found.notes == ("not checked at a finer step: the step belongs to the system",)
+    # What only leaves the circle by Euler's step is a failure of a plant that is Euler's step.
+    assert (found.verdict == "confirmed").mean() > 0.95
+    assert "refuted" not in found.verdict
+
+
 def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles):
     a = circles.table.counterexamples["a"]
     verdict = confirmed_circles.table["verdict"]

@@ -14,6 +14,8 @@ from envs import cartpole
 from envs.arch.automatic_transmission import automatic_transmission
 from envs.arch.chasing_cars import chasing_cars
 from envs.arch.neural_network_controller import neural_network_controller
+from envs.arch.pacemaker import pacemaker
+from envs.mountain_car import mountain_car
 from verifai_jax.core.trace import Trace
 
 FEATURES = {"a": 1.3, "x0": 2.0}
@@ -146,6 +148,25 @@ def test_arch_models_take_a_traced_factor(system, features, signal):
     assert fine <= coarse + 1e-12 < 1e-2
 
 
+def test_a_step_that_belongs_to_the_system_is_not_refined():
+    published = decaying(exact_step=True)
+    assert published.exact_step
+    assert not published.can_refine
+    with pytest.raises(ValueError, match=r"the step belongs to this system \(exact_step=True\)"):
+        published.refined(2)
+    assert decaying().can_refine
+    # CartPole-v1 is explicit Euler at 0.02 s; anything else approximates the continuous plant.
+    assert cartpole.cartpole().exact_step
+    assert cartpole.cartpole(method="rk4").can_refine
+    assert cartpole.cartpole(dt=0.01).can_refine
+    for discrete in (pacemaker(1.0), mountain_car(steps=3)):
+        assert discrete.exact_step
+        assert not discrete.can_refine
+        with pytest.raises(ValueError, match="the step belongs to this model"):
+            discrete.refined(2)
+    assert automatic_transmission(1.0).can_refine
+
+
 def stepping(factor):
     def simulate(features):
         return Trace({"x": np.full(3, features["x"] / factor)}, dt=0.1)
@@ -160,6 +181,13 @@ def test_a_black_box_is_as_refined_as_its_function():
     many = vj.blackbox(stepping(1), vectorised=True)
     assert many.can_refine
     assert not vj.blackbox(lambda features: Trace({"x": np.zeros(3)}, dt=0.1)).can_refine
+    published = stepping(1)
+    published.exact_step = True
+    for options in ({}, {"vectorised": True}):
+        system = vj.blackbox(published, **options)
+        assert system.exact_step
+        assert not system.can_refine
+    assert not box.exact_step
 
 
 SWING = """
@@ -197,13 +225,15 @@ def test_brax_converges_where_it_is_the_same_model():
     pytest.importorskip("brax")
     with jax.enable_x64(False):
         still = lambda observation: jnp.zeros(1)  # noqa: E731
-        system = vj.brax("inverted_pendulum", still, steps=30, backend="generalized")
+        system = vj.brax(
+            "inverted_pendulum", still, steps=30, backend="generalized", exact_step=False
+        )
         angles = [
             np.asarray(jax.jit(system.refined(n).__call__)({}, jax.random.key(0))["q"])[:, 1]
             for n in (1, 2, 4)
         ]
         gaps = [np.max(np.abs(a - b)) for a, b in itertools.pairwise(angles)]
         assert 1.6 < gaps[0] / gaps[1] < 2.5
-        other = vj.brax("inverted_pendulum", still, steps=3, backend="positional")
+        other = vj.brax("inverted_pendulum", still, steps=3, backend="positional", exact_step=False)
         with pytest.raises(ValueError, match="backend 'positional': its constraints are as stiff"):
             other.refined(2)

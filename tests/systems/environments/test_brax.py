@@ -315,6 +315,15 @@ def test_policy_of_another_kind_is_refused():
         jax.eval_shape(brax(Slide(), policy, steps=3), {}, KEY)
 
 
+def test_the_step_belongs_to_the_environment_unless_it_is_said_not_to():
+    system = brax(Slide(), lambda observation: 0.0, steps=3)
+    assert system.exact_step
+    assert not system.can_refine
+    with pytest.raises(ValueError, match=r"the step belongs to Slide .* give exact_step=False"):
+        system.refined(2)
+    assert brax(Slide(), lambda observation: 0.0, steps=3, exact_step=False).can_refine
+
+
 def test_an_error_within_brax_names_the_versions():
     class Broken(Slide):
         def step(self, state, action):

@@ -66,7 +66,9 @@ def test_it_agrees_with_the_cartpole_in_jax():
 
 def test_a_time_limit_ends_the_trace():
     make = partial(gym.make, "CartPole-v1", max_episode_steps=5)
-    trace = gymnasium(make, balancing, steps=20, dt=0.5)({}, 0)
+    system = gymnasium(make, balancing, steps=20, dt=0.5)
+    assert system.exact_step
+    trace = system({}, 0)
     assert (trace.length, trace.valid, trace.dt) == (21, 6, 0.5)
 
 

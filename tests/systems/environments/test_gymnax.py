@@ -170,7 +170,10 @@ def test_keeps_the_contract_of_systems():
 def test_time_limit_cuts_only_when_asked():
     params = package.make("CartPole-v1")[1]
     short = params.replace(max_steps_in_episode=5)
-    assert gymnax("CartPole-v1", lean, params=short).steps == 5
+    system = gymnax("CartPole-v1", lean, params=short)
+    assert system.steps == 5
+    assert system.exact_step
+    assert not system.can_refine
     assert int(gymnax("CartPole-v1", lean, params=short, steps=9)({}, KEY).valid) == 10
     cut = gymnax("CartPole-v1", lean, params=short, steps=9, truncate=True)
     assert int(cut({}, KEY).valid) == 6

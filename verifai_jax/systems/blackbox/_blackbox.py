@@ -166,6 +166,11 @@ class BlackBox(System):
         as_system(self.simulation.function).check(features)
 
     @property
+    def exact_step(self) -> bool:
+        """True for a simulator that says that its step is part of the system."""
+        return as_system(self.simulation.function).exact_step
+
+    @property
     def can_refine(self) -> bool:
         """True for a simulator that has a `refined(factor)` of its own."""
         return as_system(self.simulation.function).can_refine
@@ -204,6 +209,11 @@ class PooledBlackBox(System):
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
         as_system(self.simulation.function).check(features)
 
+    @property
+    def exact_step(self) -> bool:
+        """True for a simulator that says that its step is part of the system."""
+        return as_system(self.simulation.function).exact_step
+
     def close(self) -> None:
         """End the workers; the next simulation starts new ones."""
         self.pool.close()
@@ -223,6 +233,11 @@ class VectorisedBlackBox(System):
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], features)
         trace = self._simulate(batch, np.array([seed_of(key)], np.uint32), 1)
         return jax.tree.map(lambda leaf: leaf[0], trace)
+
+    @property
+    def exact_step(self) -> bool:
+        """True for a simulator that says that its step is part of the system."""
+        return as_system(self.function).exact_step
 
     @property
     def can_refine(self) -> bool:

@@ -63,7 +63,10 @@ BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 @dataclass(frozen=True, eq=False)
 class Brax(System):
-    """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are."""
+    """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are.
+
+    - `exact_step`: the step belongs to the environment, so that it has no finer one.
+    """
 
     env: Any
     name: str
@@ -75,6 +78,7 @@ class Brax(System):
     configure: Callable[..., Any] | None
     initial: Mapping[str, Place] | Callable[..., Any] | None
     signals: Any
+    exact_step: bool = True
 
     @property
     def duration(self) -> float:
@@ -92,9 +96,15 @@ class Brax(System):
     def refined(self, factor: int) -> "Brax":
         """Return the same episode, decided and sampled as before, at a `factor` times smaller step.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer, and for an
-        environment that is another model at another step (backends spring and positional).
+        **Raises:** `ValueError` for a factor that is not a positive integer, for an environment
+        whose step belongs to it, and for one that is another model at another step (backends spring
+        and positional).
         """
+        if self.exact_step:
+            raise ValueError(
+                f"the step belongs to {self.name} (exact_step=True), so a finer one would simulate "
+                "another environment; to take its step for an approximation, give exact_step=False"
+            )
         check_factor(factor)
         return replace(self, env=with_finer_step(self.env, factor, self.name))
 
@@ -212,6 +222,7 @@ def brax(
     dt: float | None = None,
     policy_memory: PyTree = None,
     options: Mapping[str, object] | None = None,
+    exact_step: bool = True,
 ) -> Brax:
     """Make a system `(features, key) -> Trace` from an environment of Brax and a policy.
 
@@ -242,6 +253,10 @@ def brax(
     - `policy_memory`: what a policy with memory remembers at first. It is then called
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
     - `options`: keyword arguments of an environment by name.
+    - `exact_step`: whether the environment is what its `step` computes, which a counterexample is
+      confirmed against in double precision and under rounding. False to take the step for an
+      approximation of continuous bodies: counterexamples are then also replayed at a half and a
+      quarter of it (backends generalized and mjx).
 
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
 
@@ -294,6 +309,7 @@ def brax(
         configure=configure,
         initial=starts,  # pyright: ignore[reportArgumentType]
         signals=signals,
+        exact_step=exact_step,
     )
 
 

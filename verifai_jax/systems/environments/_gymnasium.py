@@ -11,7 +11,7 @@ One trace is one episode: it is never reset within.
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, cast
+from typing import Any, ClassVar, TypeAlias, cast
 
 import jax
 import numpy as np
@@ -47,6 +47,8 @@ class EpisodeFunction:
     The environment is made once in each process, and does not travel to workers.
     """
 
+    # An environment is the difference equation that its `step` computes.
+    exact_step: ClassVar[bool] = True
     make: str | Callable[[], Any]
     policy: Any
     steps: int

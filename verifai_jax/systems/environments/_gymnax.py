@@ -11,7 +11,7 @@ import importlib.metadata
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,8 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 class Gymnax(System):
     """A closed loop `(features, key) -> Trace`; made by `gymnax`, which says what its parts are."""
 
+    # An environment is the difference equation that its `step` computes.
+    exact_step: ClassVar[bool] = True
     env: Any
     params: Any
     policy: Any

@@ -40,6 +40,7 @@ class Ode(System):
     """A closed loop `(features, key) -> Trace`; made by `ode`, which documents its parts.
 
     - `substeps`: integration steps between two samples; more than one in a `refined` loop.
+    - `exact_step`: the step is part of the plant, so that the loop has no finer one.
     """
 
     traced_factor: ClassVar[bool] = True
@@ -55,6 +56,7 @@ class Ode(System):
     terminate: Callable[..., Any] | None
     unroll: int
     substeps: Any = 1
+    exact_step: bool = False
 
     @property
     def duration(self) -> float:
@@ -66,8 +68,14 @@ class Ode(System):
 
         The factor may be traced by JAX; the loop then has no derivative in reverse mode.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer.
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for a loop whose
+        step is part of it.
         """
+        if self.exact_step:
+            raise ValueError(
+                "the step belongs to this system (exact_step=True), so a finer one would simulate "
+                "another; a plant whose step is an approximation has exact_step=False"
+            )
         if not isinstance(factor, jax.Array):
             check_factor(factor)
         return replace(self, substeps=self.substeps * factor)
@@ -330,6 +338,7 @@ def ode(
     signals: Callable[..., Mapping[str, Any]] | None = None,
     terminate: Callable[..., Any] | None = None,
     unroll: int = 1,
+    exact_step: bool = False,
 ) -> Ode:
     """Make a system `(features, key) -> Trace` from equations of motion, with a fixed step.
 
@@ -355,6 +364,10 @@ def ode(
     - `terminate(state, features) -> bool`: ends the simulation. The first sample at which it is
       true is the last valid one; the state stays frozen from there on.
     - `unroll`: steps in one iteration of the compiled loop; changes speed only.
+    - `exact_step`: True where the method and its step define the plant, as in an environment that
+      is published as a difference equation. A counterexample is then confirmed in double precision
+      and under rounding alone. False for a plant that moves continuously, of which a step is an
+      approximation: counterexamples are also replayed at a half and a quarter of it.
 
     **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
     infinite.
@@ -388,4 +401,5 @@ def ode(
         signals=signals,
         terminate=terminate,
         unroll=unroll,
+        exact_step=exact_step,
     )
