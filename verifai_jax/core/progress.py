@@ -70,6 +70,11 @@ class ProgressBar:
         if self._display is not None and self._stage is not None:
             self._display.update(self._stage, completed=done, total=total, figures=figures)
 
+    def note(self, text: str) -> None:
+        """Write a line above the bar, which stays."""
+        if self._display is not None:
+            self._display.console.print(f"note: {text}", markup=False, highlight=False)
+
     @property
     def speed(self) -> float:
         """Units per second of the present stage."""
@@ -99,6 +104,10 @@ class SimulationProgress:
 
     def __exit__(self, *reason: object) -> None:
         self.bar.__exit__(*reason)
+
+    def note(self, text: str) -> None:
+        """Write a line above the bar, which stays."""
+        self.bar.note(text)
 
     def update(self, simulations: int, counterexamples: int, best: float) -> None:
         """Show the simulations made, the counterexamples among them and the least robustness."""

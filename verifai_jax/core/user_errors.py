@@ -108,6 +108,19 @@ def defined_at(function: Callable[..., object] | None) -> str:
     return f" ({_shown_file(code.co_filename)}, line {code.co_firstlineno})"
 
 
+def source_line(traceback: object) -> str | None:
+    """Return the user's line at which JAX recorded an operation; None where it is not known.
+
+    **Arguments:**
+
+    - `traceback`: of the operation, as JAX keeps it: frames from the innermost one on.
+    """
+    for frame in getattr(traceback, "frames", ()):
+        if _is_user_file(frame.file_name):
+            return f"{_shown_file(frame.file_name)}, line {frame.line_num}"
+    return None
+
+
 def explain_user_error(error: BaseException, features: object = None) -> str:
     """Write what a user's code did, where, and what to do about it, in one line.
 

@@ -7,6 +7,7 @@ run = resume(run, budget=50_000)
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,6 +22,12 @@ from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.run import Run, load, write_record
+from verifai_jax.falsification.silent_mistakes import (
+    NOMINAL_FAILS,
+    nominal_note,
+    notes_after,
+    notes_before,
+)
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     adapt_search,
@@ -103,7 +110,8 @@ def falsify(
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
 
-    Ctrl-C ends the run and returns what is finished.
+    Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
+    the run's `notes`, and above the progress bar.
 
     **Returns:** the run: its table, its statistics, and replays of its rows.
 
@@ -131,6 +139,7 @@ def falsify(
     check_gradient(problem, search)
     problem.check()
     search, notes = adapt_search(problem, search)
+    notes += notes_before(problem, search)
     if diverse:
         search = searches.Diverse(search, capacity=max(256, stop_after or 0))
     place = new_folder(folder)
@@ -142,7 +151,8 @@ def falsify(
             rounds.warm(earlier)
 
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
-    return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes)
+    warm = earlier is not None
+    return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes, warm=warm)
 
 
 @suggests_options
@@ -262,8 +272,11 @@ def resume(
             rounds.resume(checkpoint)
 
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
-    notes = [note for note in run.notes if note.startswith("portfolio ")]
-    return _run_rounds(rounds, ends, run.seed, choice, progress, run.target, prepare, notes)
+    notes = [note for note in run.notes if note.startswith(("portfolio ", NOMINAL_FAILS))]
+    notes += notes_before(problem, search)
+    return _run_rounds(
+        rounds, ends, run.seed, choice, progress, run.target, prepare, notes, resumed=True
+    )
 
 
 class _Ending(NamedTuple):
@@ -306,6 +319,9 @@ def _run_rounds(
     target: str | None,
     prepare: Callable[[], None],
     notes: Sequence[str] = (),
+    *,
+    warm: bool = False,
+    resumed: bool = False,
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -351,6 +367,10 @@ def _run_rounds(
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
             rounds.compile()
+            if not resumed:
+                notes = (*notes, *nominal_note(problem, rounds.evaluate, search))
+            for note in notes:
+                bar.note(note)
             prepare()
             # Checking and tracing are part of what a second run of the problem does not repeat.
             rounds.compile_seconds = ends.seconds
@@ -366,6 +386,8 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     result = run(stopped)
+    after = notes_after(rounds.table.all, result.formulas, search, warm)
+    result = replace(result, notes=(*result.notes, *after))
     try:
         rounds.table.close()
         rounds.save()

@@ -1,0 +1,187 @@
+"""Mistakes that raise nothing get a note, and what is right gets none."""
+
+import itertools
+import random
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax.core.targets import definitions
+from verifai_jax.mtl import parse
+from verifai_jax.problem.silent_mistakes import first_look_ahead, silent_mistakes
+
+ROOT = Path(__file__).parents[2]
+SPACE = {"a": vj.Box(0, 1), "b": vj.Box(0, 1)}
+KEPT = itertools.count(1)
+
+
+def both(f, key):
+    return vj.Trace({"x": f["a"] * jnp.ones(11), "y": f["b"] * jnp.ones(11)}, dt=0.1)
+
+
+def python_numbers(f, key):
+    return vj.Trace({"x": f["a"] * random.random() * jnp.ones(11)}, dt=0.1)
+
+
+def numpy_numbers(f, key):
+    return vj.Trace({"x": f["a"] + jnp.asarray(np.random.rand(11))}, dt=0.1)  # noqa: NPY002
+
+
+def numbers_in_a_loop(f, key):
+    gain = np.random.rand()  # noqa: NPY002
+    loop = vj.ode(lambda t, s, u, f: {"x": f["a"] * gain}, lambda f, k: {"x": 0.0}, dt=0.1, steps=9)
+    return loop(f, key)
+
+
+def counts_its_calls(f, key):
+    return vj.Trace({"x": f["a"] * jnp.ones(next(KEPT))}, dt=0.1)
+
+
+def draws(f, key):
+    noise = np.float32(0.1) * jnp.asarray(np.arange(11.0)) * jax.random.normal(key, (11,))
+    return vj.Trace({"x": f["a"] + noise + 0 * f["b"]}, dt=0.1)
+
+
+def notes_of(system, spec="always x < 2", space=SPACE):
+    return silent_mistakes(vj.Problem("p", space, system, spec))
+
+
+@pytest.mark.parametrize(
+    "system", [python_numbers, numpy_numbers, numbers_in_a_loop, counts_its_calls]
+)
+def test_numbers_that_are_not_of_the_key(system):
+    note = notes_of(system, space={"a": vj.Box(0, 1)})[0]
+    assert note.startswith("the system computes with other numbers each time")
+    assert "test_silent_mistakes.py, line" in note
+    assert "jax.random" in note
+
+
+def test_what_is_right_gets_no_note():
+    assert notes_of(draws) == ()
+    assert notes_of(both, "always (x < 2 & y < 2)") == ()
+
+
+def test_a_feature_that_nothing_reads():
+    text = "feature 'b' influences no signal that the property speaks of (x): the search varies it"
+    assert notes_of(both)[0].startswith(text)
+    fields = {
+        **SPACE,
+        "car": vj.Struct({"v": vj.Box(0, 1), "w": vj.Box(0, 1), "g": vj.Constant(9.8)}),
+        "wind": vj.Signal(vj.Box(0, 1), 3),
+    }
+    (note,) = notes_of(
+        lambda f, k: vj.Trace({"x": (f["a"] + f["car"]["v"]) * jnp.ones(3)}, dt=1.0), space=fields
+    )
+    assert note.startswith("features 'b', 'car.w', 'wind' influence no signal")
+    # One that the constraint reads is read.
+    space = vj.FeatureSpace(SPACE, where=lambda f: f["b"] < f["a"])
+    assert notes_of(both, space=space) == ()
+
+
+def test_a_state_of_a_loop_that_is_not_monitored():
+    loop = vj.ode(
+        lambda t, s, u, f: {"x": f["a"], "y": f["b"]},
+        lambda f, k: {"x": 0.0, "y": 0.0},
+        dt=0.1, steps=9,
+    )  # fmt: skip
+    assert "feature 'b' influences no signal" in notes_of(loop)[0]
+    assert notes_of(loop, "always x + y < 2") == ()
+
+
+@pytest.mark.parametrize(
+    ("spec", "seconds"),
+    [
+        ("always[0, 3] x < 2", 3),
+        ("always x < 2", 0),
+        ("always[2, 4] (x < 1 -> eventually[1, 3] x > 1)", 5),
+        ("(x > 1) until[1, 6] (x < 1)", 6),
+        ("always[1, inf] historically[0, 9] x < 1", 1),
+        ("next next x < 1", 0.2),
+    ],
+)
+def test_the_first_look_ahead(spec, seconds):
+    assert first_look_ahead(parse(spec), 0.1) == pytest.approx(seconds)
+
+
+def test_a_formula_that_looks_beyond_the_trace():
+    (note,) = notes_of(both, "always[0, 3] (x < 2 & y < 2)")
+    assert note == (
+        "the formula looks 3 s ahead and a trace lasts 1 s: its last sample is taken for all that "
+        "comes after"
+    )
+    # A window that slides over the end is no mistake, nor is one period more than there is.
+    for spec in ("always[0, 1] eventually[0, 0.5] x + y > 0", "always[0, 1.1] x + y < 3"):
+        assert notes_of(both, spec) == ()
+
+
+def test_the_specifications_of_this_project_get_no_false_note():
+    checked = 0
+    for file in sorted((ROOT / "specs").glob("**/*.py")):
+        if file.stem in ("__init__", "tuning", "hopper", "reacher"):
+            continue
+        for name, problem in definitions(str(file), vj.Problem).items():
+            # In this model of an aircraft the heading has no part in the altitude.
+            heading = "feature 'psi' influences no signal"
+            found = [note for note in silent_mistakes(problem) if not note.startswith(heading)]
+            assert not found, f"{file}:{name}: {found}"
+            checked += 1
+    assert checked > 40
+
+
+class TestRuns:
+    def test_the_nominal_features_fail(self, capsys):
+        def run(limit, system=both, **options):
+            spec = f"always (x < {limit} & y < 2)"
+            problem = vj.Problem("p", SPACE, system, spec, nominal={"a": 0.5, "b": 0.5})
+            return vj.falsify(problem, "uniform", 40, batch=40, **options)
+
+        found = run(0.25, progress=True)
+        note = "the nominal features fail themselves, with robustness -0.25"
+        assert found.notes[0].startswith(note)
+        assert note in found.summary()
+        assert note in capsys.readouterr().err.replace("\n", " ")
+        assert run(0.75).notes == ()
+        simulated = []
+
+        def simulate(f):
+            simulated.append(f["a"])
+            return vj.Trace({"x": f["a"] * np.ones(2), "y": f["b"] * np.ones(2)}, dt=0.1)
+
+        assert run(0.25, vj.blackbox(simulate), confirm=False).notes[0].startswith(note)
+        assert len(simulated) == 41
+        # Resumed it is told, and not simulated again.
+        again = vj.resume(found, budget=48)
+        assert again.notes[0].startswith(note)
+
+    def test_the_table_is_the_same(self):
+        problem = vj.Problem("p", SPACE, both, "always x < 0.2")
+        told = vj.Problem("p", SPACE, both, "always x < 0.2", nominal={"a": 0.5, "b": 0.5})
+        tables = [vj.falsify(p, "cross_entropy", 64, batch=16).table.all for p in (problem, told)]
+        assert tables[0].equals(tables[1])
+
+    def test_everything_fails(self):
+        problem = vj.Problem("p", SPACE, both, "always x + y < -1")
+        notes = vj.falsify(problem, "uniform", 40, batch=40).notes
+        assert notes == (
+            "all 40 simulations with a verdict violate the property: are the formula and its "
+            "units right?",
+        )
+        rows = vj.simulate(problem, [{"a": 0.5, "b": 0.5}] * 40)
+        assert rows.notes == ()
+
+    def test_nothing_comes_near(self):
+        spec = {"far": "always x < 1000", "near": "always y < 1.01"}
+        (note,) = vj.falsify(vj.Problem("p", SPACE, both, spec), "uniform", 40, batch=40).notes
+        assert note.startswith("formula 'far' was never near being violated: its robustness lay")
+
+    def test_a_search_that_follows_slopes_where_there_are_none(self):
+        def steps(f, key):
+            return vj.Trace({"x": jnp.floor(4 * f["a"] + f["b"]) * jnp.ones(3)}, dt=1.0)
+
+        problem = vj.Problem("p", SPACE, steps, "always x < 4")
+        notes = vj.falsify(problem, "gradient", 16, batch=16).notes
+        assert any("follows slopes and there are none" in note for note in notes)

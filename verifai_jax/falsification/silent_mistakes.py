@@ -1,0 +1,125 @@
+"""Notes on what is likely a mistake: before a search starts, and on the table that it leaves.
+
+    notes_before(problem, search)                       # nothing compiles
+    nominal_note(problem, evaluate)                     # one simulation, on the run's own engine
+    notes_after(run.table.all, run.formulas)
+
+Each is a sentence that is true of the run, for its `notes` and so for its summary.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.falsification.validation import needs_gradient
+from verifai_jax.problem.dependence import has_gradient
+from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import silent_mistakes, traced_by_default
+from verifai_jax.search import PointList, Search
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ENOUGH = 32
+"""Simulations with a verdict from which on what all of them have in common is worth a note."""
+NOMINAL_FAILS = "the nominal features fail themselves"
+"""Beginning of the note that they do."""
+HARDLY_MOVES = 0.05
+"""Share of its least value within which a robustness hardly moves."""
+
+
+def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
+    """Return what is likely a mistake of a problem and a search, before anything compiles.
+
+    Given features are simulated as they are, without a word.
+    """
+    if isinstance(search, PointList):
+        return ()
+    notes = silent_mistakes(problem)
+    if needs_gradient(search) and traced_by_default(problem.system) and not has_gradient(problem):
+        notes += (
+            f"search {search!r} follows slopes and there are none: the robustness is constant "
+            "between jumps; use 'cross_entropy' or another search without gradients",
+        )
+    return notes
+
+
+def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple[str, ...]:
+    """Simulate the nominal features once, and return a note if they fail themselves.
+
+    Nothing is simulated where the problem does not say what is nominal, and where a batch of the
+    engine may take long: its program has one shape, however few its rows.
+
+    **Arguments:**
+
+    - `problem`: of the run.
+    - `evaluate`: the run's own, compiled.
+    - `search`: of the run.
+    """
+    if problem.nominal is None or isinstance(search, PointList):
+        return ()
+    engine = evaluate.engine
+    if isinstance(engine, HostEngine):
+        # One of its own: the journal of the run keeps rows of its table only.
+        engine = HostEngine(problem, engine.precision, monitor=engine.monitor)
+    elif not traced_by_default(problem.system):
+        return ()
+    space = problem.space
+    varied = {name: problem.nominal[name] for name, domain in space.root.fields if domain.size}
+    u = np.asarray(jax.jit(space.flatten)(space.coerce(varied)), np.float32)
+    verdict = engine.evaluate(u[None], evaluate.key, 0)
+    if not verdict.violated[0]:
+        return ()
+    return (
+        f"{NOMINAL_FAILS}, with robustness {verdict.least[0]:.4g}: "
+        "are the formula and its units right?",
+    )
+
+
+def notes_after(
+    table: "pd.DataFrame", formulas: Mapping[str, str], search: Search, warm: bool = False
+) -> tuple[str, ...]:
+    """Return what all simulations of a run have in common and is likely a mistake.
+
+    **Arguments:**
+
+    - `table`: of the run, all rows.
+    - `formulas`: texts by name.
+    - `search`: of the run.
+    - `warm`: whether the search began where an earlier run had ended.
+    """
+    proper = table["status"].to_numpy() == "ok"
+    count = int(np.sum(proper))
+    if count < ENOUGH or isinstance(search, PointList):
+        return ()
+    if np.all(table["violated"].to_numpy(bool)[proper]):
+        if warm:
+            return ()
+        return (
+            f"all {count} simulations with a verdict violate the property: are the formula and "
+            "its units right?",
+        )
+    notes = []
+    for name in formulas if len(formulas) > 1 else [""]:
+        column = f"rho.{name}" if name else "rho"
+        if column in table:
+            which = f"formula {name!r}" if name else "the property"
+            notes += _never_near(which, table[column].to_numpy()[proper])
+    return tuple(notes)
+
+
+def _never_near(which: str, values: Float[np.ndarray, " n"]) -> list[str]:
+    low, high = float(values.min()), float(values.max())
+    # A constant one counts whole things, or tells how far a truth value is from the other.
+    if not 0 < low < high < math.inf or high - low > HARDLY_MOVES * low:
+        return []
+    return [
+        f"{which} was never near being violated: its robustness lay between {low:.4g} and "
+        f"{high:.4g} in all {len(values)} simulations; are its bounds and units right?"
+    ]

@@ -1,0 +1,261 @@
+"""Mistakes in a problem that raise nothing: found before the first simulation, told as sentences.
+
+    silent_mistakes(problem)                            # ("feature 'wind' influences no ...",)
+
+A formula that looks beyond the end of the trace, a feature that nothing reads, a system that is not
+a function of its features and its key. Nothing compiles: the system is traced twice, which takes a
+fraction of a second. What is not surely a mistake is not told.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.interpreters import partial_eval
+from jaxtyping import PyTree
+
+from verifai_jax.core.programs import Slot
+from verifai_jax.core.user_errors import source_line
+from verifai_jax.features import Domain
+from verifai_jax.features.compound import Struct
+from verifai_jax.mtl import Formula
+from verifai_jax.mtl.formula import Always, Eventually, Next, Until
+from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.base import System
+
+PATIENCE = 1.0
+"""Seconds of a first tracing above which there is no second one."""
+
+END_OF_TRACE = {
+    "hold": "its last sample is taken for all that comes after",
+    "truncate": "what comes after is left out",
+}
+
+MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
+"""Sentences on a problem."""
+
+
+def silent_mistakes(problem: Problem) -> tuple[str, ...]:
+    """Return a sentence for each mistake of a problem that no error tells; found once.
+
+    **Raises:** what tracing the system raises.
+    """
+
+    def found() -> tuple[str, ...]:
+        return (*beyond_the_trace(problem), *mistakes_of_the_system(problem))
+
+    return problem.programs.get(MISTAKES, None, found)
+
+
+def beyond_the_trace(problem: Problem) -> Iterator[str]:
+    """Yield the formulas that look beyond the end of a whole trace even at its first instant.
+
+    What they ask at later instants may well lie behind the end: windows that slide do so.
+    """
+    form, duration = problem.form(), problem.duration
+    if form is None or form.dt is None or duration is None or problem.end not in END_OF_TRACE:
+        return
+    for name, formula in problem.formulas.items():
+        ahead = first_look_ahead(formula, form.dt)
+        # A trace of n samples lasts n - 1 periods, and many count n.
+        if math.isfinite(ahead) and ahead > duration + 1.01 * form.dt:
+            which = "the formula" if len(problem.formulas) == 1 else f"formula {name!r}"
+            yield (
+                f"{which} looks {ahead:g} s ahead and a trace lasts {duration:g} s: "
+                f"{END_OF_TRACE[problem.end]}"
+            )
+
+
+def first_look_ahead(formula: Formula, dt: float, start: float = 0.0) -> float:
+    """Return the end of the latest window of a formula whose every operator begins at its earliest.
+
+    Unbounded windows end with the trace and do not count.
+
+    **Arguments:**
+
+    - `formula`: any.
+    - `dt`: sampling period in seconds, by which `next` looks ahead.
+    - `start`: instant at which the formula is asked, in seconds.
+    """
+    begin = end = start
+    if isinstance(formula, Always | Eventually | Until):
+        begin, end = start + formula.interval.start, start + formula.interval.end
+    elif isinstance(formula, Next):
+        begin = end = start + dt
+    latest = end if math.isfinite(end) else begin
+    parts = [first_look_ahead(part, dt, begin) for part in formula.operands()]
+    return max([latest, *parts])
+
+
+def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
+    """Yield what two tracings of the system show; nothing for one that is not quick to trace."""
+    if problem.black_box or not traced_by_default(problem.system):
+        return
+    features = jax.eval_shape(problem.space.unflatten, jnp.zeros(problem.space.dim))
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    started = time.perf_counter()
+    program = _program(problem, features, key)
+    yield from _unread(problem, program, features)
+    if time.perf_counter() - started > PATIENCE:
+        return
+    differs, line = difference(program, _program(problem, features, key))
+    if differs:
+        where = "" if line is None else f" (see {line})"
+        yield (
+            f"the system computes with other numbers each time that it is called{where}: random "
+            "numbers of Python or NumPy, the clock, or something kept from the call before. "
+            "Compiled by JAX it keeps those of one call for all simulations. Draw from the key "
+            "that the system is given, by jax.random"
+        )
+
+
+def traced_by_default(system: System) -> bool:
+    """Return whether JAX traces the system itself to know the form of its traces."""
+    function = getattr(system, "function", None)
+    return type(system).abstract is System.abstract or (
+        function is not None and not callable(getattr(function, "abstract", None))
+    )
+
+
+def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
+    """Trace from features to the monitored signals, and the length of what counts of them."""
+
+    def signals(features: PyTree, key: Any) -> Any:
+        trace = problem.system(features, key)
+        return [trace.signals[name] for name in problem.monitored], trace.valid
+
+    return jax.make_jaxpr(signals)(features, key)
+
+
+def _unread(problem: Problem, program: ClosedJaxpr, features: PyTree) -> Iterator[str]:
+    """Yield the features that neither a monitored signal nor the constraint depends on."""
+    used = _used_inputs(program)
+    where = problem.space.where
+    if where is not None:
+        asked = jax.make_jaxpr(where)(features)
+        used = [one or other for one, other in zip(used, _used_inputs(asked), strict=False)]
+    read: dict[tuple[str, ...], bool] = {}
+    for (path, _), is_used in zip(jax.tree.leaves_with_path(features), used, strict=False):
+        names = _names(path)
+        read[names] = read.get(names, False) or is_used
+    unread = [names for names in _order(problem) if not read.get(names, True)]
+    shown = ", ".join(repr(".".join(names)) for names in unread[:6])
+    if unread:
+        one = len(unread) == 1
+        more = f" and {len(unread) - 6} more" if len(unread) > 6 else ""
+        yield (
+            f"feature{'' if one else 's'} {shown}{more} influence{'s' if one else ''} no signal "
+            f"that the property speaks of ({', '.join(problem.monitored)}): "
+            f"the search varies {'it' if one else 'them'} for nothing"
+        )
+
+
+def _used_inputs(program: ClosedJaxpr) -> list[bool]:
+    outputs = [True] * len(program.jaxpr.outvars)
+    return partial_eval.dce_jaxpr(program.jaxpr, outputs)[1]
+
+
+def _names(path: jax.tree_util.KeyPath) -> tuple[str, ...]:
+    """Return the names of a feature and of its fields, as far as these are dictionaries'."""
+    names = []
+    for step in path:
+        if not isinstance(step, jax.tree_util.DictKey):
+            break
+        names.append(str(step.key))
+    return tuple(names)
+
+
+def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
+    """Yield the names of all features that vary, fields of structures one by one."""
+
+    def below(names: tuple[str, ...], domain: Domain) -> Iterator[tuple[str, ...]]:
+        if isinstance(domain, Struct):
+            for name, part in domain.fields:
+                yield from below((*names, name), part)
+        elif domain.size:
+            yield names
+
+    return below((), problem.space.root)
+
+
+def difference(one: ClosedJaxpr, other: ClosedJaxpr) -> tuple[bool, str | None]:
+    """Return whether two programs compute with other numbers, and the line of it where known.
+
+    Operations, the constants among their operands, and plain parameters are compared.
+    """
+    for a, b in zip(one.consts, other.consts, strict=False):
+        if not _same_value(a, b):
+            return True, _line_of_constant(one, a)
+    if len(one.consts) != len(other.consts):
+        return True, None
+    return _difference(one.jaxpr, other.jaxpr)
+
+
+def _difference(one: Jaxpr, other: Jaxpr) -> tuple[bool, str | None]:
+    for a, b in zip(one.eqns, other.eqns, strict=False):
+        if a.primitive is not b.primitive or not _same_operands(a, b):
+            return True, _line(a)
+        inner = list(zip(_programs(a.params), _programs(b.params), strict=False))
+        for first, second in inner:
+            differs, line = difference(first, second)
+            if differs:
+                return True, line or _line(a)
+        plain = [name for name, value in a.params.items() if _is_plain(value)]
+        if any(a.params[name] != b.params.get(name) for name in plain):
+            return True, _line(a)
+    return len(one.eqns) != len(other.eqns), None
+
+
+def _same_operands(one: JaxprEqn, other: JaxprEqn) -> bool:
+    if len(one.invars) != len(other.invars):
+        return False
+    for a, b in zip(one.invars, other.invars, strict=True):
+        if isinstance(a, Literal) != isinstance(b, Literal):
+            return False
+        if isinstance(a, Literal) and isinstance(b, Literal) and not _same_value(a.val, b.val):
+            return False
+    return True
+
+
+def _programs(parameters: dict[str, Any]) -> Iterator[ClosedJaxpr]:
+    """Yield the programs inside an operation, such as the body of a loop."""
+    for value in parameters.values():
+        for part in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(part, ClosedJaxpr):
+                yield part
+            elif isinstance(part, Jaxpr):
+                yield ClosedJaxpr(part, ())
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_is_plain, value))
+    # Names of functions may hold addresses.
+    return isinstance(value, bool | int | float) and value == value
+
+
+def _same_value(one: object, other: object) -> bool:
+    try:
+        a, b = np.asarray(one), np.asarray(other)
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
+    except TypeError:  # Random keys and the like.
+        return True
+
+
+def _line_of_constant(program: ClosedJaxpr, constant: object) -> str | None:
+    """Return the line of the first operation on a constant."""
+    place = next(i for i, value in enumerate(program.consts) if value is constant)
+    variable = program.jaxpr.constvars[place]
+    for step in program.jaxpr.eqns:
+        if any(value is variable for value in step.invars):
+            return _line(step)
+    return None
+
+
+def _line(step: JaxprEqn) -> str | None:
+    return source_line(getattr(step.source_info, "traceback", None))
