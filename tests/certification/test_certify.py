@@ -316,7 +316,7 @@ def test_misspelt_names_get_the_nearest():
 def test_problems_that_do_not_fit():
     with pytest.raises(ValueError, match="there is no policy to certify"):
         certify(problem_of, [])
-    with pytest.raises(ValueError, match="unknown signal 'speed'") as raised:
+    with pytest.raises(ValueError, match="the trace has no signal 'speed'") as raised:
         certify(lambda policy: vj.Problem("s", X, simulated(policy), "always speed < 1"), POLICIES)
     assert raised.value.__notes__[-1:] == ["while checking the problem of policy 0"]
     with pytest.raises(TypeError, match="problem_of must return a Problem for a policy"):

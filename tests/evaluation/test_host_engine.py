@@ -102,7 +102,7 @@ def test_rows_come_in_any_order_and_are_told_apart(traced):
     ("system", "message"),
     [
         (lambda f: 3, "TypeError: the system must return a Trace; it returned int"),
-        (lambda f: Trace({"y": np.ones(3)}, dt=1.0), "unknown signal 'x'"),
+        (lambda f: Trace({"y": np.ones(3)}, dt=1.0), "the trace has no signal 'x'"),
         (lambda f: 1 / 0, "ZeroDivisionError: division by zero"),
     ],
 )
@@ -175,7 +175,7 @@ def test_a_system_says_early_what_does_not_fit():
         def abstract(self, features):
             return jax.eval_shape(lambda: Trace({"y": jnp.ones(5)}, dt=0.25))
 
-    with pytest.raises(ValueError, match="unknown signal 'x'"):
+    with pytest.raises(ValueError, match="the trace has no signal 'x'"):
         problem_of(Told()).check()
 
 

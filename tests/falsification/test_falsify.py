@@ -394,7 +394,7 @@ class TestRefusedBeforeAnythingCompiles:
 
     def test_a_formula_over_a_signal_that_is_not_there(self):
         problem = vj.Problem("typo", space=SPACE, system=ramp, spec="always xx <= 1")
-        with pytest.raises(ValueError, match="unknown signal 'xx'; did you mean 'x'"):
+        with pytest.raises(ValueError, match="the trace has no signal 'xx'; did you mean 'x'"):
             vj.falsify(problem, "uniform", 10)
 
     def test_gradients_need_something_continuous(self):

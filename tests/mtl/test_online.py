@@ -99,5 +99,7 @@ def test_what_cannot_be_monitored_is_said_at_once():
     with unchecked(), pytest.raises(ValueError, match="dt must be positive; got 0"):
         online("G (x > 0)", 0)
     monitor = online("G (speed > 0)", 0.1)
-    with pytest.raises(UnknownNameError, match="unknown signal 'speed'; did you mean 'sped'"):
+    with pytest.raises(
+        UnknownNameError, match="the sample has no signal 'speed'; did you mean 'sped'"
+    ):
         monitor.step(monitor.init(), {"sped": 1.0})

@@ -31,6 +31,22 @@ def test_csv(flight):
     assert set(read(flight, columns=["x"]).signals) == {"x"}
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time;x\n0,0;1,5\n0,5;-2e0\n",
+        "time;x\n0.0;1.5\n0.5;-2\n",
+        "time\tx\n0.0\t1.5\n0.5\t-2\n",
+        'time,x\n"0,0","1,5"\n"0,5","-2"\n',
+    ],
+)
+def test_separators_and_decimal_commas(tmp_path, text):
+    (tmp_path / "flight.csv").write_text(text)
+    trace = read(tmp_path / "flight.csv")
+    np.testing.assert_array_equal(trace.times, [0, 0.5])
+    np.testing.assert_array_equal(trace["x"], [1.5, -2])
+
+
 def test_parquet_and_a_given_period(tmp_path):
     file = tmp_path / "flight.parquet"
     parquet.write_table(pa.table({"x": [1.0, 2.0, 3.0]}), file)
@@ -75,10 +91,14 @@ def test_bad_recordings(tmp_path, flight):
         ValueError, match=r"column 'label' of .* holds no numbers; it starts with 'a'"
     ):
         read(flight, columns=["label"])
-    with pytest.raises(UnknownNameError, match="unknown column 'xx'; did you mean 'x'"):
+    with pytest.raises(UnknownNameError, match=r"flight\.csv has no column 'xx'; did you mean 'x'"):
         read(flight, columns=["xx"])
     with pytest.raises(ValueError, match="more than one column 'x'"):
         read(file("time,x,x\n0,1,2\n"))
+    with pytest.raises(ValueError, match="Decimal commas need semicolons between the columns"):
+        read(file("time,x\n0,0,1,5\n0,5,2,5\n"))
+    with pytest.raises(ValueError, match="commas in column 'time' and decimal points in"):
+        read(file("time;x\n0,0;1.5\n0,5;2.5\n"))
     with pytest.raises(ValueError, match="cannot be read"):
         read(file("not a table", "bad.parquet"))
     with pytest.raises(ValueError, match="resampling needs both"):

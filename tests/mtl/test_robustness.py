@@ -242,7 +242,9 @@ def test_an_interval_off_the_clock_names_the_nearest_multiples():
 
 
 def test_an_unknown_signal_is_named_with_the_nearest():
-    with pytest.raises(UnknownNameError, match="unknown signal 'thetta'; did you mean 'theta'"):
+    with pytest.raises(
+        UnknownNameError, match="the trace has no signal 'thetta'; did you mean 'theta'"
+    ):
         robustness("G (thetta > 0)", Trace({"theta": np.ones(5)}, dt=0.02))
 
 

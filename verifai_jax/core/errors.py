@@ -33,6 +33,14 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownNameEr
     return UnknownNameError(f"unknown {kind} {name!r}{hint}{listing}")
 
 
+def missing_name(owner: str, kind: str, name: object, known: Iterable[str]) -> UnknownNameError:
+    """Make the error for `name`, which `owner` (`the trace`) should have and has not."""
+    known = [str(k) for k in known]
+    hint = nearest_names(name, known) or "."
+    listing = f"It has: {', '.join(known)}." if known else f"It has no {kind} at all."
+    return UnknownNameError(f"{owner} has no {kind} {name!r}{hint} {listing}")
+
+
 def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
     """Raise `UnknownNameError` for the first of `names` that is not `known`."""
     known = list(known)

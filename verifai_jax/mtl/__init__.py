@@ -30,6 +30,7 @@ from verifai_jax.mtl.operators import prev as prev
 from verifai_jax.mtl.operators import since as since
 from verifai_jax.mtl.operators import until as until
 from verifai_jax.mtl.plot import draw as draw
+from verifai_jax.mtl.recording import TimeColumnError as TimeColumnError
 from verifai_jax.mtl.recording import read as read
 from verifai_jax.mtl.recording import resample as resample
 from verifai_jax.mtl.rewriting import nnf as nnf
@@ -39,6 +40,7 @@ from verifai_jax.mtl.semantics import boolean as boolean
 from verifai_jax.mtl.semantics import hard as hard
 from verifai_jax.mtl.semantics import smooth as smooth
 from verifai_jax.mtl.setting import HorizonError as HorizonError
+from verifai_jax.mtl.setting import SamplingError as SamplingError
 
 __all__ = [
     "FALSE",
@@ -51,8 +53,10 @@ __all__ = [
     "HorizonError",
     "IntervalError",
     "Online",
+    "SamplingError",
     "Semantics",
     "SmoothingError",
+    "TimeColumnError",
     "always",
     "anneal",
     "boolean",

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.errors import missing_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
@@ -64,7 +64,7 @@ class Online:
         """
         for name in self.formula.signals():
             if name not in sample:
-                raise unknown_name("signal", name, sample)
+                raise missing_name("the sample", "signal", name, sample)
         return _step(self, state, {name: sample[name] for name in self.formula.signals()})
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -13,11 +13,25 @@ from typing import Any, Literal
 
 import numpy as np
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl.setting import seconds
 
 Method = Literal["hold", "linear"]
+
+
+class TimeColumnError(ValueError):
+    """A recording without the column of its sample times.
+
+    `fact` says so, without the advice of the message; `columns` are those it has.
+    """
+
+    def __init__(self, fact: str, columns: Sequence[str]) -> None:
+        self.fact, self.columns = fact, tuple(columns)
+        super().__init__(
+            f"{fact}: give the sampling period dt, or the name of the column. "
+            f"It has: {', '.join(columns)}"
+        )
 
 
 def resample(trace: Trace, dt: float, method: Method) -> Trace:
@@ -71,7 +85,8 @@ def read(
     """Read a trace from a CSV or Parquet file, one column a signal, one row a sample.
 
     Columns `p[0]`, `p[1]`, ... make one vector signal `p`. Columns that hold no numbers are left
-    out, unless named in `columns`.
+    out, unless named in `columns`. In a CSV file commas, semicolons or tabs separate the columns,
+    whichever the first line has; numbers may have a decimal comma, if all of them do.
 
     **Arguments:**
 
@@ -92,10 +107,7 @@ def read(
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
     table = _columns(path)
     if time not in table and dt is None:
-        raise ValueError(
-            f"{path} has no column {time!r} of sample times: give the sampling period dt, or the "
-            f"name of the column. It has: {', '.join(table)}"
-        )
+        raise TimeColumnError(f"{path} has no column {time!r} of sample times", list(table))
     times = table.pop(time, None)
     signals = _signals(path, table, columns)
     if dt is not None:
@@ -122,15 +134,18 @@ def _check_increasing(times: np.ndarray) -> None:
 def _columns(path: Path) -> dict[str, Any]:
     """Read columns by name, as Arrow arrays."""
     import pyarrow
-    from pyarrow import csv, parquet
+    from pyarrow import parquet
 
-    readers = {".csv": csv.read_csv, ".parquet": parquet.read_table}
+    readers = {".csv": _read_csv, ".parquet": parquet.read_table}
     if path.suffix.lower() not in readers:
         raise ValueError(f"a recording is a .csv or a .parquet file; got {path.name}")
     try:
         table = readers[path.suffix.lower()](path)
     except (pyarrow.ArrowInvalid, OSError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
+        # A row with more cells than the first line has names is often one of decimal commas.
+        advice = ". Decimal commas need semicolons between the columns"
+        advice = advice if "Expected" in str(error) else ""
+        raise ValueError(f"{path} cannot be read: {error}{advice}") from None
     if table.num_rows == 0:
         raise ValueError(f"{path} has no rows")
     names = table.column_names
@@ -138,6 +153,42 @@ def _columns(path: Path) -> dict[str, Any]:
     if repeated:
         raise ValueError(f"{path} has more than one column {', '.join(map(repr, repeated))}")
     return {name: table.column(name) for name in names}
+
+
+def _read_csv(path: Path) -> Any:
+    """Read a CSV file as an Arrow table, whatever separates its columns and its decimals."""
+    from pyarrow import csv
+
+    with open(path, encoding="utf-8", errors="replace") as file:
+        first = file.readline()
+    separator = max((",", ";", "\t"), key=first.count)
+    parsed = csv.ParseOptions(delimiter=separator)
+    table = csv.read_csv(path, parse_options=parsed)
+    named = list(zip(table.column_names, table.columns, strict=True))
+    commas = [name for name, column in named if _decimal_commas(column)]
+    if not commas:
+        return table
+    again = csv.read_csv(
+        path, parse_options=parsed, convert_options=csv.ConvertOptions(decimal_point=",")
+    )
+    for (name, before), after in zip(named, again.columns, strict=True):
+        if _numeric(before) and not _numeric(after):
+            raise ValueError(
+                f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
+                f"{name!r}: write all numbers in one way"
+            )
+    return again
+
+
+def _decimal_commas(column: Any) -> bool:
+    """Return whether a column of text holds numbers such as `1,5`, and nothing else."""
+    from pyarrow import compute, types
+
+    if not types.is_string(column.type) or column.null_count == len(column):
+        return False
+    number = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
+    fits = compute.match_substring_regex(column, number)  # pyright: ignore[reportAttributeAccessIssue]
+    return bool(compute.all(fits, skip_nulls=True).as_py())  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _numeric(column: Any) -> bool:
@@ -187,5 +238,5 @@ def _signals(
         elif name in table:
             signals[name] = _numbers(path, name, table[name])
         else:
-            raise unknown_name("column", name, [*scalars, *vectors])
+            raise missing_name(str(path), "column", name, [*scalars, *vectors])
     return signals

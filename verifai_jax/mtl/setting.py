@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Samples, Trace
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
@@ -18,7 +18,28 @@ from verifai_jax.mtl.semantics import Semantics
 
 
 class HorizonError(ValueError):
-    """A formula that looks beyond the end of a trace, under `end="strict"`."""
+    """A formula that looks beyond the end of a trace, under `end="strict"`.
+
+    `fact` says by how much, without the advice of the message.
+    """
+
+    def __init__(self, fact: str) -> None:
+        self.fact = fact
+        super().__init__(f'{fact}. Use end="hold" or end="truncate", or a longer trace')
+
+
+class SamplingError(ValueError):
+    """A trace whose samples are not evenly spaced.
+
+    `fact` says where, without the advice of the message; `dt` is the usual step in seconds.
+    """
+
+    def __init__(self, fact: str, dt: float) -> None:
+        self.fact, self.dt = fact, dt
+        super().__init__(
+            f"{fact}. Resample it first, as in "
+            f'resample(trace, dt={dt:g}, method="hold") or method="linear"'
+        )
 
 
 class Setting(NamedTuple):
@@ -55,7 +76,7 @@ def prepare(
         raise TypeError(f"semantics is hard, boolean or smooth(tau); got {semantics!r}")
     for name in formula.signals():
         if name not in trace.signals:
-            raise unknown_name("signal", name, trace.signals)
+            raise missing_name("the trace", "signal", name, trace.signals)
     dt = period(trace)
     if end == "strict":
         _check_horizon(formula, trace, dt)
@@ -112,10 +133,10 @@ def period(trace: Trace) -> float:
     slack = 1e-3 * dt + 4 * np.finfo(np.float32).eps * np.abs(times).max()
     if np.any(np.abs(steps - dt) > slack):
         k = int(np.argmax(np.abs(steps - dt)))
-        raise ValueError(
+        raise SamplingError(
             f"the trace is not evenly sampled: steps of {steps.min():g} s to {steps.max():g} s, "
-            f"as at {times[k]:g} s. Resample it first, as in "
-            f'resample(trace, dt={np.median(steps):g}, method="hold") or method="linear"'
+            f"as at {times[k]:g} s",
+            float(np.median(steps)),
         )
     return float(f"{dt:.9g}")
 
@@ -135,10 +156,7 @@ def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
     duration = (length - 1) * dt
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
         what = "has no end" if math.isinf(horizon) else f"looks {horizon:g} s ahead"
-        raise HorizonError(
-            f"the formula {what}, but the trace lasts {duration:g} s: {formula}. "
-            'Use end="hold" or end="truncate", or a longer trace'
-        )
+        raise HorizonError(f"the formula {what}, but the trace lasts {duration:g} s: {formula}")
 
 
 def evaluator_of(
