@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from verifai_jax.cli import arguments
 from verifai_jax.cli.doctor import bad_pairs
 from verifai_jax.cli.main import main
 from verifai_jax.falsification.run import load
@@ -24,6 +25,7 @@ ramp = vj.Problem(
     nominal={"a": 0.5, "b": 0.25},
 )
 flat = vj.Problem("flat", ramp.space, ramp.system, "eventually x > 0.5")
+never = vj.Problem("calm", ramp.space, ramp.system, "always x < 9")
 """
 
 
@@ -89,7 +91,7 @@ def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     one, two = (load(tmp_path / name).table.all for name in ("one", "two"))
     assert one.equals(two)
     assert set(one["a"]) == {0.5}
-    output = call("falsify", "--resume", "one", "--budget", 99, code=1)
+    output = call("falsify", "--resume", "one", "--budget", 99, code=2)
     assert "its feature 'a' was" in output
     output = call("falsify", "--resume", "one", "--seed", 3, code=2)
     assert "--seed is fixed in the run that --resume goes on with" in output
@@ -106,7 +108,7 @@ def test_ends_and_warm_start(call):
     output = call(*ramp, *learning, "--budget", 64, "--folder", "warm")
     assert "64 simulations" in output
     assert "give one" in call(*ramp, "--within", 0.1, "--decide", 0.1, code=2)
-    assert "needs independent samples" in call(*ramp, "--within", 0.1, code=1)
+    assert "needs independent samples" in call(*ramp, "--within", 0.1, code=2)
 
 
 def test_analyze(call, tmp_path):
@@ -133,7 +135,7 @@ def test_list(call):
             ["falsify", "specs/ramp.py:rampe"],
             "unknown problem in specs/ramp.py 'rampe'; did you mean",
         ),
-        (["falsify", "specs/ramp.py"], "has 2 problems; name one: specs/ramp.py:ramp"),
+        (["falsify", "specs/ramp.py"], "has 3 problems; name one: specs/ramp.py:ramp"),
         (["falsify", "specs/rampp.py:ramp"], "no file specs/rampp.py; specs/ has ramp.py"),
         (["falsify", "nowhere.at:all"], "no file and no module 'nowhere.at'"),
         (["falsify", "specs/ramp.py:ramp", "--search", "halten"], "did you mean 'halton'"),
@@ -174,7 +176,7 @@ def test_precision_of_a_run(call, tmp_path):
     call("falsify", "specs/ramp.py:ramp", "--budget", 32, "--precision", "float64", *where)
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert (record["precision"], record["backend"]) == ("float64", None)
-    output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=1)
+    output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=2)
     assert "has no backends to choose from; got backend 'native'" in output
 
 
@@ -193,12 +195,122 @@ def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_p
     assert "float64" in call("replay", "runs/ramp-2", 0, "--no-pictures")
 
 
+BROKEN = """
+import jax.numpy as jnp
+import verifai_jax as vj
+
+def crash(features):
+    raise RuntimeError("no road")
+
+space = {"a": vj.Box(0.0, 1.0)}
+nan = vj.Problem(
+    "nan", space, lambda f, key: vj.Trace({"x": jnp.log(-1 - f["a"])[None]}, dt=1.0), "x < 1"
+)
+raising = vj.Problem("raising", space, vj.blackbox(crash, signals=("x",)), "x < 1")
+"""
+
+
+def test_exit_codes(call, tmp_path, monkeypatch):
+    (tmp_path / "specs" / "broken.py").write_text(BROKEN)
+    few = ("--search", "uniform", "--budget", 32, "--no-pictures")
+    ramp = ("falsify", "specs/ramp.py:ramp", *few)
+    call(*ramp)
+    call(*ramp, "--fail-on", "counterexample", code=1)
+    call("falsify", "specs/ramp.py:calm", *few, "--fail-on", "counterexample")
+    call(*ramp, "--fail-on", "something", code=2)
+    call("falsify", "specs/ramp.py:rampe", *few, code=2)
+    output = call("falsify", "specs/broken.py:nan", *few, code=3)
+    last = "Error: no simulation had a verdict, so nothing is known of the property: 32 nonfinite"
+    assert output.splitlines()[-1] == last
+    output = call("falsify", "specs/broken.py:raising", *few, "--fail-on", "counterexample", code=3)
+    assert "32 error. The first says: RuntimeError: no road (specs/broken.py, line 6" in output
+    output = call("estimate", "specs/broken.py:nan", "--budget", 64, code=3)
+    assert "no simulation had a verdict" in output
+    assert "goes with --p0" in call("estimate", "specs/ramp.py:calm", "--fail-on", "p0", code=2)
+    shown = ("--budget", 200, "--method", "monte_carlo", "--fail-on", "p0", "--p0")
+    call("estimate", "specs/ramp.py:calm", *shown, 0.1)
+    call("estimate", "specs/ramp.py:ramp", *shown, 0.001, code=1)
+    for command in ([], ["falsify"], ["monitor"]):
+        assert "3  the tool or the simulator broke" in call(*command, "--help")
+
+    # Raised in a file of the package, and not in one of a user.
+    code = "def bug(*_, **__):\n    raise AttributeError('no such part')"
+    scope = {}
+    exec(compile(code, arguments.__file__, "exec"), scope)
+    monkeypatch.setattr("verifai_jax.falsification.falsify", scope["bug"])
+    output = call(*ramp, code=3)
+    assert "Traceback" in output
+    assert "AttributeError: no such part\nThis is a bug of verifai_jax; please report it" in output
+    monkeypatch.setattr("verifai_jax.falsification.falsify", _interrupted)
+    assert call(*ramp, code=130) == "Error: interrupted\n"
+
+
+def _interrupted(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_a_target_by_its_variable(call, tmp_path):
+    few = ("--search", "uniform", "--budget", 16, "--no-pictures")
+    assert call("falsify", "specs/ramp.py:never", *few).startswith("calm: ")
+    call("falsify", "--resume", "runs/calm-1", "--budget", 20, "--no-pictures")
+    output = call("falsify", "specs/ramp.py:nevr", code=2)
+    assert "did you mean 'never'? Known: ramp, flat, calm, never." in output
+    twice = PROBLEM + '\nagain = vj.Problem("ramp", ramp.space, ramp.system, "always x < 7")\n'
+    (tmp_path / "specs" / "twice.py").write_text(twice)
+    assert call("falsify", "specs/twice.py:again", *few).startswith("ramp: ")
+    assert "specs/twice.py:again" in call("list", "specs/twice.py")
+
+
+def test_folders_of_something_else(call, tmp_path):
+    call("falsify", "specs/ramp.py:calm", "--search", "uniform", "--budget", 8, "--no-pictures")
+    for name, file, text in (
+        ("sweeps", "sweep.sqlite", ""),
+        ("other", "run.json", '{"lap": 1}'),
+        ("cut", "run.json", "{"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).write_text(text)
+    for place, told in (
+        ("specs", "no run in specs: run.json is missing; give a folder that"),
+        ("runs/calm-2", "no run in runs/calm-2: there is no such folder; in runs there are calm-1"),
+        ("runs", "run.json is missing; but its folders calm-1 are runs"),
+        ("specs/ramp.py", "no run in specs/ramp.py: it is a file"),
+        ("sweeps", "it is the folder of a sweep; verifai-jax sweep --resume sweeps goes on"),
+        ("other", "no run in other: its run.json is damaged, or of another program"),
+        ("cut", "no run in cut: its run.json is damaged, or of another program"),
+    ):
+        assert told in call("falsify", "--resume", place, code=2)
+        assert told in call("falsify", "specs/ramp.py:ramp", "--warm-start", place, code=2)
+        assert told in call("replay", place, code=2)
+    (tmp_path / "runs" / "calm-1" / "table.parquet").write_text("PAR1")
+    output = call("replay", "runs/calm-1", code=2)
+    assert "the table of the run in runs/calm-1 is damaged" in output
+    told = "it is the folder of a run; verifai-jax falsify --resume runs/calm-1 goes on with it"
+    assert told in call("sweep", "--resume", "runs/calm-1", code=2)
+
+
+def test_list_where_problems_are_elsewhere(call, tmp_path, monkeypatch):
+    (tmp_path / "specs" / "helpers.py").write_text("two = 2\n")
+    (tmp_path / "specs" / "bad.py").write_text("import verifai_jax\none = {}['x']\n")
+    output = call("list", code=2)
+    assert "specs/bad.py, line 2 (`one = {}['x']`): KeyError: 'x'" in output
+    assert "specs/ramp.py:calm" in output
+    assert "helpers" not in output
+    (tmp_path / "specs" / "bad.py").write_text("one = (\n")
+    assert "specs/bad.py is not Python: '(' was never closed" in call("list", code=2)
+    monkeypatch.chdir(tmp_path / "specs")
+    output = call("list", code=2)
+    assert output.startswith("Error: there is no folder specs/ here; verifai-jax list FILE.py")
+    assert "Python files here: bad.py, helpers.py, ramp.py" in output
+    assert "ramp.py:calm" in call("list", ".", code=2)
+
+
 def test_a_missing_extra_is_one_line(call, tmp_path):
     (tmp_path / "specs" / "robot.py").write_text(
         "from verifai_jax.core.errors import require\nrequire('no_such_engine', extra='engine')\n"
     )
     told = "no_such_engine is not installed: pip install 'verifai_jax[engine]'"
-    assert call("falsify", "specs/robot.py:walk", code=1) == f"Error: {told}\n"
+    assert call("falsify", "specs/robot.py:walk", code=2) == f"Error: {told}\n"
     output = call("list")
     assert f"specs/robot.py: {told}\n" in output
     assert "specs/ramp.py:ramp" in output
@@ -223,14 +335,16 @@ class TestMonitor:
     @pytest.fixture(autouse=True)
     def recording(self, call, tmp_path):
         (tmp_path / "drive.csv").write_text(
-            "time,dist,speed\n0.0,5.0,1.0\n0.5,3.0,2.0\n1.0,1.5,4.0\n1.5,2.5,2.5\n"
+            "time,dist,speed,mode\n0.0,5.0,1.0,a\n0.5,3.0,2.0,a\n1.0,1.5,4.0,b\n1.5,2.5,2.5,b\n"
         )
+        (tmp_path / "uneven.csv").write_text("time,dist\n0,1\n0.5,2\n1.5,2\n")
 
     def test_robustness_of_a_recording(self, call):
         assert call("monitor", "always dist > 1", "drive.csv") == "holds with robustness 0.5\n"
-        assert call("monitor", "always[0, 1] dist >= 2", "drive.csv", "--fail", code=1) == (
-            "fails with robustness -0.5\n"
-        )
+        gate = ("--fail-on", "violation")
+        output = call("monitor", "always[0, 1] dist >= 2", "drive.csv", *gate, code=1)
+        assert output == "fails with robustness -0.5\n"
+        call("monitor", "always dist > 1", "drive.csv", *gate)
         assert "robustness 0.5" in call(
             "monitor", "G (dist < 2 -> F[0, 500ms] slow)", "drive.csv",
             "--define", "slow=speed < limit", "--const", "limit=3",
@@ -246,17 +360,46 @@ class TestMonitor:
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
-            (["always dst > 1", "drive.csv"], "unknown signal 'dst'; did you mean 'dist'"),
+            (
+                ["always dst > 1", "drive.csv"],
+                "drive.csv has no signal 'dst'; did you mean 'dist'? It has: dist",
+            ),
+            (
+                ["always mode > 1", "drive.csv"],
+                "'mode' of drive.csv holds no numbers; it starts with",
+            ),
+            (["always dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
+            (
+                ["always dist > 1", "drive.csv", "--resample", "1"],
+                "--resample PERIOD goes with --me",
+            ),
+            (["always (dist > 1", "drive.csv"], "Error: "),
             (["always (dist > 1", "drive.csv"], "^"),
             (["always[0, 0.3] dist > 1", "drive.csv"], "0.3"),
             (["always dist > 1", "none.csv"], "no recording none.csv"),
-            (["always dist > 1", "drive.csv", "--time", "t"], "no column 't' of sample times"),
+            (
+                ["always dist > 1", "drive.csv", "--time", "tme"],
+                "no column 'tme' of sample times; did you mean 'time' or 'mode'? Give the sampling "
+                "period, --dt SECONDS, or the name of the column, --time NAME",
+            ),
             (["always dist > 1", "drive.csv", "--const", "a=b"], "--const a must be a number"),
-            (["always[0, 9] dist > 1", "drive.csv", "--end", "strict"], "9"),
+            (
+                ["always[0, 9] dist > 1", "drive.csv", "--end", "strict"],
+                "Use --end hold or --end truncate, or a longer recording",
+            ),
         ],
     )
     def test_mistakes(self, arguments, message):
         result = CliRunner().invoke(main, ["monitor", *arguments])
-        assert result.exit_code != 0
+        assert result.exit_code == 2
         assert message in result.output
         assert "Traceback" not in result.output
+
+    def test_a_gap_is_no_verdict(self, call, tmp_path):
+        (tmp_path / "gap.csv").write_text("time,dist\n0,1\n1,\n2,3\n")
+        output = call("monitor", "always dist > 0", "gap.csv", code=3)
+        assert output == "Error: no verdict: signal 'dist' is NaN at 1 s\n"
+
+    def test_semicolons_and_decimal_commas(self, call, tmp_path):
+        (tmp_path / "semi.csv").write_text("time;dist\n0,0;5,0\n0,5;3,5\n")
+        assert call("monitor", "G dist > 1", "semi.csv") == "holds with robustness 2.5\n"

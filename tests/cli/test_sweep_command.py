@@ -115,7 +115,7 @@ def test_errors_in_one_line(call, tmp_path):
         (("--resume", "nowhere"), "Error: no sweep to resume in nowhere"),
         (("specs/drift.py:safe", "--samples", 0), "samples must be an integer"),
     ):
-        output = call(*arguments, code=1)
+        output = call(*arguments, code=2)
         assert told in output
         assert len(output.strip().splitlines()) == 1
     for arguments, told in (
@@ -146,7 +146,7 @@ def test_only_some_vary(call):
 
 def test_another_sweep_in_the_same_folder_is_refused(call):
     call("specs/drift.py:safe", *SMALL, "--folder", "kept")
-    output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=1)
+    output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=2)
     assert "kept/sweep.sqlite holds a different sweep: options.seed is 9, in the cache 0" in output
 
 
@@ -161,7 +161,7 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
     base.execute("UPDATE about SET value = replace(value, 'specs/', 'kept/specs/')")
     base.commit()
     base.close()
-    output = call("--resume", "kept", code=1)
+    output = call("--resume", "kept", code=2)
     assert "kept does not say which study of this project it is of" in output
 
 

@@ -457,13 +457,13 @@ def test_command_line(circles, tmp_path):
     circles.save(tmp_path / "run")
     folder, problem = str(tmp_path / "run"), ["--problem", f"{target}:circle"]
     call = CliRunner().invoke
-    done = call(command, [folder, str(circles.best.name), *problem, "--fail"])
+    done = call(command, [folder, str(circles.best.name), *problem, "--fail-on", "unconfirmed"])
     assert done.exit_code == 0, done.output
     assert "of circle: confirmed, it fails in every replay" in done.output
     done = call(command, [folder, *problem])
     assert done.exit_code == 0
     assert "circle: of" in done.output
-    done = call(command, [folder, *problem, "--fail"])
+    done = call(command, [folder, *problem, "--fail-on", "unconfirmed"])
     assert done.exit_code == 1
     assert "refuted" in done.output
 

@@ -53,6 +53,16 @@ PROGRESS = click.option(
 SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed of all chance.")
 """Seed of a command that cannot be resumed."""
 
+
+def fail_on(gate: str, explanation: str) -> Callable[[Command], Command]:
+    """Return the option `--fail-on` of a command with one gate."""
+    return click.option(
+        "--fail-on",
+        type=click.Choice([gate]),
+        help=f"Exit with code 1 {explanation}.",
+    )
+
+
 ONLY = click.option(
     "--only",
     metavar="NAMES",
@@ -131,21 +141,73 @@ def load_problem(target: str, only: str | None = None) -> "Problem":
 
 def load_run(folder: Path, target: str | None) -> "Run":
     """Load the run in a folder, with the problem named, or else the one that the run records."""
+    return read_run(folder, load_problem(target or recorded_target(folder)))
+
+
+def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
+    """Read the run in a folder; say what the folder is where it holds none."""
+    import pyarrow
+
     from verifai_jax.falsification.run import load
 
-    return load(folder, load_problem(target or recorded_target(folder)))
+    read_record(folder)
+    try:
+        return load(folder, problem)
+    except pyarrow.ArrowException as error:
+        raise ValueError(f"the table of the run in {folder} is damaged: {error}") from error
 
 
-def recorded_target(folder: Path) -> str:
+def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") -> str:
     """Return the target that a run records, if it is a file of the user's own project."""
     from verifai_jax.core.targets import target_of_project
+
+    target = read_record(folder).get("target")
+    return target_of_project(target, folder, kind="problem", remedy=remedy)
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read the record of the run in a folder.
+
+    **Raises:** `FileNotFoundError` where there is none, `ValueError` where it is none of a run;
+    both say what the folder is instead, as far as that can be seen.
+    """
     from verifai_jax.falsification.run import RECORD
 
-    if not (folder / RECORD).exists():
-        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
-    target = json.loads((folder / RECORD).read_text()).get("target")
-    remedy = "--problem specs/FILE.py:NAME"
-    return target_of_project(target, folder, kind="problem", remedy=remedy)
+    file = folder / RECORD
+    if not file.is_file():
+        raise FileNotFoundError(f"no run in {folder}: {_describe_place(folder, RECORD)}")
+    try:
+        record = json.loads(file.read_text())
+    except ValueError:
+        record = None
+    if not isinstance(record, dict) or not {"format", "name", "features"} <= record.keys():
+        raise ValueError(
+            f"no run in {folder}: its {RECORD} is damaged, or of another program; give a folder "
+            "that verifai-jax falsify has written"
+        )
+    return record
+
+
+def _describe_place(folder: Path, record: str) -> str:
+    """Say what a folder without a run is."""
+    if folder.is_file():
+        return "it is a file; give the folder that verifai-jax falsify has written"
+    if not folder.exists():
+        beside = folder.parent
+        runs = sorted(path.name for path in beside.glob("*") if (path / record).is_file())
+        there = f"; in {beside} there are {', '.join(runs)}" if runs else ""
+        return f"there is no such folder{there}"
+    if is_sweep(folder):
+        return f"it is the folder of a sweep; verifai-jax sweep --resume {folder} goes on with it"
+    runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
+    if runs:
+        return f"{record} is missing; but its folders {', '.join(runs)} are runs"
+    return f"{record} is missing; give a folder that verifai-jax falsify has written"
+
+
+def is_sweep(folder: Path) -> bool:
+    """Return whether a folder is one that `verifai-jax sweep` has written."""
+    return any((folder / name).is_file() for name in ("sweep.json", "sweep.sqlite"))
 
 
 def split_names(text: str) -> list[str]:

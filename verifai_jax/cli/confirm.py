@@ -4,7 +4,8 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, load_run
+from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, fail_on, load_run
+from verifai_jax.cli.exit_codes import fail_gate
 
 
 @click.command()
@@ -12,9 +13,13 @@ from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, load_run
 @ROW
 @PROBLEM
 @click.option("--simulator", help="Another backend of the system that has to agree.")
-@click.option("--fail", is_flag=True, help="Exit with 1 if any is not confirmed.")
+@fail_on("unconfirmed", "if any is not confirmed")
 def confirm(
-    folder: Path, row: int | None, target: str | None, simulator: str | None, fail: bool
+    folder: Path,
+    row: int | None,
+    target: str | None,
+    simulator: str | None,
+    fail_on: str | None,
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
     from verifai_jax import counterexamples
@@ -26,5 +31,5 @@ def confirm(
         all_confirmed = result.confirmed
     else:
         all_confirmed = len(result.confirmed) == len(result)
-    if fail and not all_confirmed:
-        raise SystemExit(1)
+    if fail_on is not None and not all_confirmed:
+        raise fail_gate()

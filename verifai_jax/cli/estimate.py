@@ -1,7 +1,7 @@
 """`verifai-jax estimate FILE.py:NAME`: how probable a failure is."""
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -14,8 +14,13 @@ from verifai_jax.cli.arguments import (
     PRECISION,
     SEED,
     TARGET,
+    fail_on,
     load_problem,
 )
+from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+
+if TYPE_CHECKING:
+    from verifai_jax.estimation import Estimate
 
 
 @click.command()
@@ -31,6 +36,7 @@ from verifai_jax.cli.arguments import (
 @PRECISION
 @BACKEND
 @PLOT
+@fail_on("p0", "unless the probability is shown to be below --p0")
 def estimate(
     target: str,
     method: str | None,
@@ -44,10 +50,13 @@ def estimate(
     precision: Literal["float32", "float64"] | None,
     backend: str | None,
     plot: Path | None,
+    fail_on: str | None,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax.estimation import estimate as run
 
+    if fail_on is not None and p0 is None:
+        raise click.UsageError("--fail-on p0 goes with --p0")
     found = run(
         load_problem(target, only),
         method,
@@ -64,3 +73,16 @@ def estimate(
     if plot is not None:
         found.plot(plot)
         click.echo(f"  picture      {plot}")
+    if found.prior_no_verdict == found.prior_simulations and not found.failures:
+        raise CommandError(
+            f"no simulation had a verdict, of {found.prior_simulations:,}: nothing is known of the "
+            "probability; verifai-jax falsify says why",
+            BROKEN,
+        )
+    if fail_on is not None and p0 is not None and not _is_below(found, p0):
+        raise fail_gate()
+
+
+def _is_below(found: "Estimate", p0: float) -> bool:
+    """Return whether the bound or the interval shows a probability below `p0`."""
+    return found.upper_bound <= p0 or (found.probability is not None and found.high < p0)

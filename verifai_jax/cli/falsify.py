@@ -14,12 +14,15 @@ from verifai_jax.cli.arguments import (
     PRECISION,
     PROGRESS,
     SET,
+    fail_on,
     load_problem,
     next_folder,
     plain_values,
+    read_run,
     recorded_target,
     refuse_with_resume,
 )
+from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
@@ -55,6 +58,7 @@ if TYPE_CHECKING:
 )
 @PICTURES
 @PROGRESS
+@fail_on("counterexample", "if a counterexample was found")
 def falsify(
     target: str | None,
     search: str | None,
@@ -76,6 +80,7 @@ def falsify(
     folder: Path | None,
     pictures: bool,
     progress: bool | None,
+    fail_on: str | None,
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
@@ -89,7 +94,7 @@ def falsify(
         refuse_with_resume(fixed, "run")
         run = falsification.resume(
             resume,
-            load_problem(target or recorded_target(resume), only),
+            load_problem(target or _resumed_target(resume), only),
             budget=budget,
             max_seconds=max_seconds,
             stop_after=stop_after,
@@ -110,7 +115,7 @@ def falsify(
             max_seconds=max_seconds,
             stop_after=stop_after,
             stop_when=stop_when,
-            warm_start=None if warm_start is None else falsification.load(warm_start),
+            warm_start=None if warm_start is None else read_run(warm_start),
             folder=folder or next_folder("runs", problem.name),
             precision=precision or "float32",
             backend=backend,
@@ -120,6 +125,12 @@ def falsify(
             target=target,
         )
     _print(run, pictures)
+    if fail_on is not None and len(run.table.counterexamples):
+        raise fail_gate()
+
+
+def _resumed_target(folder: Path) -> str:
+    return recorded_target(folder, remedy=f"specs/FILE.py:NAME --resume {folder}")
 
 
 def _stopping_rule(within: float | None, decide: float | None) -> "Within | Decided | None":
@@ -144,5 +155,16 @@ def _print(run: "Run", pictures: bool) -> None:
 
         for path in write_run_pictures(run, run.folder):
             click.echo(f"  picture      {path}")
-    if run.simulations and len(run.table.failed) < run.simulations:
+    failed = run.table.failed
+    if len(failed) < run.simulations:
         click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
+        return
+    if not run.simulations:
+        raise CommandError("no simulation was finished, so nothing is known of it", BROKEN)
+    counts = ", ".join(f"{n:,} {status}" for status, n in failed["status"].value_counts().items())
+    messages = [text for text in failed["message"] if text] if "message" in failed else []
+    raise CommandError(
+        f"no simulation had a verdict, so nothing is known of the property: {counts}"
+        + (f". The first says: {messages[0]}" if messages else ""),
+        BROKEN,
+    )

@@ -1,40 +1,78 @@
 """`verifai-jax list specs`: the problems and studies there are."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from verifai_jax.cli.exit_codes import WRONG_USAGE
+
+if TYPE_CHECKING:
+    from verifai_jax.problem import Problem
+    from verifai_jax.sweeps.study import Study
+
 
 @click.command(name="list")
-@click.argument("place", default="specs")
-def list_targets(place: str) -> None:
+@click.argument("place", required=False)
+def list_targets(place: str | None) -> None:
     """List the problems and studies of a file or folder (PLACE, by default specs/)."""
     from verifai_jax.core.errors import MissingExtra
-    from verifai_jax.core.targets import TargetError, definitions
+    from verifai_jax.core.targets import NothingDefined, TargetError, definitions
     from verifai_jax.problem import Problem
     from verifai_jax.search import names
     from verifai_jax.sweeps.study import Study
 
-    path = Path(place)
+    path = Path(place or "specs")
+    if place is None and not path.exists():
+        raise TargetError(_no_specs())
     files = sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
-    if not files:
-        raise TargetError(f"{place}/ has no Python file with problems")
+    inner = [folder for folder in sorted(path.glob("*/")) if any(folder.glob("[!_]*.py"))]
+    broken = shown = 0
     for file in files:
         try:
             targets = definitions(str(file), Problem, Study)
         except MissingExtra as error:
             click.echo(f"{file}: {error}")
             continue
+        except NothingDefined:
+            if not path.is_dir():
+                raise
+            continue  # A folder may hold other modules too.
+        except TargetError as error:
+            if not path.is_dir():
+                raise
+            click.echo(str(error), err=True)
+            broken += 1
+            continue
         for name, target in targets.items():
             click.echo(f"{file}:{name}  {target.description}")
-            varied = ", ".join(target.space.domains)
-            if isinstance(target, Study):
-                click.echo(f"    a study of training runs, for sweep, over {varied}")
-                continue
-            for formula in target.formulas.values():
-                click.echo(f"    {formula}")
-            click.echo(f"    over {varied}")
-    for folder in sorted(path.iterdir()) if path.is_dir() else []:
-        if any(folder.glob("[!_]*.py")):
-            click.echo(f"more in {folder}/: verifai-jax list {folder}")
+            _print_target(target)
+            shown += 1
+    if path.is_dir() and not (shown or broken or inner):
+        raise TargetError(f"{path}/ has no Python file with problems")
+    for folder in inner:
+        click.echo(f"more in {folder}/: verifai-jax list {folder}")
     click.echo(f"searches: {', '.join(names())}")
+    if broken:
+        raise click.exceptions.Exit(WRONG_USAGE)
+
+
+def _print_target(target: "Problem | Study") -> None:
+    varied = ", ".join(target.space.domains)
+    formulas = getattr(target, "formulas", None)
+    if formulas is None:
+        click.echo(f"    a study of training runs, for sweep, over {varied}")
+        return
+    for formula in formulas.values():
+        click.echo(f"    {formula}")
+    click.echo(f"    over {varied}")
+
+
+def _no_specs() -> str:
+    """Say that there is no folder of problems here, and what there is."""
+    files = sorted(file.name for file in Path().glob("[!_]*.py"))
+    beside = f". Python files here: {', '.join(files)}" if files else ""
+    return (
+        "there is no folder specs/ here; verifai-jax list FILE.py (or FOLDER) lists the problems "
+        f"of a file or folder{beside}"
+    )

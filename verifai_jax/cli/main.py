@@ -14,6 +14,7 @@ from verifai_jax.cli.analyze import analyze
 from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.doctor import doctor
 from verifai_jax.cli.estimate import estimate
+from verifai_jax.cli.exit_codes import EPILOG, INTERRUPTED, CommandError, command_error
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.list import list_targets
@@ -23,7 +24,7 @@ from verifai_jax.cli.replay import replay
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
-from verifai_jax.core.errors import MissingExtra, unknown_name
+from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
     falsify,
@@ -44,24 +45,18 @@ COMMANDS = (
 
 
 class _Group(click.Group):
-    """Command group that reports a user's mistake in one line, without a traceback."""
+    """Command group that tells an error in one line, with the exit code of its kind."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
-        except (click.exceptions.Exit, click.Abort):
-            # Both are RuntimeErrors to Python, and neither is a mistake.
+        except (click.exceptions.Exit, click.Abort, click.ClickException, BrokenPipeError):
+            # Click's own: nothing to translate. A reader that closed its pipe is no mistake.
             raise
-        except (ValueError, TypeError, IndexError, OSError, MissingExtra) as error:
-            if ctx.params.get("traceback"):
-                raise
-            raise click.ClickException(str(error)) from error
-        except RuntimeError as error:
-            from verifai_jax.falsification import RunError
-
-            if ctx.params.get("traceback") or not isinstance(error, RunError):
-                raise
-            raise click.ClickException(str(error)) from error
+        except KeyboardInterrupt:
+            raise CommandError("interrupted", INTERRUPTED) from None
+        except Exception as error:
+            raise command_error(error, bool(ctx.params.get("traceback"))) from error
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -71,7 +66,7 @@ class _Group(click.Group):
         return super().resolve_command(ctx, args)
 
 
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_Group, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="verifai-jax")
 @click.option("--traceback", is_flag=True, help="Show where an error was raised.")
 def main(traceback: bool) -> None:
@@ -79,4 +74,5 @@ def main(traceback: bool) -> None:
 
 
 for _command in COMMANDS:
+    _command.epilog = EPILOG
     main.add_command(_command)

@@ -1,11 +1,18 @@
 """`verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv`: a formula on a recording."""
 
+import math
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import click
 
-from verifai_jax.cli.arguments import PLOT, split_pairs
+from verifai_jax.cli.arguments import PLOT, fail_on, split_pairs
+from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
+
+if TYPE_CHECKING:
+    from verifai_jax.core.trace import Trace
+    from verifai_jax.mtl import Formula
 
 
 @click.command()
@@ -27,7 +34,7 @@ from verifai_jax.cli.arguments import PLOT, split_pairs
 @click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
-@click.option("--fail", is_flag=True, help="Exit with 1 if the formula fails.")
+@fail_on("violation", "if the formula fails")
 def monitor(
     formula: str,
     recording: Path,
@@ -41,31 +48,79 @@ def monitor(
     definitions: tuple[str, ...],
     explain: bool,
     plot: Path | None,
-    fail: bool,
+    fail_on: str | None,
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet."""
     import jax
 
     from verifai_jax import mtl
 
+    if (explain or plot is not None) and compat is not None:
+        raise click.UsageError("--explain and --plot do not go with --compat")
     numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
     parsed = mtl.parse(formula, numbers, dict(split_pairs("--define", definitions)))
-    trace = mtl.read(recording, time=time, dt=dt, resample_to=period, method=method)
+    trace = _read(recording, time, dt, period, method)
+    _check_signals(parsed, trace, recording)
     with jax.enable_x64(True):
-        holds = bool(mtl.satisfied(parsed, trace, end, compat))
-        rho = float(mtl.robustness(parsed, trace, end=end, compat=compat))
+        try:
+            rho = float(mtl.robustness(parsed, trace, end=end, compat=compat))
+        except mtl.HorizonError as error:
+            advice = "Use --end hold or --end truncate, or a longer recording"
+            raise ValueError(f"{error.fact}. {advice}") from None
+        except mtl.SamplingError as error:
+            advice = f"Resample it: --resample {error.dt:g} --method hold (or linear)"
+            raise ValueError(f"{error.fact}. {advice}") from None
+        try:
+            holds = bool(mtl.satisfied(parsed, trace, end, compat))
+        except ValueError as error:
+            if math.isnan(rho):
+                raise CommandError(str(error), BROKEN) from None
+            raise
         click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:.10g}")
         if explain or plot is not None:
-            if compat is not None:
-                raise click.UsageError("--explain and --plot do not go with --compat")
             why = mtl.explain(parsed, trace, end=end)
             if explain:
                 click.echo(str(why))
             if plot is not None:
                 mtl.draw(why, plot)
                 click.echo(f"picture {plot}")
-    if fail and not holds:
-        raise SystemExit(1)
+    if fail_on is not None and not holds:
+        raise fail_gate()
+
+
+def _read(
+    recording: Path,
+    time: str,
+    dt: float | None,
+    period: float | None,
+    method: Literal["hold", "linear"] | None,
+) -> "Trace":
+    """Read the recording; what is missing is told as an option of this command."""
+    from verifai_jax import mtl
+
+    if (period is None) != (method is None):
+        raise click.UsageError("--resample PERIOD goes with --method hold or --method linear")
+    try:
+        return mtl.read(recording, time=time, dt=dt, resample_to=period, method=method)
+    except mtl.TimeColumnError as error:
+        near = nearest_names(time, error.columns)
+        raise ValueError(
+            f"{error.fact}{near or '.'} Give the sampling period, --dt SECONDS, or the name of "
+            f"the column, --time NAME. It has: {', '.join(error.columns)}"
+        ) from None
+
+
+def _check_signals(formula: "Formula", trace: "Trace", recording: Path) -> None:
+    """Refuse a signal that the recording lacks, or that is a column of something else."""
+    from verifai_jax import mtl
+
+    for name in formula.signals():
+        if name in trace.signals:
+            continue
+        try:
+            mtl.read(recording, dt=1.0, columns=[name])
+        except UnknownNameError:
+            raise missing_name(str(recording), "signal", name, trace.signals) from None
 
 
 def _number(name: str, value: str) -> float:

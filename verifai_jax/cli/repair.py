@@ -5,7 +5,14 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import PARAMETER_CHOICE, PLOT, TARGET, load_problem, plain_values
+from verifai_jax.cli.arguments import (
+    PARAMETER_CHOICE,
+    PLOT,
+    TARGET,
+    load_problem,
+    plain_values,
+    read_run,
+)
 
 
 @click.command()
@@ -34,12 +41,11 @@ def repair(
     **keywords: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
-    from verifai_jax.falsification.run import load
     from verifai_jax.synthesis import repair as run_repair
 
     problem = load_problem(target)
     result = run_repair(
-        problem if folder is None else load(folder, problem),
+        problem if folder is None else read_run(folder, problem),
         parameters,
         budget,
         nominal=plain_values("--nominal", nominal) or None,

@@ -11,11 +11,13 @@ from verifai_jax.cli.arguments import (
     MAX_SECONDS,
     PICTURES,
     SET,
+    is_sweep,
     next_folder,
     plain_values,
     refuse_with_resume,
     split_names,
 )
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
     from verifai_jax.sweeps.result import Sweep
@@ -141,6 +143,8 @@ def sweep(
         click.echo(f"  picture      {picture}")
     if not record.complete:
         click.echo(f"  resume       verifai-jax sweep --resume {folder}")
+    elif all(status not in ("trained", "stopped") for status in result.table["status"]):
+        raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
 
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
@@ -172,12 +176,26 @@ def _read_command(place: Path) -> dict[str, Any]:
     from verifai_jax.sweeps.cache import Cache, CacheError, cache_file
 
     if not cache_file(place).exists():
-        raise FileNotFoundError(f"no sweep to resume in {place}")
+        raise FileNotFoundError(f"no sweep to resume in {place}{_describe_place(place)}")
     with Cache(place) as cache:
         note = cache.note("command")
     if note is None:
-        raise CacheError(f"{place} is not of this command; call sweep(..., folder=...) again")
+        raise CacheError(
+            f"the sweep in {place} was begun in Python, and Python has to go on with it: call "
+            f"vj.sweep(study, ..., folder={str(place)!r}) again"
+        )
     return note
+
+
+def _describe_place(place: Path) -> str:
+    """Say what a place without finished work is."""
+    if (place / "run.json").is_file():
+        return f": it is the folder of a run; verifai-jax falsify --resume {place} goes on with it"
+    if is_sweep(place):
+        return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
+    if not place.exists():
+        return ": there is no such folder"
+    return ": verifai-jax sweep has not written it"
 
 
 def _format_table(result: "Sweep") -> str:

@@ -14,7 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Protocol, TypeVar
 
-from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.errors import MissingExtra, unknown_name
+from verifai_jax.core.user_errors import explain_user_error
 
 
 class Named(Protocol):
@@ -33,6 +34,10 @@ class TargetError(ValueError):
     """A target that cannot be loaded, or that is not a file of the user's own project."""
 
 
+class NothingDefined(TargetError):
+    """A file or module without an object of the kind that was looked for."""
+
+
 def definitions(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines.
 
@@ -41,17 +46,35 @@ def definitions(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
     - `place`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
     - `kinds`: classes to look for.
 
-    **Returns:** the objects by their names, in the order of their definition.
+    **Returns:** the objects in the order of their definition, by their names; by their variables,
+    where several have one name.
 
-    **Raises:** `TargetError` where there is no such file or module, or it defines no such object.
+    **Raises:** `TargetError` where there is no such file or module, or it cannot be run;
+    `NothingDefined` where it defines no such object.
     """
-    objects = {
-        value.name: value for value in vars(_import(place)).values() if isinstance(value, kinds)
+    return _by_name(_variables(place, *kinds))
+
+
+def _variables(place: str, *kinds: type[Kind]) -> dict[str, Kind]:
+    """Return the objects of some classes that a file or module defines, by their variables."""
+    variables = {
+        name: value for name, value in vars(_import(place)).items() if isinstance(value, kinds)
     }
-    if not objects:
+    if not variables:
         nouns = " and no ".join(kind.__name__ for kind in kinds)
-        raise TargetError(f"{place} defines no {nouns}")
-    return objects
+        raise NothingDefined(f"{place} defines no {nouns}")
+    return variables
+
+
+def _by_name(variables: dict[str, Kind]) -> dict[str, Kind]:
+    """Return the objects, once each, by their names or, where several have one, by variables."""
+    once = {id(value): variable for variable, value in reversed(variables.items())}
+    kept = {variable: value for variable, value in variables.items() if once[id(value)] == variable}
+    names = [value.name for value in kept.values()]
+    return {
+        value.name if names.count(value.name) == 1 else variable: value
+        for variable, value in kept.items()
+    }
 
 
 def load_target(target: str, kind: type[Kind]) -> Kind:
@@ -59,8 +82,8 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
 
     **Arguments:**
 
-    - `target`: `FILE.py:NAME` or `MODULE:NAME`; the name may be left out where the file defines
-      one object of this kind.
+    - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable;
+      the name may be left out where the file defines one object of this kind.
     - `kind`: class of the object.
 
     **Returns:** the object.
@@ -71,12 +94,15 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
     place, colon, name = target.rpartition(":")
     if not colon:
         place, name = target, ""
-    objects = definitions(place, kind)
+    variables = _variables(place, kind)
+    objects = _by_name(variables)
     noun = kind.__name__.lower()
     if name in objects:
         return objects[name]
+    if name in variables:
+        return variables[name]
     if name:
-        raise unknown_name(f"{noun} in {place}", name, objects)
+        raise unknown_name(f"{noun} in {place}", name, dict.fromkeys((*objects, *variables)))
     if len(objects) == 1:
         return next(iter(objects.values()))
     plural = noun.removesuffix("y") + "ies" if noun.endswith("y") else f"{noun}s"
@@ -138,7 +164,14 @@ def _import(place: str) -> ModuleType:
         raise TargetError(f"{place} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except MissingExtra:
+        raise
+    except SyntaxError as error:
+        raise TargetError(f"{place} is not Python: {error}") from error
+    except (Exception, SystemExit) as error:
+        raise TargetError(f"{place} cannot be run: {explain_user_error(error)}") from error
     return module
 
 

@@ -1,0 +1,88 @@
+"""Exit codes of the command line, the same for every command, and which error has which.
+
+| code | meaning |
+|---|---|
+| 0 | it did its work; `falsify` that finds failures has done its work |
+| 1 | a gate that was asked for by `--fail-on` failed |
+| 2 | wrong usage: an option, a name, a file or a package that is not as it should be |
+| 3 | the tool or the simulator broke, or no simulation had a verdict |
+| 130 | interrupted before there was a result |
+"""
+
+import sys
+import traceback
+
+import click
+
+from verifai_jax.core.errors import MissingExtra
+
+GATE_FAILED = 1
+WRONG_USAGE = 2
+BROKEN = 3
+INTERRUPTED = 130
+
+EPILOG = """\b
+Exit codes:
+  0  it did its work; falsify that finds failures has done its work
+  1  a gate asked for with --fail-on failed
+  2  wrong usage
+  3  the tool or the simulator broke, or no simulation had a verdict
+"""
+"""What `--help` says of them."""
+
+USAGE_ERRORS = (
+    ValueError,
+    TypeError,
+    IndexError,
+    MissingExtra,
+    FileNotFoundError,
+    FileExistsError,
+    NotADirectoryError,
+    IsADirectoryError,
+    PermissionError,
+)
+"""Errors by which the Python API refuses what it was given."""
+
+
+class CommandError(click.ClickException):
+    """An error that is told in one line, with its exit code."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def fail_gate() -> click.exceptions.Exit:
+    """Return what ends a command whose gate failed."""
+    return click.exceptions.Exit(GATE_FAILED)
+
+
+def command_error(error: Exception, show_traceback: bool = False) -> CommandError:
+    """Turn an error of the Python API into one that the command line tells in a line.
+
+    A traceback is printed where it is asked for, and where the error is a bug of this package:
+    neither a refusal, nor a failure that the package foresees, nor raised by the user's own code.
+    """
+    message, code = _told(error)
+    if show_traceback or not message:
+        traceback.print_exception(error, file=sys.stderr)
+    if not message:
+        message = (
+            f"{type(error).__name__}: {error}\nThis is a bug of verifai_jax; please report it "
+            "with the lines above"
+        )
+    return CommandError(message, code)
+
+
+def _told(error: Exception) -> tuple[str, int]:
+    """Return the message and the exit code of an error; no message for a bug."""
+    if isinstance(error, USAGE_ERRORS):
+        return str(error), WRONG_USAGE
+    foreseen = isinstance(error, RuntimeError) and type(error).__module__.startswith("verifai_jax.")
+    if foreseen or isinstance(error, OSError):
+        return str(error), BROKEN
+    if isinstance(error, MemoryError):
+        return "the machine has not enough memory; a smaller --batch needs less", BROKEN
+    from verifai_jax.core.user_errors import explain_user_error, user_line
+
+    return ("" if user_line(error) is None else explain_user_error(error)), BROKEN
