@@ -96,7 +96,7 @@ def main() -> None:
         for search in chosen.searches:
             began = time.perf_counter()
             budget = chosen.budget or BUDGETS.get(name.removesuffix("_instance1"), 300)
-            trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds)
+            trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds, confirm=False)
             cost = trials.cost()
             finite = cost[np.isfinite(cost)]
             counts = ["-"] * 3

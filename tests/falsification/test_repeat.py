@@ -1,5 +1,6 @@
 """Many seeds in one program ask for what runs with these seeds would."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -84,3 +85,68 @@ def test_a_failure_is_what_it_is_in_falsify(search, spec):
             assert trials.first_failure[seed] == first + 1
             point = problem.space.flatten({"k": int(run.table.all["k"].iloc[first])})
             np.testing.assert_allclose(trials.failures[seed], point, atol=0.05)
+
+
+def bump(features, key):
+    """Single precision shows a bump around 0.45 that is not there."""
+    x = features["x"]
+    seen = x + 0.6 * jnp.exp(-(((x - 0.45) / 0.05) ** 2)) if x.dtype == jnp.float32 else x
+    return vj.Trace({"x": seen * jnp.ones(2)}, dt=1.0)
+
+
+@pytest.fixture(scope="module")
+def artefact():
+    return vj.Problem("bump", {"x": vj.Box(0, 1)}, bump, "always x <= 0.96")
+
+
+def test_a_failure_is_what_falsify_claims(artefact):
+    trials = vj.repeat(artefact, "uniform", 48, batch=16, seeds=8, stop_early=False)
+    early = vj.repeat(artefact, "uniform", 48, batch=16, seeds=8)
+    for seed in range(8):
+        table = vj.falsify(artefact, "uniform", 48, batch=16, seed=seed, progress=False).table
+        np.testing.assert_array_equal(trials.violated[seed], table.all["violated"])
+        unclaimed = table.all["verdict"].isin(["refuted", "fragile"])
+        np.testing.assert_array_equal(trials.not_claimed[seed], unclaimed)
+        claimed = table.counterexamples
+        first = claimed.index[0] + 1 if len(claimed) else np.inf
+        assert trials.first_failure[seed] == early.first_failure[seed] == first
+        if len(claimed):
+            assert trials.failures[seed, 0] == pytest.approx(claimed["x"].iloc[0])
+    assert trials.not_claimed.any()
+    assert np.any(trials.first_violation < trials.first_failure)
+    assert trials.violating >= trials.falsified > 0
+    assert f"as simulated from {trials.violating}" in repr(trials)
+    simulated = vj.repeat(artefact, "uniform", 48, batch=16, seeds=8, confirm=False)
+    assert simulated.not_claimed is None
+    np.testing.assert_array_equal(simulated.first_failure, simulated.first_violation)
+    np.testing.assert_array_equal(
+        simulated.first_violation[simulated.first_violation <= 16],
+        trials.first_violation[trials.first_violation <= 16],
+    )
+    assert "(as simulated, not confirmed)" in repr(simulated)
+
+
+def test_a_search_that_plans_learns_what_is_not_claimed(artefact):
+    trials = vj.repeat(artefact, "gradient", 60, batch=4, seeds=6)
+    assert trials.not_claimed.any()
+    for seed in range(6):
+        run = vj.falsify(artefact, "gradient", 60, batch=4, seed=seed, stop_after=1, progress=False)
+        count = int(min(trials.first_failure[seed], 60))
+        np.testing.assert_allclose(
+            trials.rho[seed, :count], run.table.all["rho"][:count], atol=2e-4
+        )
+        claimed = run.table.counterexamples
+        assert trials.first_failure[seed] == (claimed.index[0] + 1 if len(claimed) else np.inf)
+
+
+def test_a_random_system_loses_no_failure():
+    def noisy(features, key):
+        x = features["k"] + jax.random.uniform(key)
+        return vj.Trace({"x": x * jnp.ones(2)}, dt=1.0)
+
+    problem = vj.Problem("noisy", {"k": vj.DiscreteBox(0, 9)}, noisy, "always x <= 8.5")
+    trials = vj.repeat(problem, "uniform", 32, batch=8, seeds=3)
+    # There is nothing finer to look with: double precision would draw other numbers.
+    assert not trials.not_claimed.any()
+    assert trials.falsified == trials.violating > 0
+    assert np.isfinite(trials.failures[np.isfinite(trials.first_failure)]).all()

@@ -3,6 +3,7 @@
     trials = repeat(problem, "gradient", budget=300, batch=8, seeds=50)
     trials.falsified, trials.median_simulations         # seeds that found a failure; how soon
     trials.first_failure                                # [seeds], counted from 1; inf without one
+    trials.violating, trials.first_violation            # the same as simulated, before confirmation
 
 Whole rounds (ask, simulate, judge, differentiate, tell) run in one `lax.scan`, all seeds side by
 side: for comparing searches, where a run a seed would spend its time between rounds.
@@ -25,6 +26,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import violations
+from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.falsification.lockstep import lockstep
 from verifai_jax.falsification.validation import (
     adapt_search,
@@ -51,6 +53,9 @@ class Trials:
     - `violated`: `[seeds, simulations]`, which simulations violate the property, as in `falsify`.
     - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
       one.
+    - `not_claimed`: `[seeds, simulations]`, which of the violating simulations are no failures by
+      closer replays, as in `falsify`; None where these were not asked for. Of a seed they end with
+      the first failure that is claimed, unless it was to go on.
     - `differentiated`: `[seeds, simulations]`, which were differentiated; None where none or all
       were.
     """
@@ -62,6 +67,7 @@ class Trials:
     rho: Float[np.ndarray, "seeds simulations"]
     violated: Bool[np.ndarray, "seeds simulations"]
     failures: Float[np.ndarray, "seeds d"]
+    not_claimed: Bool[np.ndarray, "seeds simulations"] | None = None
     differentiated: Bool[np.ndarray, "seeds simulations"] | None = None
 
     def cost(self, derivative: float = 2.0) -> Float[np.ndarray, " seeds"]:
@@ -74,14 +80,27 @@ class Trials:
 
     @property
     def first_failure(self) -> Float[np.ndarray, " seeds"]:
-        """The number, from 1, of each seed's first failing simulation; infinite without one."""
-        failing = self.violated
-        return np.where(failing.any(axis=1), failing.argmax(axis=1) + 1.0, np.inf)
+        """The number, from 1, of each seed's first failing simulation; infinite without one.
+
+        Of those that are claimed, where closer replays were asked for.
+        """
+        refused = self.not_claimed
+        return _first(self.violated if refused is None else self.violated & ~refused)
+
+    @property
+    def first_violation(self) -> Float[np.ndarray, " seeds"]:
+        """The number of each seed's first violating simulation, as simulated; infinite without."""
+        return _first(self.violated)
 
     @property
     def falsified(self) -> int:
         """Seeds that found a failure."""
         return int(np.isfinite(self.first_failure).sum())
+
+    @property
+    def violating(self) -> int:
+        """Seeds that found a violation as simulated, claimed or not."""
+        return int(np.isfinite(self.first_violation).sum())
 
     @property
     def mean_simulations(self) -> float:
@@ -96,10 +115,15 @@ class Trials:
         return float((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)
 
     def __repr__(self) -> str:
+        if self.not_claimed is None:
+            meant = "as simulated, not confirmed"
+        else:
+            meant = f"counting what is claimed; as simulated from {self.violating}"
         return (
             f"{self.name}: {self.search} falsified from {self.falsified} of {len(self.seeds)} "
-            f"seeds within {self.rho.shape[1]} simulations; mean {self.mean_simulations:.4g}, "
-            f"median {self.median_simulations:.4g} simulations to the first failure"
+            f"seeds within {self.rho.shape[1]} simulations ({meant}); mean "
+            f"{self.mean_simulations:.4g}, median {self.median_simulations:.4g} simulations to the "
+            "first failure"
         )
 
 
@@ -114,6 +138,7 @@ def repeat(
     stop_early: bool = True,
     precision: str = "float32",
     backend: str | None = None,
+    confirm: bool = True,
 ) -> Trials:
     """Run a search from many seeds at once; each asks for what `falsify` with its seed would.
 
@@ -124,9 +149,18 @@ def repeat(
     - `seeds`: which, or how many from 0 on.
     - `stop_early`: end once every seed has found a failure. Seeds of a search that plans its
       rounds (`portfolio`, `gradient`) each end with their own first failure.
+    - `confirm`: count as failures what `falsify` would claim: a violation is replayed more finely,
+      and one that is `refuted` or `fragile` is none. A replay costs ten simulations and more, so of
+      each seed only the first violations are replayed, until one is claimed (all of them without
+      `stop_early`), those of all seeds together. False to count violations as simulated, which
+      compiles nothing but the search.
 
-    **Returns:** the robustness and the verdicts of each seed's simulations. A failure is what it is
-    in `falsify` before it is confirmed.
+    A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
+    other that learns has its rounds compiled together and learns from them as simulated: behind a
+    seed's first unclaimed violation its simulations may be others than those of `falsify`.
+
+    **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
+    of the violations are not claimed.
 
     **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`) or a priority,
     which are dealt with between rounds: use `falsify` with one seed after the other.
@@ -154,9 +188,10 @@ def repeat(
     traced.check()
     search, _ = adapt_search(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
+    claims = SeedClaims(traced, precision, every, not stop_early) if confirm else None
     if search.wants_clauses:
         with in_precision(precision):
-            found = lockstep(traced, search, every, budget, batch, precision, stop_early)
+            found = lockstep(traced, search, every, budget, batch, precision, stop_early, claims)
         return Trials(
             problem.name,
             repr(search),
@@ -165,6 +200,7 @@ def repeat(
             found.rho,
             found.violated,
             found.failures,
+            found.not_claimed if confirm else None,
             found.differentiated,
         )
     rounds = -(-budget // batch)
@@ -175,8 +211,13 @@ def repeat(
             (search, batch, each, precision),
             lambda: _WholeRounds(traced, search, batch, each, precision),
         )
-        histories = program.play(every, rounds, stop_early)
+        histories = program.play(every, rounds, stop_early, claims)
     return Trials(problem.name, repr(search), every, batch, *histories)
+
+
+def _first(failing: Bool[np.ndarray, "seeds simulations"]) -> Float[np.ndarray, " seeds"]:
+    """Return the number of each seed's first such simulation, from 1; infinite without one."""
+    return np.where(failing.any(axis=1), failing.argmax(axis=1) + 1.0, np.inf)
 
 
 def _traced(problem: Problem, backend: str | None) -> Problem | None:
@@ -202,16 +243,24 @@ class _WholeRounds:
         self._programs: dict[int, jax.stages.Compiled] = {}
 
     def play(
-        self, seeds: Int[np.ndarray, " seeds"], rounds: int, stop_early: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return robustness and violations, `[seeds, n]`, and first failures `[seeds, d]`."""
+        self,
+        seeds: Int[np.ndarray, " seeds"],
+        rounds: int,
+        stop_early: bool,
+        claims: SeedClaims | None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+        """Play the rounds.
+
+        **Returns:** robustness and violations, `[seeds, n]`, first failures `[seeds, d]`, and which
+        violations are not claimed, `[seeds, n]`; None without `claims`.
+        """
         count, devices = len(seeds), len(jax.local_devices())
         # As many on each device: the last seed again, for those that are missing.
         padded = np.append(seeds, np.repeat(seeds[-1:], -count % devices))
         keys = [run_keys(int(seed)) for seed in padded]
         state = self._start(jnp.stack([key for key, _ in keys]))
         simulations = jnp.stack([key for _, key in keys])
-        parts, broken = [], []
+        parts, broken, refused = [], [], []
         failures = np.full((count, self.problem.space.dim), np.nan, np.float32)
         failed = np.zeros(count, bool)
         for first in range(0, rounds, self.rounds):
@@ -221,14 +270,24 @@ class _WholeRounds:
             # The last call may have rounds beyond the budget.
             u, rho, status = (part[:, : (rounds - first) * self.batch] for part in (u, rho, status))
             violated = self._violated(u, rho, status, simulations, number)
-            new = violated.any(axis=1) & ~failed
-            failures[new] = u[new, violated[new].argmax(axis=1)]
+            unclaimed = np.zeros_like(violated)
+            if claims is not None:
+                some = violated & ~(failed[:, None] & stop_early)
+                seed, row = np.nonzero(some)
+                unclaimed[some], _ = claims(seed, number + row, u[some], rho[some])
+            failing = violated & ~unclaimed
+            new = failing.any(axis=1) & ~failed
+            failures[new] = u[new, failing[new].argmax(axis=1)]
             failed |= new
             parts.append(rho)
             broken.append(violated)
+            refused.append(unclaimed)
             if stop_early and failed.all():
                 break
-        return np.concatenate(parts, axis=1), np.concatenate(broken, axis=1), failures
+        rho, violated, unclaimed = (
+            np.concatenate(each, axis=1) for each in (parts, broken, refused)
+        )
+        return rho, violated, failures, unclaimed if claims is not None else None
 
     def _violated(
         self,

@@ -18,6 +18,7 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
@@ -33,13 +34,16 @@ class SeedHistories(NamedTuple):
     - `rho`: the least robustness; NaN where there is no simulation or no verdict.
     - `violated`: whether the simulation violates the property.
     - `differentiated`: whether derivatives were taken.
-    - `failures`: the first failing point of each seed in the unit cube; NaN without one.
+    - `failures`: the first failing point of each seed in the unit cube, of those that closer
+      replays were made for the first that is claimed; NaN without one.
+    - `not_claimed`: whether closer replays say that a violating simulation is no failure.
     """
 
     rho: Float[np.ndarray, "seeds simulations"]
     violated: Bool[np.ndarray, "seeds simulations"]
     differentiated: Bool[np.ndarray, "seeds simulations"]
     failures: Float[np.ndarray, "seeds d"]
+    not_claimed: Bool[np.ndarray, "seeds simulations"]
 
 
 def lockstep(
@@ -50,10 +54,12 @@ def lockstep(
     batch: int,
     precision: str,
     stop_early: bool,
+    claims: SeedClaims | None = None,
 ) -> SeedHistories:
     """Run the search from every seed and return the histories.
 
-    A seed that has found a failure makes no further simulation if `stop_early`.
+    A seed that has found a failure makes no further simulation if `stop_early`. With `claims` a
+    failure is what these claim, and the search is told of the others as `falsify` tells it.
     """
     cube, n = problem.space.cube, len(seeds)
     keys = [run_keys(int(seed)) for seed in seeds]
@@ -67,6 +73,7 @@ def lockstep(
     number_keys = jax.jit(jax.vmap(simulation_key))
     rho: list[list[float]] = [[] for _ in range(n)]
     violated: list[list[bool]] = [[] for _ in range(n)]
+    refused: list[list[bool]] = [[] for _ in range(n)]
     differentiated: list[list[bool]] = [[] for _ in range(n)]
     failures = np.full((n, cube.dim), np.nan, np.float32)
     failed = np.zeros(n, bool)
@@ -103,14 +110,26 @@ def lockstep(
             broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses
             if kind:
                 clause_gradients[seed, row] = verdicts.clause_gradients
+        simulated, unclaimed = values.copy(), np.zeros((n, batch), bool)
+        if claims is not None:
+            some = broken & ~(failed[:, None] & stop_early)
+            seed, row = np.nonzero(some)
+            numbers = np.array([len(each) for each in rho])[seed] + row
+            found, greatest = claims(seed, numbers, u[some], values[some])
+            unclaimed[some] = found
+            values[some] = np.where(found, greatest, values[some])
+            # Clauses that are broken no more, as `falsify` tells them.
+            lift = np.where(found, 1e-6 - np.max(clauses[some], axis=-1), 0.0)
+            clauses[some] += lift[:, None].astype(np.float32)
         for seed in range(n):
             count = int(rows[seed])
-            rho[seed].extend(values[seed, :count].tolist())
+            rho[seed].extend(simulated[seed, :count].tolist())
             violated[seed].extend(broken[seed, :count].tolist())
+            refused[seed].extend(unclaimed[seed, :count].tolist())
             differentiated[seed].extend([bool(wanted[seed])] * count)
-            first_broken = np.flatnonzero(broken[seed, :count])
-            if len(first_broken) and not failed[seed]:
-                failed[seed], failures[seed] = True, u[seed, first_broken[0]]
+            first = np.flatnonzero((broken & ~unclaimed)[seed, :count])
+            if len(first) and not failed[seed]:
+                failed[seed], failures[seed] = True, u[seed, first[0]]
         observations = Observations(
             u=jnp.asarray(u),
             rho=jnp.asarray(values),
@@ -125,6 +144,7 @@ def lockstep(
         _filled(violated, longest, False).astype(bool),
         _filled(differentiated, longest, False).astype(bool),
         failures,
+        _filled(refused, longest, False).astype(bool),
     )
 
 

@@ -1,0 +1,137 @@
+"""Closer replays of what the seeds of `repeat` violate: which failures `falsify` would claim.
+
+    claims = SeedClaims(problem, "float32", seeds, thorough=False)
+    refused, greatest = claims(place, numbers, u, rho)      # of violating simulations, seed by seed
+
+A replay costs as much as many simulations, so of each seed they are made in their order until one
+is claimed; of all seeds together, so that few programs make many of them.
+"""
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
+from verifai_jax.evaluation.confirmation import LIMIT, Confirmer
+from verifai_jax.evaluation.engine import Engine
+from verifai_jax.falsification.table import NOT_CLAIMED
+from verifai_jax.problem.problem import Problem
+
+MORE = 4
+"""So many times as many rows of a seed are replayed next, after none of its last was claimed."""
+WITHOUT_BOUND = 2**31 - 1
+"""A number of rows that no run has."""
+
+DRAWS: Slot[str, bool] = Slot("randomness of the system")
+"""Whether the system uses its random key, by precision."""
+
+
+class SeedClaims:
+    """Verdicts of closer replays, by the rule that `falsify` has.
+
+    Violations beyond the first `LIMIT` of a seed that were replayed count as claimed, as there.
+
+    **Arguments:**
+
+    - `problem`: on a backend that JAX traces.
+    - `precision`: of the simulations.
+    - `seeds`: of the runs.
+    - `thorough`: replay all violations, not only each seed's until one is claimed.
+    """
+
+    def __init__(
+        self, problem: Problem, precision: str, seeds: Int[np.ndarray, " seeds"], thorough: bool
+    ) -> None:
+        self.problem, self.precision, self.seeds = problem, precision, seeds
+        self.thorough = thorough
+        self._examined = np.zeros(len(seeds), int)
+        self._confirmers: dict[int, Confirmer] = {}
+
+    def __call__(
+        self,
+        place: Int[np.ndarray, " n"],
+        numbers: Int[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"],
+        rho: Float[np.ndarray, " n"],
+    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Replay violating simulations.
+
+        **Arguments:**
+
+        - `place`: of the seed of each, ascending.
+        - `numbers`: of the simulations in their runs, ascending for each seed.
+        - `u`, `rho`: their points and the least formula's robustness.
+
+        **Returns:** which of them are not claimed, and the greatest robustness of their replays, at
+        least 1e-6, NaN where there was none.
+        """
+        refused, greatest = np.zeros(len(place), bool), np.full(len(place), np.nan)
+        left, width = np.arange(len(place)), 1
+        while len(left):
+            rank = _rank(place[left])
+            now = left if self.thorough else left[rank < width]
+            known = self._examined[place[now]] + _rank(place[now]) >= LIMIT
+            taken = now[~known]
+            if len(taken):
+                refused[taken], greatest[taken] = self._replayed(
+                    place[taken], numbers[taken], u[taken], rho[taken]
+                )
+                np.add.at(self._examined, place[taken], 1)
+            if self.thorough:
+                break
+            done = np.unique(place[now[~refused[now]]])
+            left = left[(rank >= width) & ~np.isin(place[left], done)]
+            width *= MORE
+        return refused, greatest
+
+    def _replayed(
+        self,
+        place: Int[np.ndarray, " n"],
+        numbers: Int[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"],
+        rho: Float[np.ndarray, " n"],
+    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        rows = self._rows(u) | {"rho": rho}
+        # Without random numbers all seeds simulate the same.
+        whose = place if self._draws else np.zeros_like(place)
+        refused, greatest = np.zeros(len(place), bool), np.full(len(place), np.nan)
+        for one in np.unique(whose).tolist():
+            own = np.flatnonzero(whose == one)
+            columns = {name: column[own] for name, column in rows.items()}
+            checked = self._confirmer(one)(columns, numbers[own])
+            refused[own] = np.isin(checked.verdict, NOT_CLAIMED)
+            if checked.rho:
+                most = np.nanmax(np.stack([*checked.rho.values(), rho[own]]), axis=0)
+                greatest[own] = np.maximum(most, 1e-6)
+        return refused, greatest
+
+    def _rows(self, u: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:
+        """Return the rows of the table at these points."""
+        # Powers of two, so that few shapes are compiled.
+        padded = np.pad(u, ((0, (1 << (len(u) - 1).bit_length()) - len(u)), (0, 0)), mode="edge")
+        space = self.problem.space
+        with in_precision(self.precision):
+            features = jax.jit(jax.vmap(space.unflatten))(padded.astype(self.precision))
+            columns = space.rows(jax.tree.map(np.asarray, features))
+        return {name: column[: len(u)] for name, column in columns.items()}
+
+    def _confirmer(self, place: int) -> Confirmer:
+        if place not in self._confirmers:
+            self._confirmers[place] = Confirmer(
+                self.problem, self.precision, int(self.seeds[place]), most=WITHOUT_BOUND
+            )
+        return self._confirmers[place]
+
+    @property
+    def _draws(self) -> bool:
+        def trace() -> bool:
+            engine = Engine(self.problem, 1, precision=self.precision, own_keys=True, alone=True)
+            return engine.draws()
+
+        return self.problem.programs.get(DRAWS, self.precision, trace)
+
+
+def _rank(place: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the number of each row within those of its seed, from 0; seeds are ascending."""
+    return np.arange(len(place)) - np.searchsorted(place, place)
