@@ -1,5 +1,6 @@
 """explain: what is said of a failure whose causes are known, and what is drawn."""
 
+import re
 from dataclasses import replace
 
 import jax
@@ -165,3 +166,11 @@ def test_the_command(tmp_path):
     assert f"Row {row} of p breaks" in done.output
     assert "y does not matter." in " ".join(done.output.split())
     assert (tmp_path / "run" / f"why-{row}.png").exists()
+
+
+def test_sentences_tell_control_points_by_their_time(driven):
+    assert "throttle from 5 s to 10 s=70" in driven.summary()
+    assert "throttle from 5 s to 10 s=70" in str(driven.replay(0))
+    text = str(vj.shrink(driven, budget=300))
+    assert re.search(r"throttle from \d+ s to \d+ s +30 -> ", text)
+    assert "throttle[" not in text

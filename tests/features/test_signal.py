@@ -166,3 +166,20 @@ class TestInRollouts:
                      method="euler", signals=lambda t, s, c, f: {"w": f["wind"](t)})  # fmt: skip
         trace = system(space.coerce({"wind": [-1, 1], "gust": 0}))
         np.testing.assert_allclose(trace["w"], [-1, 0, 1, 1, 1])
+
+
+def test_people_read_the_time_of_a_control_point():
+    parts = {
+        "a": Box(0, 1),
+        "wind": Signal(Box(-1, 1), 5),
+        "car": Struct({"throttle": Signal(Box([0, 0], [1, 1]), 2, "constant", duration=10.0)}),
+    }
+    space = FeatureSpace(parts)
+    labels = space.labels(6.0)
+    assert list(labels) == list(space.coordinates)
+    assert labels["a"] == "a"
+    assert labels["wind[1]"] == "wind at 1.5 s"
+    assert labels["wind[4]"] == "wind at 6 s"
+    assert labels["car.throttle[1][0]"] == "car.throttle[0] from 5 s to 10 s"
+    assert space.labels()["wind[1]"] == "wind[1]"
+    assert space.fixed(wind=0.0).labels(6.0).keys() == {"a", *list(labels)[-4:]}

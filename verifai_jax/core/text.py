@@ -24,11 +24,17 @@ MOST_ENTRIES = 4
 """Numbers of one feature that are written one by one; of more, their range."""
 
 
-def format_features(features: Mapping[str, object]) -> str:
+def format_features(features: Mapping[str, object], labels: Mapping[str, str] | None = None) -> str:
     """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
 
     Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written.
+
+    **Arguments:**
+
+    - `features`: values by column.
+    - `labels`: names for people by column, where they differ.
     """
+    labels = labels or {}
     entries: dict[str, list[tuple[str, object]]] = {}
     for name, value in features.items():
         stem = name.partition("[")[0] if name.endswith("]") and _is_real(value) else name
@@ -37,7 +43,7 @@ def format_features(features: Mapping[str, object]) -> str:
     for stem, columns in entries.items():
         there = [value for _, value in columns if value == value]
         if len(columns) <= MOST_ENTRIES or not there:
-            parts += [f"{name}={_format_value(value)}" for name, value in columns]
+            parts += [f"{labels.get(n, n)}={_format_value(value)}" for n, value in columns]
             continue
         values = np.array([value for _, value in columns], float)
         values = values[~np.isnan(values)]  # Items that there are not.

@@ -68,7 +68,7 @@ class Shrunk:
     name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
     coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
-    `notes` for people.
+    `notes` for people; `duration` of the simulation in seconds.
     """
 
     problem: Problem
@@ -87,11 +87,18 @@ class Shrunk:
     history: tuple[Step, ...]
     notes: tuple[str, ...] = ()
     key: Key[Array, ""] | None = field(default=None, repr=False)
+    duration: float | None = None
 
     @property
     def count(self) -> int:
         """Number of coordinates that are not nominal."""
         return len(self.changed)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names for people of what departs: control points of signals by their time."""
+        labels = self.problem.space.labels(self.duration)
+        return tuple(labels.get(name, name) for name in self.changed)
 
     def replay(self, precision: str | None = None) -> Replay:
         """Simulate it again, with the random key of the row, and keep the trace."""
@@ -124,10 +131,11 @@ class Shrunk:
                 f"{self.distance:.3g} of {'its' if self.count == 1 else 'their'} range "
                 f"(robustness {self.rho:.3g})"
             ]
-            width = max(map(len, self.changed))
+            names = self.labels
+            width = max(map(len, names))
             lines += [
                 f"  {name:<{width}}  {_shown(was)} -> {_shown(now)}"
-                for name, (was, now) in self.changed.items()
+                for name, (was, now) in zip(names, self.changed.values(), strict=True)
             ]
         lines.append(
             f"  row {self.row} departed in {_of(self.start_count, d)}, by "
@@ -230,6 +238,7 @@ def shrink(
         history=tuple(search.history),
         notes=tuple(notes),
         key=key,
+        duration=float(np.asarray(original.trace.clock())[-1]) or None,
     )
 
 

@@ -70,6 +70,12 @@ class Replay:
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.features)
         return {name: column[0] for name, column in self.problem.space.rows(one).items()}
 
+    def describe_features(self) -> str:
+        """Write the features in one line, control points of signals by their time."""
+        clock = np.asarray(self.trace.clock())
+        labels = self.problem.space.labels(float(clock[-1]) if len(clock) > 1 else None)
+        return format_features(self.columns(), labels)
+
     def __repr__(self) -> str:
         which = "" if self.row is None else f"row {self.row} of "
         return f"Replay({which}{self.problem.name!r}, {self._verdict()})"
@@ -79,7 +85,7 @@ class Replay:
         lines = [f"{which} of {self.problem.name}: {self._verdict()}"]
         if len(self.rho) > 1 and self.status == Status.OK:
             lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
-        lines.append(f"  {'features':<12} {format_features(self.columns())}")
+        lines.append(f"  {'features':<12} {self.describe_features()}")
         span, *signals = str(self.trace).splitlines()
         return "\n".join([*lines, f"  {span}", *(f"  {line}" for line in signals)])
 

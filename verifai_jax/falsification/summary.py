@@ -26,7 +26,8 @@ def summarize(run: Run) -> str:
     lines += _rates(run)
     if len(failed) < run.simulations:
         best = run.best.to_dict()
-        where = format_features({name: best[name] for name in run.table.features})
+        labels = None if run.problem is None else run.problem.space.labels(run.problem.duration)
+        where = format_features({name: best[name] for name in run.table.features}, labels)
         verdict = best.get("verdict", "")
         lines.append(
             f"  {'worst' if best['violated'] else 'nearest':<13}row {run.best.name}"

@@ -80,6 +80,13 @@ class Struct(Domain):
             for label in domain.coordinates(dotted(name, field))
         )
 
+    def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
+        return tuple(
+            label
+            for field, domain in self.fields
+            for label in domain.labels(dotted(name, field), duration)
+        )
+
     def __getitem__(self, name: str) -> Domain:
         check_names("feature", [name], self.names)
         return dict(self.fields)[name]

@@ -136,6 +136,16 @@ class Domain(abc.ABC):
         """Return the names of the unit coordinates of the feature called `name`."""
         return self.columns(name)
 
+    def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
+        """Return the names of the unit coordinates for people: control points by their time.
+
+        **Arguments:**
+
+        - `name`: of the feature.
+        - `duration`: of a simulation in seconds, for signals that have none of their own.
+        """
+        return self.coordinates(name)
+
     def refined(self, factor: int) -> "Domain":
         """Return the same domain with finer signals, where it has any; see `Signal.refined`."""
         return self

@@ -1,6 +1,7 @@
 """Functions of time as features (`Signal`), varied through their control points."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -101,6 +102,18 @@ class Signal(Domain):
         return tuple(
             column for knot in indexed(name, self.knots) for column in self.domain.columns(knot)
         )
+
+    def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
+        length = self.duration or duration
+        if length is None:
+            return self.coordinates(name)
+        parts = self.domain.coordinates(name)
+        if self.hold == "linear":
+            times = [f"at {time:.4g} s" for time in np.linspace(0, length, self.knots)]
+        else:
+            edges = np.linspace(0, length, self.knots + 1)
+            times = [f"from {a:.4g} s to {b:.4g} s" for a, b in pairwise(edges)]
+        return tuple(f"{part} {time}" for time in times for part in parts)
 
     def to_columns(self, values: Waveform, name: str) -> dict[str, np.ndarray]:
         knots, columns = np.asarray(values.knots), {}

@@ -98,6 +98,16 @@ class FeatureSpace:
         """Names of the coordinates, such as `x0`, `cars.length`, `cars[0].x`."""
         return self.root.coordinates("")
 
+    def labels(self, duration: float | None = None) -> dict[str, str]:
+        """Return the names of the coordinates for people: `{"wind[3]": "wind at 1.5 s", ...}`.
+
+        **Arguments:**
+
+        - `duration`: of a simulation in seconds, for signals that have none of their own; without
+          it their control points keep their numbers.
+        """
+        return dict(zip(self.coordinates, self.root.labels("", duration), strict=True))
+
     @property
     def dim(self) -> int:
         """Number of unit coordinates."""

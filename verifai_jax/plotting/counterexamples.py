@@ -216,7 +216,8 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
             f"{format_number(was)} to {format_number(now)}", (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
-    left.set_yticks(range(len(places)), [_short(name, 18) for name in shown[: len(places)]])
+    labels = [_short(label, 24) for label in shrunk.labels[: len(places)]]
+    left.set_yticks(range(len(places)), labels)
     left.set_ylim(max(len(places), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Formula, explain, robustness_signal
@@ -54,7 +53,7 @@ def plot_replay(replay: Replay, path: str | Path | None = None) -> Figure:
         _mark(panels[shown.index(decisive[0])], trace, *decisive)
     panels[-1].set_xlabel("time [s]")
     verdict = "violated" if replay.violated else replay.status.name.lower()
-    where = format_features(replay.columns())
+    where = replay.describe_features()
     figure.suptitle(
         f"{formula}\nrobustness {replay.rho[name]:.4g} ({verdict}) at {where}"[:400],
         fontsize=9,
