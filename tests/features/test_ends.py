@@ -169,3 +169,10 @@ def test_a_line_between_two_knots_stays_between_them():
         assert all(low <= on_host(float(time)) <= high for time in times[:50])
     slope = jax.grad(lambda knots: Waveform(knots, duration=1.0)(0.25))(jnp.asarray([high, high]))
     np.testing.assert_allclose(slope, [0.75, 0.25])
+
+
+def test_a_feature_fixed_at_its_end_stays_inside():
+    with in_precision("float64"):
+        space = vj.FeatureSpace({"x": vj.Box(0, 61.2), "y": vj.Box(0, 1)}).fixed(x=61.2)
+        for precision in ("float32", "float64"):
+            assert 61.199996 < float(space.unflatten(jnp.zeros(1, precision))["x"]) <= 61.2

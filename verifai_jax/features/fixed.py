@@ -48,7 +48,7 @@ class Fixed(Domain):
             real = jnp.issubdtype(leaf.dtype, jnp.floating)
             return leaf.astype(u.dtype) if real else leaf
 
-        return jax.tree.map(cast, self.value)
+        return self.domain.coerce(jax.tree.map(cast, self.value))
 
     def to_unit(self, value: PyTree) -> Float[Array, "0"]:
         return jnp.zeros(0, jnp.result_type(float))
