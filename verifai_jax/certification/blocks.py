@@ -23,6 +23,7 @@ from verifai_jax.certification.simulators import (
     problem_with,
     shared_simulator,
 )
+from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
@@ -193,6 +194,7 @@ class Blocks:
 
             yield i, _from_memo(self._remember(block.name, compute), len(block.points))
 
+    @truncate_silently()
     def _simulate(self, owner: int, blocks: list[Block], key: Any) -> list[Verdicts]:
         simulator, places = self._simulators[owner]
         self.simulated += len(blocks)
@@ -201,6 +203,7 @@ class Blocks:
         first = np.array([block.first for block in blocks], np.int32)
         return simulator(members, u, first, key)
 
+    @truncate_silently()
     def _traceable(self, problem_of: Any, policy: Any, numbers: tuple[int, ...]) -> bool:
         """Check by abstract evaluation that JAX can trace the problem in the policy's numbers."""
 

@@ -1,14 +1,18 @@
 """The two precisions of simulations, verdicts and gradients."""
 
+import re
 import threading
+import warnings
 import weakref
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 
 import jax
 import numpy as np
 
 PRECISIONS = ("float32", "float64")
+_TRUNCATION = re.compile("Explicitly requested dtype .* is not available")
 
 
 def in_precision(precision: str) -> AbstractContextManager[None]:
@@ -24,7 +28,30 @@ def in_precision(precision: str) -> AbstractContextManager[None]:
             f"precision must be {' or '.join(map(repr, PRECISIONS))}; got {precision!r}"
         )
     _give_constants_their_precision()
-    return jax.enable_x64(precision == "float64")  # pyright: ignore[reportReturnType]
+    return _computing_in(precision)
+
+
+@contextmanager
+def _computing_in(precision: str) -> Iterator[None]:
+    with truncate_silently(), jax.enable_x64(precision == "float64"):
+        yield
+
+
+@contextmanager
+def truncate_silently() -> Iterator[None]:
+    """Keep JAX from warning that a system's float64 is truncated: a run asks for its precision.
+
+    A system that says `jnp.asarray(x, float)` serves both precisions, and the advice to enable x64
+    for all of JAX is none for its author. All other warnings go on as they are. The filter is put
+    into the list itself: `warnings.catch_warnings` would make Python forget which warnings of the
+    user's own code it has shown.
+    """
+    filters: list[object] = warnings.filters  # pyright: ignore[reportAssignmentType]
+    filters.insert(0, entry := ("ignore", _TRUNCATION, UserWarning, None, 0))
+    try:
+        yield
+    finally:
+        filters.remove(entry)
 
 
 @cache

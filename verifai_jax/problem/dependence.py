@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
 from verifai_jax.problem.problem import Problem
 
@@ -22,6 +23,7 @@ def has_gradient(problem: Problem) -> bool:
     return problem.programs.get(DEPENDENCE, None, lambda: _depends(problem))
 
 
+@truncate_silently()
 def _depends(problem: Problem) -> bool:
     key = jax.random.key(0)
 

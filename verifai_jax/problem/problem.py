@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import defined_at, explain_user_error
@@ -125,6 +126,7 @@ class Problem:
         """True where the system runs on the host, and JAX cannot trace it."""
         return self.system.black_box
 
+    @truncate_silently()
     def draws(self) -> bool:
         """Return whether the system uses its random key; abstract evaluation, nothing compiles.
 
@@ -164,6 +166,7 @@ class Problem:
         own = None if self.nominal is None else fixed
         return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
 
+    @truncate_silently()
     def check(self) -> None:
         """Trace the system and its monitor abstractly: no simulation, nothing compiles.
 
@@ -203,6 +206,7 @@ class Problem:
         form = self.form()
         return None if form is None or form.dt is None else (form.length - 1) * form.dt
 
+    @truncate_silently()
     def _form(self) -> Trace | None:
         features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
         try:

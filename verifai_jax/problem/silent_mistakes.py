@@ -19,6 +19,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.interpreters import partial_eval
 from jaxtyping import PyTree
 
+from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.features import Domain
@@ -122,6 +123,7 @@ def traced_by_default(system: System) -> bool:
     )
 
 
+@truncate_silently()
 def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
     """Trace from features to the monitored signals, and the length of what counts of them."""
 
