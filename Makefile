@@ -40,12 +40,13 @@ falsify: .venv/installed
 # Tests of one file share what they compile, so a file stays with one worker; long files begin.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-# Quick tests compile without most of XLA's optimisations, in two thirds of the time; slow ones
-# compile as a user does.
+# Quick and thorough tests compile without most of XLA's optimisations, in two thirds of the time;
+# slow ones compile as a user does.
 test: .venv/installed
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
 
 test-slow: .venv/installed
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST) -m "thorough and not slow"
 	$(PYTEST) -m slow
 
 test-all: test test-slow

@@ -4,6 +4,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
@@ -80,6 +82,7 @@ def test_first_words_are_noticed():
     assert list(questioning(ast.parse(source))) == [(1, "Whether it holds."), (2, "How.")]
 
 
+@pytest.mark.thorough
 def test_arguments_have_types():
     annotations = [
         text for file in FILES for text in argument_annotations(ast.parse(file.read_text()))

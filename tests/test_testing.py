@@ -77,6 +77,7 @@ class Wayward(Search):
         return {**state, "shift": shift}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("flaw", "message"),
     [
@@ -99,6 +100,7 @@ def test_what_is_right_passes():
     check_search(Uniform(), CUBE)
 
 
+@pytest.mark.thorough
 def test_batches_that_matter():
     with pytest.raises(AssertionError, match="must not depend on the batch size"):
         check_batch_independence(Wayward(), CUBE)

@@ -18,6 +18,7 @@ def judged(**columns):
     return pd.DataFrame(columns).assign(violated=False, status="ok")
 
 
+@pytest.mark.thorough
 def test_discrepancy_is_relative_to_uniform_samples():
     ratios = []
     for seed in range(30):
@@ -144,6 +145,7 @@ def test_pictures(tmp_path):
             assert image.size[0] > 300
 
 
+@pytest.mark.thorough
 def test_distributions_are_uniform_in_their_own_coordinates():
     space = vj.FeatureSpace(
         {
@@ -170,6 +172,7 @@ def test_distributions_are_uniform_in_their_own_coordinates():
     assert coverage(table).discrepancy > 20
 
 
+@pytest.mark.thorough
 def test_what_a_constraint_forbids_is_no_hole():
     space = vj.FeatureSpace(
         {

@@ -58,6 +58,7 @@ def test_report_on_disk(found, tmp_path):
     assert "x &lt;= 0.3" in page or "&lt;= " in page
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("failing", ["none", "one", "three", "all", "any", "empty", "single"])
 def test_odd_tables(failing, tmp_path):
     frame = failing_table(60)

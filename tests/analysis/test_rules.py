@@ -217,6 +217,7 @@ def test_conditions_in_words():
     assert str(OneOf(column, (0, 1, 4))) == "c is none of c, d"
 
 
+@pytest.mark.thorough
 def test_what_precision_means_depends_on_the_search():
     def system(features, key):
         return vj.Trace({"y": features["a"][None] - 0.25}, dt=1.0)

@@ -105,6 +105,7 @@ P = 0.05
 HARD = np.concatenate([np.full(8, P), [0.0, 0.01, 0.02, 0.03, 0.08, 0.1, 0.2, 0.9]])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("runs", "budget"), [(15, 12_000), pytest.param(200, 40_000, marks=pytest.mark.slow)]
 )

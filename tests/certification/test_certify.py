@@ -75,6 +75,7 @@ def test_verdicts_of_known_rates(certificates):
     assert certificates.stopped == "decided"
 
 
+@pytest.mark.thorough
 def test_failures_are_those_of_the_samples(certificates):
     pieces = Blocks(problem_of, POLICIES, seed=3, lanes=64)
     for row, t in zip(certificates.rows, THRESHOLDS, strict=True):
@@ -169,6 +170,7 @@ def test_a_digest_is_of_numbers_and_structure():
     assert digest(threshold(0.5, 4)) != digest(threshold(0.5, 5))
 
 
+@pytest.mark.thorough
 def test_at_exactly_zero_the_comparator_decides():
     zero = [jax.tree.map(np.zeros_like, threshold(0.0))]
     only = {"samples": 64, "budget": 64, "attack_simulations": 0}
@@ -232,6 +234,7 @@ def outside(policy):
     return vj.Problem("threshold", X, vj.blackbox(system), "always y <= 0")
 
 
+@pytest.mark.thorough
 def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
     some = [POLICIES[2]]
     options = {"p": 0.05, "samples": 64, "budget": 64, "attack_simulations": 64}

@@ -43,6 +43,7 @@ def call(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.thorough
 def test_falsify_and_replay(call, tmp_path):
     output = call(
         "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300, "--seed", 2
@@ -63,6 +64,7 @@ def test_falsify_and_replay(call, tmp_path):
     assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
 
 
+@pytest.mark.thorough
 def test_options_of_a_search(call, tmp_path):
     output = call(
         "falsify",
@@ -83,6 +85,7 @@ def test_options_of_a_search(call, tmp_path):
     assert "here" in output
 
 
+@pytest.mark.thorough
 def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--batch", 16]
     call(*start, "--budget", 48, "--only", "b", "--folder", "one", "--no-pictures")
@@ -97,6 +100,7 @@ def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     assert "--seed is fixed in the run that --resume goes on with" in output
 
 
+@pytest.mark.thorough
 def test_ends_and_warm_start(call):
     ramp = ["falsify", "specs/ramp.py:ramp", "--batch", 64, "--no-pictures"]
     output = call(*ramp, "--search", "uniform", "--within", 0.1, "--folder", "prior")
@@ -111,6 +115,7 @@ def test_ends_and_warm_start(call):
     assert "needs independent samples" in call(*ramp, "--within", 0.1, code=2)
 
 
+@pytest.mark.thorough
 def test_analyze(call, tmp_path):
     call("falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 400, "--no-pictures")
     output = call("analyze", "runs/ramp-1")
@@ -180,6 +185,7 @@ def test_precision_of_a_run(call, tmp_path):
     assert "has no backends to choose from; got backend 'native'" in output
 
 
+@pytest.mark.thorough
 def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_path):
     (tmp_path / "specs" / "noisy.py").write_text(
         PROBLEM.replace('f["a"] +', 'jax.random.normal(key) + f["a"] +').replace(
@@ -339,6 +345,7 @@ class TestMonitor:
         )
         (tmp_path / "uneven.csv").write_text("time,dist\n0,1\n0.5,2\n1.5,2\n")
 
+    @pytest.mark.thorough
     def test_robustness_of_a_recording(self, call):
         assert call("monitor", "always dist > 1", "drive.csv") == "holds with robustness 0.5\n"
         gate = ("--fail-on", "violation")

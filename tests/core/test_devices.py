@@ -25,6 +25,7 @@ def test_one_device_per_core():
     assert devices == cores
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("cores", "devices"), [("1", "1"), ("3", "3")])
 def test_the_user_may_choose(cores, devices):
     done = run("import verifai_jax, jax; print(len(jax.devices()))", VERIFAI_JAX_CORES=cores)
@@ -41,6 +42,7 @@ def test_a_backend_that_runs_already_is_left_alone():
     assert done.stdout.strip() == "1"
 
 
+@pytest.mark.thorough
 def test_compiled_programs_outlive_the_process(tmp_path):
     code = (
         "import jax.numpy as jnp, verifai_jax as vj\n"

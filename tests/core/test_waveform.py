@@ -29,6 +29,7 @@ def test_constant_holds_each_from_its_start_on():
     np.testing.assert_array_equal(values, KNOTS[np.clip(places, 0, 4)])
 
 
+@pytest.mark.thorough
 @given(st.sampled_from([1, 3, 16, 40]), st.integers(1, 500), st.floats(0.001, 0.1))
 @settings(max_examples=60, deadline=None)
 def test_pieces_begin_on_the_beat_of_a_rollout(pieces, steps, dt):
@@ -37,6 +38,7 @@ def test_pieces_begin_on_the_beat_of_a_rollout(pieces, steps, dt):
     assert jax.vmap(wave)(clock).tolist() == list(range(pieces))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("wave", [LINEAR, CONSTANT], ids=["linear", "constant"])
 @pytest.mark.parametrize("factor", [1, 2, 3])
 def test_refined_is_the_same_function(wave, factor):
@@ -57,6 +59,7 @@ def test_vectors_and_batches():
     np.testing.assert_allclose(values[-1], knots[-1, -1])
 
 
+@pytest.mark.thorough
 def test_gradients():
     slopes = jax.grad(lambda wave: wave(0.625))(LINEAR)
     np.testing.assert_allclose(slopes.knots, [0, 0.75, 0.25, 0, 0], atol=1e-6)

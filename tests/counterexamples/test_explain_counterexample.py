@@ -48,6 +48,7 @@ def explained(driven):
     return explain(driven)
 
 
+@pytest.mark.thorough
 def test_the_predicate_the_instant_and_the_features(explained):
     assert isinstance(explained, Explained)
     assert explained.row == 0
@@ -88,6 +89,7 @@ def test_the_paragraph(explained):
     assert "A small change helps most in mass: more of it" in text
 
 
+@pytest.mark.thorough
 def test_without_nominal_features(driven):
     bare = replace(driven, problem=replace(driven.problem, nominal=None))
     why = explain(bare)
@@ -146,6 +148,7 @@ def test_words():
     assert spans_of(vj.Box(0.0, 1.0), 4.0) is None
 
 
+@pytest.mark.thorough
 def test_the_command(tmp_path):
     from verifai_jax.cli.explain import explain as command
     from verifai_jax.core.targets import load_target

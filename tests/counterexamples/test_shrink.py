@@ -102,6 +102,7 @@ def test_the_edge_of_two_half_spaces(edges):
         checked(edges, row, EDGE, EDGE[1], seed=seed, others=False, budget=600)
 
 
+@pytest.mark.thorough
 def test_what_it_says(edges):
     found = shrink(edges)
     assert isinstance(found, Shrunk)
@@ -119,11 +120,13 @@ def test_what_it_says(edges):
     assert float(found.features["x2"]) == 2.0
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same(edges):
     one, two = shrink(edges, seed=3, budget=300), shrink(edges, seed=3, budget=300)
     np.testing.assert_array_equal(one.u, two.u)
 
 
+@pytest.mark.thorough
 def test_a_few_simulations_do_not_make_it_safe(edges):
     for budget in (1, 5, 20):
         found = shrink(edges, budget=budget)
@@ -131,6 +134,7 @@ def test_a_few_simulations_do_not_make_it_safe(edges):
         assert found.replay().violated
 
 
+@pytest.mark.thorough
 def test_another_nominal(edges):
     found = shrink(edges, nominal={"x0": 5.0})
     assert list(found.changed) == ["x1"]
@@ -139,6 +143,7 @@ def test_another_nominal(edges):
     assert "the nominal features fail themselves" in str(already)
 
 
+@pytest.mark.thorough
 def test_each_kind_by_itself():
     problem = problem_of("sides", 2, lambda u: jnp.where(u[0] > 0.5, 0.8 - u[0], u[0] - 0.4))
     run = vj.simulate(problem, [{"x0": 5.5, "x1": 5.0}, {"x0": -1.0, "x1": 0.0}], progress=False)
@@ -225,6 +230,7 @@ def test_a_black_box_without_gradients():
     assert (few.count, few.distance) == (1, pytest.approx(0.375, rel=0.05))
 
 
+@pytest.mark.thorough
 def test_a_system_that_draws_is_simulated_with_the_key_of_the_row():
     def system(features, key):
         lucky = jax.random.uniform(key)
@@ -257,6 +263,7 @@ def test_the_nearest_point_of_half_spaces():
     np.testing.assert_allclose(capped, [0.2, 0.1], atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_departures():
     space = {"x": vj.Box(0.0, 10.0), "n": vj.DiscreteBox(0, 4), "c": vj.Categorical("a", "b", "c")}
     problem = vj.Problem(
@@ -272,6 +279,7 @@ def test_departures():
     assert [name for name, _ in nominal.groups] == ["x", "n", "c"]
 
 
+@pytest.mark.thorough
 def test_the_command(edges, tmp_path):
     from verifai_jax.cli.shrink import shrink as command
 

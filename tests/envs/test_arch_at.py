@@ -76,6 +76,7 @@ def test_segments_are_those_of_matlab():
     assert set(np.asarray(states.gear)) == {1, 2, 3, 4}
 
 
+@pytest.mark.thorough
 def test_full_throttle_reaches_what_others_computed(simulate):
     trace = simulate([100.0] * 6, [0.0] * 6)
     wanted = {
@@ -179,6 +180,7 @@ def test_shifting_up_and_down_is_that_of_a_plain_program(simulate):
     np.testing.assert_allclose(trace["rpm"], rows[:, 1], rtol=0, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_derivatives_are_those_of_differences():
     system = at.automatic_transmission(duration=5.0)
 

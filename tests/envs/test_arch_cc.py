@@ -37,6 +37,7 @@ def places(trace, time):
     return [float(trace[name][round(time * 100)]) for name in NAMES]
 
 
+@pytest.mark.thorough
 def test_transitions_at_the_end_of_steps_are_what_fixed_step_tools_report():
     run = jax.jit(cc.chasing_cars(located=False).__call__)
     full = run({"throttle": jnp.array(1.0), "brake": jnp.array(0.0)})
@@ -143,6 +144,7 @@ def test_single_precision_keeps_the_gaps():
         np.testing.assert_allclose(gap, double[ahead] - double[behind], rtol=0, atol=0.02)
 
 
+@pytest.mark.thorough
 def test_derivatives_go_through_transitions(located):
     def outcome(x):
         features = {"throttle": Waveform(x[:2], "constant"), "brake": Waveform(x[2:], "constant")}

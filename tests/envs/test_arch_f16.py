@@ -32,6 +32,7 @@ def falls():
         return lambda rows: np.asarray(run(jnp.asarray(rows, jnp.float64)))
 
 
+@pytest.mark.thorough
 def test_falls_are_those_of_aerobench(falls):
     pi = math.pi
     # Least altitudes by AeroBench v2 with its adaptive method.
@@ -53,6 +54,7 @@ def test_falls_are_those_of_aerobench(falls):
     np.testing.assert_allclose(altitude[0, [30, 60, 150, 450]], wanted, rtol=0, atol=0.01)
 
 
+@pytest.mark.thorough
 def test_heading_makes_no_difference_and_the_rest_is_differentiable(falls):
     system, centre = plane.f16(), np.array([math.pi / 4, -0.375 * math.pi, -math.pi / 4])
 
@@ -89,6 +91,7 @@ def test_engine_is_that_of_its_tables():
     assert float(pressure) == pytest.approx(0.5 * 2.377e-3 * 500**2)
 
 
+@pytest.mark.thorough
 def test_the_pilot_rolls_pulls_and_stands_by():
     trace = jax.jit(plane.f16().__call__)({"phi": 0.7})
     modes = np.asarray(trace["mode"]).astype(int)

@@ -40,6 +40,7 @@ def test_problem_fits_its_system_and_looks_no_further(name):
         assert formula.horizon() <= problem.system.duration + 1e-9
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", MODULES)
 def test_requirements_hold_on_an_ordinary_day(module):
     problems = [p for p in vars(module).values() if isinstance(p, vj.Problem)]

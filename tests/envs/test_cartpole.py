@@ -35,6 +35,7 @@ def gymnasium_episode(features, actions):
     return np.array(states), terminated
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(8))
 def test_equal_to_gymnasium_step_for_step(seed):
     rng = np.random.default_rng(seed)
@@ -138,6 +139,7 @@ def test_shipped_network_balances_in_gymnasium_itself():
     assert total >= 475
 
 
+@pytest.mark.thorough
 def test_shipped_network_fails_off_nominal():
     # What the whole toolkit is shown on: a controller of full return that breaks.
     system = cp.cartpole(cp.neural(), terminate=True)
@@ -163,6 +165,7 @@ def test_task_steps_like_gymnasium():
     assert over
 
 
+@pytest.mark.thorough
 def test_an_episode_has_its_own_pole_and_start():
     task = cp.CartPoleTask(masspole_range=1.0, length_range=0.5, x0_range=1.0, theta0_range=0.1)
     assert len(jax.tree.leaves(task)) == 5
@@ -226,6 +229,7 @@ def test_argmax_pushes_with_full_force_and_has_the_derivative_of_the_mean_force(
         assert float(jax.grad(lambda t, f=force: f(blind, t))(at[2])) == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("width", [16, 64])
 def test_force_is_that_of_the_policy_small_or_large_normalised_or_not(width):
     layers = new_layers(jax.random.key(1), (4, width, width, 2), gain=1.0)
@@ -242,6 +246,7 @@ def test_force_is_that_of_the_policy_small_or_large_normalised_or_not(width):
         assert float(push) == (10 if int(policy.act(state)) == 1 else -10)
 
 
+@pytest.mark.thorough
 def test_one_program_judges_any_policy_of_a_form():
     @jax.jit
     def worst(policy, u):
@@ -287,6 +292,7 @@ def test_wind_is_a_force_on_the_cart():
     assert abs(one.signals["theta"][-1] - blown({"theta0": 0.02}, KEY).signals["theta"][-1]) > 1e-4
 
 
+@pytest.mark.thorough
 def test_either_controller():
     both = cp.cartpole(cp.either(cp.linear(), cp.neural()), duration=0.2)
     for place, alone in enumerate((cp.linear(), cp.neural())):

@@ -91,6 +91,7 @@ class State:
         self.qpos = jnp.array([trace[name][sample] for name in ("x", "height", "pitch")])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_an_ordinary_day_is_safe(name):
     problem = getattr(specs, name).on_backend("native")
@@ -99,6 +100,7 @@ def test_an_ordinary_day_is_safe(name):
     assert min(seen.rho.values()) > 0.05
 
 
+@pytest.mark.thorough
 def test_a_few_samples_find_a_failure():
     problem = specs.upright.on_backend("native")
     run = vj.falsify(problem, "uniform", 64, batch=64, seed=0)
@@ -169,6 +171,7 @@ def test_a_policy_that_did_not_learn_is_not_written(earned, status, tmp_path, ca
         }
 
 
+@pytest.mark.thorough
 def test_a_row_is_the_same_simulation_in_any_batch():
     """Falls differ visibly by the last digit of a network's output."""
     problem = specs.upright.on_backend("native")
@@ -182,6 +185,7 @@ def test_a_row_is_the_same_simulation_in_any_batch():
         np.testing.assert_array_equal(trace["pitch"], whole["pitch"][:count])
 
 
+@pytest.mark.thorough
 def test_replays_are_exact():
     run = vj.falsify(specs.upright, "uniform", 70, batch=64, backend="native")
     for row in (int(run.best.name), 69):

@@ -70,6 +70,7 @@ def ours(continuous, start, actions, dtype):
     return np.concatenate([np.asarray(start)[None], states]), np.asarray(rewards), np.asarray(over)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("continuous", [False, True])
 def test_equal_to_gymnasium_step_for_step(continuous, monkeypatch):
     # Gymnasium computes the discrete car in float64; it rounds the continuous one's state to
@@ -197,6 +198,7 @@ def test_shaping_sums_to_the_difference_of_potentials():
     assert float(reward) == pytest.approx(-1 - 20.0 * float(mc.energy(near.state) - 1), rel=1e-5)
 
 
+@pytest.mark.thorough
 def test_ranges_of_episodes():
     task = mc.ContinuousMountainCarTask(
         start_range=0.4, start_speed_range=0.02, power_range=1.0, gravity_range=0.5
@@ -293,6 +295,7 @@ def pushing_along(continuous):
     return Policy(((weight, jnp.array([0.0, -1.0, 0.5])),), None, None, None, Discrete(3))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("continuous", [False, True])
 def test_one_program_judges_any_policy_of_a_form(continuous):
     baseline = climb_continuous if continuous else climb
@@ -318,6 +321,7 @@ def test_one_program_judges_any_policy_of_a_form(continuous):
     baseline.check()
 
 
+@pytest.mark.thorough
 def test_pushing_along_solves_the_tasks():
     returns = evaluate(mc.ContinuousMountainCarTask(), pushing_along(True), episodes=50)
     assert returns.min() > 85

@@ -41,6 +41,7 @@ def test_the_spring_pulls_the_tip_to_the_target():
     assert away[-1] < rc.TOLERANCE
 
 
+@pytest.mark.thorough
 def test_reacher_refuses_what_it_does_not_have():
     with pytest.raises(UnknownNameError, match="'loads'; did you mean 'load'"):
         rc.reacher("loads")

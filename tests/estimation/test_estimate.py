@@ -30,6 +30,7 @@ def rare():
     return estimate(half_space(1e-6, "rare"), budget=20_000, p0=1e-4)
 
 
+@pytest.mark.thorough
 def test_one_in_a_million(rare):
     assert rare.method == "importance"
     assert rare.low < 1e-6 < rare.high
@@ -52,6 +53,7 @@ def test_pictures(rare, tmp_path):
     assert (tmp_path / "estimate.png").stat().st_size > 5000
 
 
+@pytest.mark.thorough
 def test_features_reach_beyond_single_precision():
     # At the upper end a float32 coordinate has 17 numbers in this tail, at the lower many more.
     b = norm.isf(1e-6)
@@ -62,6 +64,7 @@ def test_features_reach_beyond_single_precision():
     assert found.probability == pytest.approx(1e-6, rel=0.05)
 
 
+@pytest.mark.thorough
 def test_a_black_box_without_gradient_with_simulations_that_fail():
     @vj.blackbox
     def system(features):
@@ -78,6 +81,7 @@ def test_a_black_box_without_gradient_with_simulations_that_fail():
     assert "neither safe nor failing" in str(found)
 
 
+@pytest.mark.thorough
 def test_several_formulas_and_a_constraint():
     system = lambda f, key: vj.Trace({"x": f["x"][None], "y": f["y"][None]}, dt=1.0)  # noqa: E731
     space = vj.FeatureSpace(
@@ -126,6 +130,7 @@ easy = vj.Problem(
 """
 
 
+@pytest.mark.thorough
 def test_command(tmp_path):
     (tmp_path / "easy.py").write_text(TARGET)
     arguments = [f"{tmp_path / 'easy.py'}:easy", "--budget", "3000", "--p0", "0.5"]

@@ -27,6 +27,7 @@ def answered(
     return answer, limit_state
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "dim"),
     [("half-space", 2), ("sphere", 10), ("uneven modes", 5)],
@@ -94,6 +95,7 @@ def test_boolean_robustness_has_no_slope_and_is_counted():
     assert answer.high > 3e-4
 
 
+@pytest.mark.thorough
 def test_discrete_coordinates_are_cells_of_the_cube():
     # One of 10 cells, and in it a tail: p = 1e-5.
     def robustness(u):
@@ -103,6 +105,7 @@ def test_discrete_coordinates_are_cells_of_the_cube():
     assert answer.probability == pytest.approx(1e-5, rel=0.1)
 
 
+@pytest.mark.thorough
 def test_a_constraint_makes_the_prior_conditional():
     # Given that the first coordinate lies in its upper quarter, failing is four times as probable.
     answer, limit_state = answered(
@@ -129,6 +132,7 @@ def test_simulations_without_verdict_widen_the_upper_end():
     assert answer.high > 0.15 * 0.98 + 0.02
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same():
     one, other = (answered(half_space(4, 1e-4), 4, 10_000, seed=3)[0] for _ in range(2))
     assert one.probability == other.probability

@@ -28,6 +28,7 @@ def components(failures):
     }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["gaussian", "smooth", "copula", "alike", "shell"])
 def test_density_is_that_of_the_samples(failures, name):
     component = components(failures)[name]

@@ -56,6 +56,7 @@ def problem(**options: Any):
     return vj.Problem("two", SPACE, TwoEngines(**options), "always x <= 0.9")
 
 
+@pytest.mark.thorough
 def test_a_gradient_needs_the_backend_that_jax_traces():
     run = vj.falsify(problem(), "gradient", 32, batch=8)
     assert run.backend == "mjx"
@@ -74,6 +75,7 @@ def test_a_short_run_does_not_wait_for_a_compiler():
     assert "less than compiling for mjx takes" in choice.why
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("slow", "faster"), [(0.2, "mjx"), (0.0, "native")])
 def test_the_faster_one_is_taken_as_measured(monkeypatch, slow, faster):
     monkeypatch.setattr(backends, "WORTH_MEASURING", 0.0)
@@ -113,6 +115,7 @@ def test_a_model_that_mjx_cannot_do_is_simulated_natively(monkeypatch):
     assert "tendons with pulleys" in choice.why
 
 
+@pytest.mark.thorough
 def test_runs_remember_their_backend(tmp_path):
     two = problem()
     whole = vj.falsify(two, "uniform", 64, batch=16, backend="native")

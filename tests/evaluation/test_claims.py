@@ -37,6 +37,7 @@ def artefact():
     return vj.Problem("artefact", SPACE, Decay(), "always x >= -0.05")
 
 
+@pytest.mark.thorough
 def test_artefacts_of_the_step_are_not_claimed(artefact):
     run = vj.falsify(artefact, "halton", 64, batch=64)
     raw = run.table.all
@@ -58,6 +59,7 @@ def test_a_search_goes_on_where_nothing_is_confirmed(artefact):
     assert len(run.table.unconfirmed)
 
 
+@pytest.mark.thorough
 def test_true_failures_are_claimed():
     problem = vj.Problem("slow", SPACE, Decay(0.125), "eventually[0, 4] x <= 0.3")
     run = vj.falsify(problem, budget=64, batch=1, stop_after=1)
@@ -68,6 +70,7 @@ def test_true_failures_are_claimed():
     assert "1 confirmed in double precision, at a half and a quarter of the step" in run.summary()
 
 
+@pytest.mark.thorough
 def test_slopes_are_left_out_where_there_are_none():
     space = {"a": vj.Box(0, 10), "b": vj.Box(0, 1)}
 
@@ -87,6 +90,7 @@ def test_slopes_are_left_out_where_there_are_none():
     assert notes[0] in run.notes
 
 
+@pytest.mark.thorough
 def test_diverse_failures_are_of_both_kinds():
     def system(features, key):
         x, y = features["x"], features["y"]

@@ -73,6 +73,7 @@ def test_a_step_that_belongs_to_the_system_is_not_made_finer(circles):
     assert "refuted" not in found.verdict
 
 
+@pytest.mark.thorough
 def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles):
     a = circles.table.counterexamples["a"]
     verdict = confirmed_circles.table["verdict"]
@@ -85,6 +86,7 @@ def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles
     assert len(confirmed_circles) == len(a) == sum(confirmed_circles.counts.values())
 
 
+@pytest.mark.thorough
 def test_robustness_of_each_check_is_that_of_an_own_replay(circles, confirmed_circles):
     row = circles.best
     for factor, name in ((1, "float64"), (2, "half_step"), (4, "quarter_step")):
@@ -249,6 +251,7 @@ def test_at_zero_the_boolean_semantics_decide():
     assert checked(allowed, [0.3]).verdict.tolist() == ["refuted"]
 
 
+@pytest.mark.thorough
 def test_random_systems_keep_their_numbers_and_their_precision():
     noisy = plain(lambda f, key: f["x"] + 0.1 * jax.random.normal(key))
     run = vj.falsify(noisy, "uniform", 64, batch=64, seed=3, progress=False, confirm=False)
@@ -319,6 +322,7 @@ def test_a_black_box_may_be_refined():
     )
 
 
+@pytest.mark.thorough
 def test_features_are_those_of_the_table():
     space = vj.FeatureSpace(
         {
@@ -449,6 +453,7 @@ circle = oscillator()
 """
 
 
+@pytest.mark.thorough
 def test_command_line(circles, tmp_path):
     from verifai_jax.cli.confirm import confirm as command
 

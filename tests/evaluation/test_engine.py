@@ -32,6 +32,7 @@ def points(n, d, seed=0):
     return np.random.default_rng(seed).random((n, d), np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("terminate", [None, lambda s, f: s["h"] < 0], ids=["whole", "ends"])
 def test_a_streaming_monitor_says_what_the_stored_trace_says(terminate):
     formulas = {
@@ -50,6 +51,7 @@ def test_a_streaming_monitor_says_what_the_stored_trace_says(terminate):
     np.testing.assert_array_equal(rho, wanted[0])
 
 
+@pytest.mark.thorough
 def test_a_streaming_monitor_reports_what_is_not_finite():
     system = vj.ode(
         lambda t, s, c, f: {"h": jnp.where(f["start"] > 1, jnp.inf, 0.0)},
@@ -96,6 +98,7 @@ def test_packing_is_lossless():
     assert np.signbit(back["m"]).all()
 
 
+@pytest.mark.thorough
 def test_float64_simulates_and_judges_in_float64():
     problem = vj.Problem("fall", SPACE, falling(), "always[0, 2] h >= 0")
     single = vj.falsify(problem, "uniform", 32, batch=32)
@@ -111,6 +114,7 @@ def test_float64_simulates_and_judges_in_float64():
     assert jnp.zeros(1).dtype == jnp.float32  # Nothing of it stays behind.
 
 
+@pytest.mark.thorough
 def test_float64_also_in_gradients_and_on_the_host():
     problem = vj.Problem("fall", SPACE, falling(), "always[0, 2] h >= 0")
     gradient = engine_for(problem, 8, True, "float64").evaluate(points(8, 2), KEY, 0, 0.05).gradient
@@ -131,6 +135,7 @@ def test_refuses_other_precisions():
         vj.falsify(problem, "uniform", 4, precision="half")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [3, 4, 8, 11, 20])
 def test_forward_and_reverse_agree(d):
     weights = jnp.linspace(-1, 1, d)
@@ -168,6 +173,7 @@ class Iterated:
         return Trace({"x": x[None]}, dt=1.0)
 
 
+@pytest.mark.thorough
 def test_a_loop_without_reverse_mode_is_differentiated_forward():
     space = {f"f{i}": vj.Box(0, 1) for i in range(6)}
     problem = vj.Problem("loop", space, Iterated(), "x <= 0.5")
@@ -188,6 +194,7 @@ def test_a_loop_without_reverse_mode_is_differentiated_forward():
     np.testing.assert_allclose(gradient, np.repeat(-slope[:, None] / 6, 6, axis=1), atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_gradients_that_are_not_finite_are_reported_by_row():
     def system(features, key):
         # At the left of the space the square root has an infinite slope.

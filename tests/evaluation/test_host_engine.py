@@ -78,6 +78,7 @@ def traced():
     return vj.falsify(problem_of(ramp), "uniform", 200, batch=64).table.all
 
 
+@pytest.mark.thorough
 def test_lock_step_gives_the_table_of_the_traced_system(traced):
     table = vj.falsify(problem_of(LockStep()), "uniform", 200, batch=64).table.all
     assert (table["message"] == "").all()
@@ -98,6 +99,7 @@ def test_rows_come_in_any_order_and_are_told_apart(traced):
     np.testing.assert_allclose(table.loc[proper, "rho"], traced.loc[proper, "rho"], atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("system", "message"),
     [
@@ -122,6 +124,7 @@ def test_a_batch_of_the_wrong_form_is_rows_too():
     assert "a batch of 8 simulations must give signals [8, time]; 'x' has" in table["message"][0]
 
 
+@pytest.mark.thorough
 def test_finished_rows_of_a_batch_survive_a_kill(tmp_path, traced):
     """A process that dies within a batch leaves a journal; only the other rows are simulated."""
 

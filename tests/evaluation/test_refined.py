@@ -121,6 +121,7 @@ def test_a_finer_loop_has_derivatives():
         np.testing.assert_allclose(jax.jit(derivative(last))(2.0), np.exp(-5.2), rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_the_push_of_the_cart_is_the_same_at_every_step():
     times = jnp.arange(0.99, 1.2, 0.005)
     share = jax.vmap(functools.partial(cartpole.pushed, push_time=1.013))
@@ -131,6 +132,7 @@ def test_the_push_of_the_cart_is_the_same_at_every_step():
     assert np.all(fine[np.asarray(times) < 0.999] == 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("system", "features", "signal"),
     [

@@ -26,6 +26,7 @@ def problem():
     return vj.Problem("ramp", space=SPACE, system=ramp, spec="always[0, 1] x <= 1")
 
 
+@pytest.mark.thorough
 def test_rows_are_what_was_simulated(problem):
     run = vj.falsify(problem, "uniform", 500, batch=64, seed=3)
     table = run.table.all
@@ -45,6 +46,7 @@ def test_rows_are_what_was_simulated(problem):
     assert run.best["rho"] == table["rho"].min()
 
 
+@pytest.mark.thorough
 def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     assert vj.falsify(problem, "uniform", 3000).batch == 1024
     # A search that does not learn, and that nothing but the budget ends, has few rounds.
@@ -55,6 +57,7 @@ def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     assert vj.search.Bayes().most_at_once == 16
 
 
+@pytest.mark.thorough
 def test_same_seed_same_table(problem):
     one = vj.falsify(problem, "cross_entropy", 300, batch=64, seed=5).table.all
     two = vj.falsify(problem, "cross_entropy", 300, batch=64, seed=5).table.all
@@ -71,6 +74,7 @@ def test_passive_searches_do_not_depend_on_the_batch(problem, search):
     np.testing.assert_allclose(one["rho"], two["rho"], atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", ["uniform", "gradient"])
 def test_results_do_not_depend_on_a_users_64_bit_setting(search):
     def run():
@@ -84,6 +88,7 @@ def test_results_do_not_depend_on_a_users_64_bit_setting(search):
     np.testing.assert_allclose(wide["rho"], plain["rho"], atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_random_systems_replay_and_do_not_depend_on_the_batch():
     def noisy(features, key):
         return vj.Trace({"x": features["a"] + jax.random.normal(key, (4,))}, dt=1.0)
@@ -181,6 +186,7 @@ AT_ZERO = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.thorough
 @AT_ZERO
 def test_at_zero_the_comparator_decides(spec, violated):
     problem = vj.Problem(
@@ -214,6 +220,7 @@ class TestBlackBox:
             spec="always x < 0.8",
         )
 
+    @pytest.mark.thorough
     def test_a_row_that_raises_carries_its_message_and_the_run_goes_on(self):
         def simulate(features):
             if features["a"] > 0.5:
@@ -312,6 +319,7 @@ class TestStoring:
         assert vj.load(tmp_path / "run").table.all.equals(run.table.all)
 
 
+@pytest.mark.thorough
 def test_nothing_compiles_twice(problem):
     vj.falsify(problem, "uniform", 128, batch=128)
     engine = engine_module.engine_for(problem, 128)
@@ -321,6 +329,7 @@ def test_nothing_compiles_twice(problem):
     assert engine.compile_seconds == spent
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dim", [3, 20])
 def test_gradients_equal_finite_differences(dim):
     # Above and below the number of features at which the engine changes modes.
@@ -421,6 +430,7 @@ class TestRefusedBeforeAnythingCompiles:
 
 
 class TestProblems:
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         ("changes", "message"),
         [

@@ -41,6 +41,7 @@ def test_the_order_of_a_problem(ordered, plain):
         vj.Problem("trip", space=SPACE, system=trip, spec=SPEC, priority=["save", "smooth"])
 
 
+@pytest.mark.thorough
 def test_a_search_goes_for_the_gravest(ordered, plain):
     # Three in four samples break one of the lesser rules, one in thirty the important one.
     def grave(problem):
@@ -51,6 +52,7 @@ def test_a_search_goes_for_the_gravest(ordered, plain):
     assert max(grave(plain)) < min(grave(ordered))
 
 
+@pytest.mark.thorough
 def test_front(ordered, plain):
     run = vj.falsify(ordered, "uniform", 256, batch=256)
     broken = np.maximum(-run.table.all[[f"rho.{name}" for name in SPEC]].to_numpy(), 0)

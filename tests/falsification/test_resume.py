@@ -41,6 +41,7 @@ def end_of_a_round(run, least):
     return int(begins[begins >= least][0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     [
@@ -67,6 +68,7 @@ def test_passive_searches_go_on_within_a_batch(problem):
     assert same(vj.resume(part, budget=64), whole)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["cross_entropy", "portfolio"])
 def test_from_a_folder_after_a_kill(problem, name, tmp_path):
     longest = vj.falsify(problem, name, 240, batch=16)
@@ -105,6 +107,7 @@ class Own(search.Uniform):
     """A search that verifai_jax does not know by name."""
 
 
+@pytest.mark.thorough
 def test_a_black_box_with_everything_that_a_space_has(tmp_path):
     def cars(features):
         items = features["cars"]
@@ -167,6 +170,7 @@ class TestRefused:
 
 
 class TestWarmStart:
+    @pytest.mark.thorough
     def test_a_search_starts_where_the_table_says(self, problem):
         earlier = vj.falsify(problem, "uniform", 256, batch=64)
         assert len(earlier.table.counterexamples) > 5
@@ -176,6 +180,7 @@ class TestWarmStart:
             assert len(warm.table.counterexamples) >= 6 > len(cold.table.counterexamples)
         assert len(warm.table) == 16
 
+    @pytest.mark.thorough
     def test_a_gradient_search_starts_from_the_nearest(self, problem):
         earlier = vj.falsify(problem, "uniform", 64, batch=64)
         warm = vj.falsify(problem, "gradient", 16, batch=16, warm_start=earlier)

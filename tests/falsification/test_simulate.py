@@ -21,6 +21,7 @@ def problem():
     return vj.Problem("given", SPACE, system, "x < 2.5")
 
 
+@pytest.mark.thorough
 def test_rows_of_a_table(problem):
     earlier = vj.falsify(problem, "uniform", 50, batch=50)
     wanted = earlier.table.all.iloc[[7, 3, 41]]
@@ -39,12 +40,14 @@ def test_features_as_a_person_writes_them(problem):
     np.testing.assert_allclose(two["rho"], [1.5, -1.5], rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_contract():
     points = np.random.default_rng(0).random((50, 2), np.float32)
     check_search(PointList(points), Cube((0, 0)))
     check_batch_independence(PointList(points), Cube((0, 0)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -56,6 +56,7 @@ class Full:
         pass
 
 
+@pytest.mark.thorough
 def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, monkeypatch):
     folder = tmp_path / "run"
     rows = vj.ErrorTable.append

@@ -26,6 +26,7 @@ class TestFeatures:
         }
     )
 
+    @pytest.mark.thorough
     def test_columns_and_round_trip(self):
         point = {"z": [0.25, 3.0], "b": "green", "n": 2, "arr": [[0.0, 0.1], [0.2, 0.3]]}
         features = self.SPACE.coerce(point)
@@ -175,6 +176,7 @@ class TestCartPole:
         ([1.9, 0.09, 0.06, 0.7], [13.2093239, 17.9227031, 19.4852709, 5.66383544], -19.26583139),
     )
 
+    @pytest.mark.thorough
     def test_traces_and_robustness(self):
         def dynamics(time, state, force, f):
             _, speed, angle, rate = state

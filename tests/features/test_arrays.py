@@ -46,6 +46,7 @@ DOMAINS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("domain", DOMAINS, ids=repr)
 def test_laws(domain):
     check_domain(domain)
@@ -77,6 +78,7 @@ def test_lengths_are_equally_likely_and_masks_follow():
     np.testing.assert_array_equal(cars["x"], cars.values["x"])
 
 
+@pytest.mark.thorough
 def test_absent_items_have_no_influence():
     u = jnp.linspace(0.05, 0.95, SPACE.dim).at[0].set(0.5)  # One car.
     other = u.at[5:9].set(0.01)  # All coordinates of the second.
@@ -99,6 +101,7 @@ class TestTable:
         u = u.at[:, 0].set((jnp.array(lengths) + 0.5) / 3)
         return jax.vmap(SPACE.unflatten)(u)
 
+    @pytest.mark.thorough
     def test_absent_entries_are_empty(self):
         rows = SPACE.rows(self.batch([0, 1, 2]))
         assert rows["cars[1].color"][0] is None
@@ -108,6 +111,7 @@ class TestTable:
             assert table[f"cars[0].{column}"].isna().tolist() == [True, False, False]
             assert table[f"cars[1].{column}"].isna().tolist() == [True, True, False]
 
+    @pytest.mark.thorough
     def test_columns_have_the_same_kinds_in_every_batch(self):
         kinds = [
             {name: column.dtype for name, column in SPACE.rows(self.batch(lengths)).items()}
@@ -116,6 +120,7 @@ class TestTable:
         assert kinds[0] == kinds[1] == kinds[2]
         assert kinds[0]["cars[1].gear"] == np.float64
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize("form", ["csv", "parquet"])
     def test_rows_come_back_exactly(self, form, tmp_path):
         features = self.batch([0, 1, 2, 1])
@@ -133,6 +138,7 @@ class TestTable:
             jax.tree.map(np.testing.assert_array_equal, again, wanted)
             assert jax.tree.map(jax.typeof, again) == jax.tree.map(jax.typeof, wanted)
 
+    @pytest.mark.thorough
     def test_wrong_lengths(self):
         row = pd.DataFrame(SPACE.rows(self.batch([2]))).iloc[0].to_dict()
         for length in (3, 0.5, float("nan")):
@@ -172,6 +178,7 @@ class TestWritten:
         with unchecked(), pytest.raises(ValueError, match=message):
             SPACE.check({"cars": [], "n": value})
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         "length", [(3, 1), (-1, 2), (0, 0), (1, 2, 3), (1.5, 2), (True, 2), ("a", "b")]
     )

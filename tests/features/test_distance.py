@@ -33,6 +33,7 @@ SPACE = FeatureSpace(
 BASE = {"x": 2, "n": 0, "gear": 3, "alg": "a", "wind": [0, 0], "cars": []}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "wanted"),
     [
@@ -112,6 +113,7 @@ def distances(us):
     return [SPACE.distance(*pair) for pair in ((a, b), (b, a), (b, c), (a, c), (a, a))]
 
 
+@pytest.mark.thorough
 @given(points, points, points)
 @settings(max_examples=100, deadline=None)
 def test_is_a_metric(a, b, c):
@@ -122,6 +124,7 @@ def test_is_a_metric(a, b, c):
     assert ac <= ab + bc + 1e-5
 
 
+@pytest.mark.thorough
 @given(points, st.integers(0, SPACE.dim - 1))
 @settings(max_examples=40, deadline=None)
 def test_is_zero_only_between_the_same(u, i):
@@ -132,6 +135,7 @@ def test_is_zero_only_between_the_same(u, i):
     assert (float(SPACE.distance(a, b)) == 0) == same
 
 
+@pytest.mark.thorough
 def test_derivatives_are_finite_between_the_same():
     u = jnp.full(SPACE.dim, 0.3)
     slope = jax.grad(lambda v: SPACE.distance(SPACE.unflatten(u), SPACE.unflatten(v)))

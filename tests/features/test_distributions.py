@@ -37,6 +37,7 @@ POINTS = np.concatenate([TAILS, np.linspace(0, 1, 257)[1:-1], 1 - TAILS]).astype
 
 @pytest.mark.parametrize("domain", REFERENCES, ids=repr)
 class TestEveryDistribution:
+    @pytest.mark.thorough
     def test_laws(self, domain):
         check_domain(domain)
 
@@ -46,17 +47,20 @@ class TestEveryDistribution:
         spread = np.ptp(REFERENCES[domain].ppf([0.25, 0.75]))
         np.testing.assert_allclose(values, wanted, rtol=5e-6, atol=2e-6 * spread)
 
+    @pytest.mark.thorough
     def test_probabilities(self, domain):
         values = REFERENCES[domain].ppf(POINTS.astype(np.float64)).astype(np.float32)
         u = jax.jit(jax.vmap(domain.to_unit))(values)[:, 0]
         wanted = REFERENCES[domain].cdf(values.astype(np.float64))
         np.testing.assert_allclose(u, wanted, atol=4e-5)
 
+    @pytest.mark.thorough
     def test_samples(self, domain):
         u = jax.random.uniform(jax.random.key(3), (4000, 1))
         values = np.asarray(jax.vmap(domain.from_unit)(u), np.float64)
         assert scipy.stats.kstest(values, REFERENCES[domain].cdf).pvalue > 1e-3
 
+    @pytest.mark.thorough
     def test_ends_and_their_slopes_are_finite(self, domain):
         ends = jnp.array([0.0, 1.0], jnp.float32)
         slope = jax.grad(lambda u: domain.from_unit(u[None]))
@@ -77,6 +81,7 @@ def test_ends_are_exact():
     assert ends == pytest.approx([-5.54, 5.54], abs=0.01)
 
 
+@pytest.mark.thorough
 def test_slope_is_one_over_the_density():
     domain = Normal(2, 3)
     u = jnp.linspace(0.01, 0.99, 99)
@@ -182,6 +187,7 @@ class TestRefused:
         with unchecked(), pytest.raises((ValueError, TypeError), match=message):
             make()
 
+    @pytest.mark.thorough
     @pytest.mark.parametrize(
         ("domain", "value", "message"),
         [

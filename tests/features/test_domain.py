@@ -38,6 +38,7 @@ DOMAINS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("domain", DOMAINS, ids=repr)
 def test_laws(domain):
     check_domain(domain)
@@ -49,6 +50,7 @@ def test_printed_as_written(domain):
     assert eval(repr(domain), names) == domain
 
 
+@pytest.mark.thorough
 def test_laws_hold_in_float64():
     with jax.enable_x64():
         for domain in (Box([0, -1, 5], [10, 1, 5.5]), DOMAINS[-1]):
@@ -276,6 +278,7 @@ class TestRefused:
         with pytest.raises(ValueError, match=message):
             domain.check(value, "f")
 
+    @pytest.mark.thorough
     def test_what_a_person_writes_is_taken(self):
         cars = Array(Struct({"x": Box(0, 1), "color": Categorical("r", "g")}), length=2)
         written = {"x": [0.25, 1], "color": ["g", "r"]}

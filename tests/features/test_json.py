@@ -69,6 +69,7 @@ domains = st.recursive(
 )
 
 
+@pytest.mark.thorough
 @given(domains, domains)
 @settings(max_examples=120, deadline=None)
 def test_round_trip(one, other):

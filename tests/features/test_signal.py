@@ -33,11 +33,13 @@ SIGNALS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("domain", SIGNALS, ids=repr)
 def test_laws(domain):
     check_domain(domain)
 
 
+@pytest.mark.thorough
 def test_knots_are_coordinates_and_columns():
     space = FeatureSpace({"wind": Signal(Box(-2, 2), 3), "push": Signal(Box([0, 0], [1, 1]), 2)})
     names = ("wind[0]", "wind[1]", "wind[2]", "push[0][0]", "push[0][1]", "push[1][0]")
@@ -97,6 +99,7 @@ def test_refused(make, message):
         make()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("hold", ["linear", "constant"])
 def test_refined_spaces_hold_the_same_functions(hold):
     signal = Signal(Box(-1, 1), 4, hold=hold)
@@ -160,6 +163,7 @@ class TestInRollouts:
         # Each piece lasts half a second, and a unit of its coordinate is two of wind.
         np.testing.assert_allclose(slopes, [[0] * 5 + [1.0] * 4] * 3, atol=1e-5)
 
+    @pytest.mark.thorough
     def test_its_own_duration_is_kept(self):
         space = FeatureSpace({"wind": Signal(Box(-1, 1), 2, duration=1.0), "gust": Box(0, 1)})
         system = ode(lambda t, s, c, f: f["wind"](t), lambda f, key: 0.0, dt=0.5, duration=2.0,

@@ -36,6 +36,7 @@ SPACE = FeatureSpace(
 )
 
 
+@pytest.mark.thorough
 def test_the_order_is_the_one_written():
     assert SPACE.columns == (
         "z", "b", "alg", "rate", "gear", "cars[0].x", "cars[0].c", "cars[1].x", "cars[1].c",

@@ -114,6 +114,7 @@ NOMINAL = {"x": 0.5, "n": 1, "alg": "sac", "wind": [0, 1, 0], "cars": [0.25]}
 
 
 class TestViews:
+    @pytest.mark.thorough
     def test_only(self):
         view = FULL.only("wind", "x", nominal=NOMINAL)
         assert (view.dim, view.columns) == (4, FULL.columns)

@@ -34,6 +34,7 @@ def trace_of(recording):
     return Trace({name: np.asarray(v, float) for name, v in recording.items()}, dt=DT)
 
 
+@pytest.mark.thorough
 @given(formulas(), recordings(), st.sampled_from(["hold", "truncate"]))
 @UNCOMPILED
 def test_hard_and_boolean_equal_the_definitions(formula, recording, end):
@@ -45,6 +46,7 @@ def test_hard_and_boolean_equal_the_definitions(formula, recording, end):
     np.testing.assert_array_equal(verdicts, [oracle.holds(formula, i) for i in range(trace.length)])
 
 
+@pytest.mark.thorough
 @given(formulas(), recordings(), st.sampled_from([1e-3, 0.1, 3.0]))
 @UNCOMPILED
 def test_smooth_stays_within_its_certificate(formula, recording, tau):
@@ -65,6 +67,7 @@ def test_smooth_stays_within_its_certificate(formula, recording, tau):
     assert abs(near - exact) <= 0.01 + rounding
 
 
+@pytest.mark.thorough
 @given(formulas())
 @settings(max_examples=300, deadline=None)
 def test_the_text_parses_back(formula):
@@ -82,6 +85,7 @@ def test_rewriting_keeps_the_value(formula, recording):
         assert oracle.holds(nnf(formula), i) == oracle.holds(formula, i)
 
 
+@pytest.mark.thorough
 @given(formulas(3), recordings(sizes=(6,)), st.sampled_from([0.05, 0.5]))
 @settings(UNCOMPILED, max_examples=30)
 def test_gradient_equals_finite_differences(formula, recording, tau):

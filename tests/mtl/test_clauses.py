@@ -33,6 +33,7 @@ def trace(values):
     return Trace({"x": values[:6], "y": values[6:]}, dt=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", FORMULAS)
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(-2, 2, width=32), min_size=12, max_size=12))
@@ -66,6 +67,7 @@ def test_units_do_not_matter():
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_absent_clauses_and_their_slopes():
     goals = goals_of([parse("x < 1 & (x < 2 | y < 1)")])
 

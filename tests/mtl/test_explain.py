@@ -37,6 +37,7 @@ def deciding(formula, recording, rho):
     }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", FORMULAS)
 def test_names_the_right_predicate_and_instant(text):
     formula = parse(text)
@@ -67,6 +68,7 @@ def test_names_the_right_predicate_and_instant(text):
     assert failing == 10
 
 
+@pytest.mark.thorough
 def test_tells_and_draws(tmp_path):
     t = np.arange(101) * 0.04
     trace = Trace(

@@ -45,6 +45,7 @@ def test_wrong_scales():
         normalize(FORMULA, {"x": 0.0, "theta": 1.0})
 
 
+@pytest.mark.thorough
 def test_annealing_is_geometric_and_may_be_traced():
     taus = jax.vmap(lambda k: anneal(k, 11, 0.4, 0.1))(jnp.arange(13))
     np.testing.assert_allclose(taus[np.array([0, 5, 10, 12])], [0.4, 0.2, 0.1, 0.1], rtol=1e-5)

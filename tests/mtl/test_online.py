@@ -22,6 +22,7 @@ def bounded(formula):
         return None
 
 
+@pytest.mark.thorough
 @given(formulas(3), recordings(sizes=(1, 5, 7)))
 @UNCOMPILED
 def test_every_prefix_equals_the_offline_value_and_lies_in_the_interval(formula, recording):
@@ -91,6 +92,7 @@ def test_not_a_number_stays():
     assert np.isnan(monitor.finish(state))
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_monitored_is_said_at_once():
     with pytest.raises(ValueError, match=r"eventually \(x > 0\) looks ahead without end"):
         online("G (y > 0 -> F (x > 0))", 0.1)

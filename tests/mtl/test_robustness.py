@@ -40,6 +40,7 @@ def one_by_one(batch, lanes, semantics=hard):
     return np.stack([run(batch["x"][i], batch["y"][i]) for i in lanes])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("semantics", [hard, smooth(0.1)], ids=["hard", "smooth"])
 def test_a_batch_equals_its_traces_one_by_one(batch, semantics):
     def rho(x, y):
@@ -61,6 +62,7 @@ def test_a_batch_equals_its_traces_one_by_one(batch, semantics):
         np.testing.assert_allclose(gradient[i], expected, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_signal_that_all_lanes_share_has_a_gradient_for_each(batch):
     x, y = batch["x"][:5], batch["y"][0]
 
@@ -88,6 +90,7 @@ def test_lanes_within_lanes_and_a_temperature_for_each(batch):
             np.testing.assert_allclose(values[i, j], rho(x[i, j], taus[j]), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_the_whole_signal_in_batches_with_its_gradient(batch):
     x, y = batch["x"][:4], batch["y"][:4]
     formula = parse("F[0,1] (x > y)")
@@ -120,6 +123,7 @@ def test_annealing_does_not_recompile():
     assert values == sorted(values)
 
 
+@pytest.mark.thorough
 def test_samples_after_the_end_never_count():
     x = np.array([1.0, 2.0, 0.5, -7.0, -7.0])
     ended = Trace({"x": x}, dt=1.0, valid=3)
@@ -282,6 +286,7 @@ def test_sample_times():
         robustness("x > 0", Trace({"x": np.ones(3)}, times=np.array([0.0, 2.0, 1.0])))
 
 
+@pytest.mark.thorough
 def test_not_a_number_is_never_a_verdict():
     x = np.array([1.0, np.nan, 2.0])
     trace = Trace({"x": x}, dt=0.5)
@@ -304,6 +309,7 @@ def test_not_a_number_is_never_a_verdict():
     assert not verdict
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
 @pytest.mark.parametrize("tau", [1e-3, 10.0])
 def test_single_precision_is_finite_at_every_scale(scale, tau):

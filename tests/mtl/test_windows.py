@@ -45,6 +45,7 @@ def value_and_pullback(function, weights, *arguments):
     return run(*arguments)
 
 
+@pytest.mark.thorough
 @DIRECTIONS
 @TAUS
 @pytest.mark.parametrize(
@@ -74,6 +75,7 @@ def until_by_definition(f, g, tau):
     return np.stack(u[::-1])
 
 
+@pytest.mark.thorough
 @BOTH
 @DIRECTIONS
 @TAUS
@@ -112,6 +114,7 @@ def test_until_at_the_root_alone(tau, lanes):
     np.testing.assert_allclose(gradient, pulled, rtol=1e-14)
 
 
+@pytest.mark.thorough
 @DIRECTIONS
 @TAUS
 def test_a_tie_gives_its_gradient_away_once(reverse, tau):
@@ -124,6 +127,7 @@ def test_a_tie_gives_its_gradient_away_once(reverse, tau):
         np.testing.assert_allclose(gradient.sum(), LENGTH, rtol=1e-12)
 
 
+@pytest.mark.thorough
 @BOTH
 @TAUS
 def test_not_a_number_goes_through(form, tau, lanes):
@@ -136,6 +140,7 @@ def test_not_a_number_goes_through(form, tau, lanes):
     assert not np.isnan(value[:, 1]).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("form", "scale", "tau"),
     [(sequential, scale, tau) for scale in (1e-5, 1e5) for tau in (1e-3, 10.0)]

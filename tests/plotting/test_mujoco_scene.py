@@ -79,6 +79,7 @@ def red(picture):
     return columns.mean() + 0.5 - width / 2, rows.mean() + 0.5 - height / 2, np.ptp(columns) + 1
 
 
+@pytest.mark.thorough
 def test_what_is_recorded_is_what_was_replayed(seen, motion):
     assert seen.violated
     np.testing.assert_array_equal(motion.qpos[:, 0], np.asarray(seen.trace["x"], float))
@@ -160,6 +161,7 @@ def test_a_run_ends_where_it_was_terminated():
     assert motion.caption == "ball, row 0: ok"
 
 
+@pytest.mark.thorough
 def test_pictures_of_a_replay(seen, gl, tmp_path, monkeypatch):
     monkeypatch.setattr(scene, "SIZE", SIZE)
     names = [path.name for path in write_replay_pictures(seen, tmp_path, "worst")]

@@ -26,6 +26,7 @@ SPACES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("space", SPACES)
 @pytest.mark.parametrize("spec", ["always x < 0.5", "always x < 9"])
 def test_every_run_can_be_drawn(space, spec, tmp_path):
@@ -39,6 +40,7 @@ def test_every_run_can_be_drawn(space, spec, tmp_path):
             assert image.size[0] > 100
 
 
+@pytest.mark.thorough
 def test_the_feature_that_decides_comes_first():
     space = {"b": vj.Box(0, 1), "a": vj.Box(0, 1)}
     for spec in ("always x < 0.5", "always x < 9"):  # with failures, and by robustness alone
@@ -54,6 +56,7 @@ def test_the_decisive_instant_is_marked():
     assert any(text.startswith("x = 2.") and text.endswith("at 1 s") for text in texts)
 
 
+@pytest.mark.thorough
 def test_animation(tmp_path):
     drawn = []
 
@@ -79,6 +82,7 @@ def test_animation(tmp_path):
         animate(vj.falsify(silent, "uniform", 4, batch=4).replay(0), tmp_path / "no.gif")
 
 
+@pytest.mark.thorough
 def test_figures_show_themselves_in_a_notebook():
     problem = vj.Problem("p", SPACES["names"], system, "always x < 0.5")
     run = vj.falsify(problem, "uniform", 16, batch=16)

@@ -59,6 +59,7 @@ def gymnax_task(*arguments, **options):
     return gymnax_task(*arguments, **options)
 
 
+@pytest.mark.thorough
 def test_gymnax_task_is_the_environments_own_rollout(gymnax):
     for name, steps in (("CartPole-v1", 60), ("Pendulum-v1", 20)):
         task = gymnax_task(name)
@@ -125,6 +126,7 @@ class Counter:
         return self.spaces.Box(jnp.array([-1.0, 0.0]), jnp.array([3.0, 10.0]), (2,))
 
 
+@pytest.mark.thorough
 def test_a_time_limit_that_an_environment_merges_into_its_end_is_taken_out(gymnax):
     from flax import struct
     from gymnax.environments import spaces
@@ -273,6 +275,7 @@ def test_an_environment_of_brax_is_its_own_rollout_and_can_be_learnt(brax):
 # Systems of our own
 
 
+@pytest.mark.thorough
 def test_ode_task_is_the_loop_under_the_same_controls():
     def features_of(key):
         return {"length": jax.random.uniform(key, minval=0.3, maxval=0.8), "theta0": 0.05}

@@ -50,6 +50,7 @@ def six_steps(task, action):
 LEFT = jnp.array([0, 0, 1])
 
 
+@pytest.mark.thorough
 def test_cut_off_is_not_terminated_and_leads_to_the_state_before_the_reset():
     episodes, observed, transition, told = six_steps(Count(), LEFT)
     np.testing.assert_array_equal(observed[:, 0, 0], [10, 11, 12, 13, 10, 11])
@@ -94,6 +95,7 @@ def test_size_of_an_observation():
     assert sizes == [3]
 
 
+@pytest.mark.thorough
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
     statistics = ObservationStatistics.initial(2)

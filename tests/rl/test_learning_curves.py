@@ -47,6 +47,7 @@ def test_pendulum_is_gymnasiums_step_for_step():
     assert not over.any()
 
 
+@pytest.mark.thorough
 def test_acrobot_is_gymnasiums_step_for_step():
     env = gymnasium.make("Acrobot-v1").unwrapped
     env.reset(seed=0)

@@ -141,6 +141,7 @@ def test_files_of_another_kind_are_refused(tmp_path):
         load_policy(torn)
 
 
+@pytest.mark.thorough
 def test_new_layers_are_orthogonal_with_their_gains():
     layers = new_layers(jax.random.key(0), (4, 16, 2), gain=0.01)
     first, last = np.asarray(layers[0][0]), np.asarray(layers[1][0])

@@ -115,6 +115,7 @@ def test_only_what_happened_is_drawn():
     assert set(np.asarray(drawn.observation[:, 0])) == {7, 8}
 
 
+@pytest.mark.thorough
 def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
     # The first policy has mean 0 and deviation 1, so that an action is the tanh of its noise.
     sac = SAC(hidden=(4,), value_hidden=(4,), environments=400, capacity=2_000, correlation=0.9)
@@ -141,6 +142,7 @@ def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
     np.testing.assert_array_equal(seen.terminated, 0)
 
 
+@pytest.mark.thorough
 def test_each_loss_has_a_gradient_for_its_own_weights():
     sac = SAC(hidden=(4,), value_hidden=(4,), environments=2, capacity=10)
     generator = np.random.default_rng(0)

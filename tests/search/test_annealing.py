@@ -30,6 +30,7 @@ def run(search, cube, batch, rho, rounds, key=0):
     return jax.jit(lambda state: jax.lax.scan(step, state, None, length=rounds))(state)[1]
 
 
+@pytest.mark.thorough
 def test_each_chain_has_the_density_of_its_temperature():
     # Two wells, one of which is a flat failure region; and a discrete coordinate.
     def rho(u):
@@ -71,6 +72,7 @@ def test_exchanges_sort_cold_chains_and_lose_no_point():
     assert {abs(int(p) - i) for row in matchings for i, p in enumerate(row)} == {0, 1, 2, 4}
 
 
+@pytest.mark.thorough
 def test_exchanges_follow_the_odds():
     # exp((1/T1 - 1/T2)(E1 - E2)) with a loss of 1.
     energy, coldness = jnp.array([0.0, 1.0]), jnp.array([1.5, 0.5])
@@ -85,6 +87,7 @@ def test_reflection():
     np.testing.assert_allclose(_reflect(u), [[0.25, 0.5, 0.75, 0.25, 0.5, 1.0]], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_the_spread_is_that_of_the_first_points():
     assert _best_to_median(jnp.array([3.0, jnp.inf, 1.0, 2.0, 100.0, jnp.nan])) == 1.0
     assert _best_to_median(jnp.full(3, jnp.inf)) == 0.0
@@ -96,6 +99,7 @@ def test_the_spread_is_that_of_the_first_points():
     assert 0.3 < spread[-1] < 2.7
 
 
+@pytest.mark.thorough
 def test_it_anneals():
     # The colder a chain, the lower its robustness.
     _, states = run(Annealing(), Cube((0, 0, 0)), 16, lambda u: 1 + jnp.sum(u, axis=1), 200)
@@ -124,6 +128,7 @@ def test_a_chain_that_stays_starts_again():
     assert int(np.sum(np.isinf(held.energy))) == 7
 
 
+@pytest.mark.thorough
 def test_warm_starts_at_the_best_points():
     search, cube = Annealing(), Cube((0, 0))
     state = search.init(jax.random.key(0), cube, 16)
@@ -141,6 +146,7 @@ def test_warm_starts_at_the_best_points():
     np.testing.assert_allclose(state.energy, np.sort(kept)[:16] + 1)
 
 
+@pytest.mark.thorough
 def test_choices_and_neighbours():
     # From a cell to any one, or, of ordered ones, mostly to a neighbour.
     search = Annealing(exploration=0.01)

@@ -38,6 +38,7 @@ def one_by_one(mean, count, exists, budget, bonus):
     return drawn / budget
 
 
+@pytest.mark.thorough
 def test_shares_are_those_of_draws_one_by_one():
     rng = np.random.default_rng(0)
     for budget in (200, 3000):
@@ -51,6 +52,7 @@ def test_shares_are_those_of_draws_one_by_one():
             np.testing.assert_allclose(got, expected, atol=1.5 / budget)
 
 
+@pytest.mark.thorough
 def test_rewards_follow_ranks():
     score = jnp.array([3.0, 0.0, jnp.inf, 1.0, 1.0, 8.0, 9.0, 7.0, 6.0, jnp.inf])
     # Eight points, the best half of which is rewarded, in the middle of its rank.
@@ -60,6 +62,7 @@ def test_rewards_follow_ranks():
     np.testing.assert_allclose(Bandit(best=0.5)._rewards(jnp.expm1(score)), expected, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_densities_are_drawn_from_evenly():
     density = jnp.array([[0.1, 0.0, 0.6, 0.3], [0.0, 1.0, 0.0, 0.0]])
     edges = np.array([[0, 0.25, 0.5, 0.75, 1], [0, 0.5, 0.7, 0.7, 1]], np.float32)
@@ -69,6 +72,7 @@ def test_densities_are_drawn_from_evenly():
     np.testing.assert_allclose(np.sort(u[:, 1]), np.linspace(0.5, 0.7, 1000), atol=2e-3)
 
 
+@pytest.mark.thorough
 def test_learns_before_the_first_failure():
     # One coordinate matters, and it is found: no point fails.
     _, u = learned(Bandit(), Cube((0, 0, 0)), lambda u: 5 + jnp.abs(u[:, 1] - 0.33), 12)
@@ -77,6 +81,7 @@ def test_learns_before_the_first_failure():
     assert np.all(np.abs(late[:, [0, 2]].mean(axis=0) - 0.5) < 0.12)
 
 
+@pytest.mark.thorough
 def test_buckets_split_where_the_search_goes():
     state, u = learned(Bandit(), Cube((0,)), lambda u: 1 + jnp.abs(u[:, 0] - 0.33), 16)
     ((places, edges, branching),) = Bandit()._bandits(Cube((0,)))
@@ -96,6 +101,7 @@ def test_buckets_split_where_the_search_goes():
     assert np.mean((u[-64:] > 0.28) & (u[-64:] < 0.4)) > 0.3
 
 
+@pytest.mark.thorough
 def test_draws_are_even_where_all_points_are_equal():
     cube = Cube((0, 5, 3), ordered=(True, True, False))
     _, u = learned(Bandit(exploration=1e-6), cube, lambda u: jnp.ones(len(u)), 40)
@@ -106,6 +112,7 @@ def test_draws_are_even_where_all_points_are_equal():
         np.testing.assert_allclose(np.bincount(cells[:, j], minlength=n) / len(u), 1 / n, atol=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("ordered", "weights"), [(False, None), (True, (0.05, 0.4, 0.05, 0.2, 0.1, 0.1, 0.1))]
 )
@@ -138,6 +145,7 @@ def test_cells_are_arms_and_many_cells_are_groups():
     np.testing.assert_allclose(edges[1], [0, 1 / 3, 2 / 3, 1, 1, 1, 1, 1], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_points_without_a_verdict_push_none_out():
     search, cube = Bandit(window=32), Cube((0,))
     state = search.init(jax.random.key(0), cube, 16)
@@ -152,6 +160,7 @@ def test_points_without_a_verdict_push_none_out():
     assert float(after.score.min()) == 2.0
 
 
+@pytest.mark.thorough
 def test_batches_of_one():
     _, u = learned(Bandit(), Cube((0, 0)), lambda u: jnp.sum(u, axis=1), 200, batch=1)
     assert np.median(u[-64:]) < 0.25

@@ -62,6 +62,7 @@ def asked(search, cube, rho, rounds, batch=8, valid=True):
     return np.concatenate(seen), state
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("value", "valid"),
     [
@@ -104,6 +105,7 @@ def test_huge_values_do_not_hide_the_others():
     assert np.median(np.linalg.norm(u[-24:] - 0.3, axis=1)) < 0.1
 
 
+@pytest.mark.thorough
 def test_what_is_kept():
     cube, search = Cube((0,)), Bayes(capacity=32, candidates=32)
     _, tell = jitted(search)

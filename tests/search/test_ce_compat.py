@@ -27,6 +27,7 @@ def histories(search, cube, rows):
     return seen
 
 
+@pytest.mark.thorough
 def test_continuous_as_verifai():
     # Conformance case ce-01; its last rows, at and above the threshold and without a verdict, are
     # no evidence (nor is the threshold itself in fals-03).
@@ -108,6 +109,7 @@ def test_a_batch_is_as_its_rows_one_by_one(alpha):
     np.testing.assert_allclose(state.histograms.sum(-1), np.ones((6, 5)), atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_points_follow_the_histograms():
     cube = Cube((0, 3), weights=(None, (0.6, 0.3, 0.1)))
     search = CECompat(buckets=4)
@@ -129,6 +131,7 @@ def test_points_follow_the_histograms():
     assert abs(inside.std() - 0.25 / np.sqrt(12)) < 0.005
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "cube",
     [

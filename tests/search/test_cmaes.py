@@ -17,11 +17,13 @@ from verifai_jax.testing import check_search
 KEY = jax.random.key(0)
 
 
+@pytest.mark.thorough
 def test_single_points():
     _, (value,) = play(CMAES(), ("ball",), 1, 256, 15)
     assert gain("ball", value) > 4
 
 
+@pytest.mark.thorough
 def test_the_same_robustness_everywhere_gives_the_prior():
     search, cube = CMAES(), Cube((0, 0))
 
@@ -63,6 +65,7 @@ def one_step(evolution, points, weights):
     return mean + size * total, size_after, covariance, way, whitened, age + 1
 
 
+@pytest.mark.thorough
 def test_a_step_is_that_of_the_tutorial():
     rng = np.random.default_rng(0)
     evolution = Evolution.begin(jnp.full(3, 0.5), jnp.float32(0.2), True)
@@ -76,6 +79,7 @@ def test_a_step_is_that_of_the_tutorial():
             np.testing.assert_allclose(got, wanted, rtol=2e-4, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_diagonal_covariance_learns_the_scales():
     scales = 10.0 ** -jnp.arange(3)
     rng = np.random.default_rng(1)
@@ -114,6 +118,7 @@ def test_discrete_coordinates_keep_moving():
     np.testing.assert_allclose(std, [1e-3, 0.1], rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_a_warm_start_begins_at_the_best_point():
     search, cube = CMAES(small_step=0.01), Cube((0, 0, 3), ordered=(True, True, False))
     u = jnp.array([[0.2, 0.9, 0.5], [0.7, 0.1, 0.9], [0.4, 0.4, 0.1], [0.1, 0.1, 0.1]])
@@ -128,6 +133,7 @@ def test_a_warm_start_begins_at_the_best_point():
     assert near.sum() == 3  # the other one explores
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "cube",
     [
@@ -140,6 +146,7 @@ def test_contract(cube):
     check_search(CMAES(), cube, batch=5, rounds=6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -44,6 +44,7 @@ EACH = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("search", "cube"), EACH)
 def test_contract(search, cube):
     refused = REFUSED.get((type(search).__name__, cube))
@@ -54,11 +55,13 @@ def test_contract(search, cube):
     check_search(search, cube)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", [Uniform(), Halton(), Halton(scramble=True)], ids=repr)
 def test_passive_searches_do_not_depend_on_the_batch(search):
     check_batch_independence(search, Cube((0, 0, 5)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", [Uniform(), Halton(True), CrossEntropy(), Gradient()], ids=repr)
 def test_the_key_decides(search):
     cube = Cube((0, 0))
@@ -66,6 +69,7 @@ def test_the_key_decides(search):
     assert not np.array_equal(one, two)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_one_clause_is_taken_to_its_corner_at_once(sign):
     cube, search, key = Cube((0, 0, 0)), Gradient(), jax.random.key(3)
@@ -78,6 +82,7 @@ def test_one_clause_is_taken_to_its_corner_at_once(sign):
     np.testing.assert_array_equal(u, 0.5 - 0.5 * sign)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", [CrossEntropy()], ids=repr)
 def test_active_searches_do_learn(search):
     # With the robustness turned around they go the other way.
@@ -98,6 +103,7 @@ def test_active_searches_do_learn(search):
     assert late(-1.0) > 0.65
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("search", "spoil"),
     [(CrossEntropy(), "invalid"), (Gradient(), "invalid"), (Gradient(), "nan gradient")],

@@ -75,6 +75,7 @@ def ridge(u):
     return jnp.array([one, two, ABSENT, ABSENT])
 
 
+@pytest.mark.thorough
 def test_a_maximum_of_clauses_does_not_stall_a_descent():
     cube = Cube((0,) * D)
     u = jax.random.uniform(jax.random.key(0), (200_000, D))
@@ -86,6 +87,7 @@ def test_a_maximum_of_clauses_does_not_stall_a_descent():
     assert max(costs) < 30 < 0.5 / share
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.slow), np.nan])
 def test_the_portfolio_leaves_gradients_that_say_nothing(slope):
     cube, search = Cube((0, 0, 0)), Portfolio()

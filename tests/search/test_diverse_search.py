@@ -16,6 +16,7 @@ from verifai_jax.testing import check_search
 MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("search", "cube"),
     [
@@ -53,6 +54,7 @@ class Descent(Search):
         return jnp.float32(0.1)
 
 
+@pytest.mark.thorough
 def test_contract_with_gradients():
     check_search(Diverse(Descent(), capacity=8), Cube((0, 0)))
 
@@ -148,6 +150,7 @@ def told(search, state, cube, u, rho, gradient=None):
     return tell(state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient))
 
 
+@pytest.mark.thorough
 def test_the_archive_holds_failures_that_are_apart():
     cube, search = Cube((0, 0)), Diverse(Uniform(), radius=0.2, capacity=3)
     state = search.init(jax.random.key(0), cube, 4)
@@ -162,6 +165,7 @@ def test_the_archive_holds_failures_that_are_apart():
     assert int(Diverse.count(state)) == 3
 
 
+@pytest.mark.thorough
 def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     cube, search = Cube((0, 0)), Diverse(CrossEntropy(), radius=0.2)
     state = search.init(jax.random.key(0), cube, 4)
@@ -192,6 +196,7 @@ def test_the_gradient_is_that_of_the_raised_robustness():
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_clauses_and_their_gradients_are_raised_alike():
     cube, search = Cube((0, 0, 0)), Diverse(Uniform(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)
@@ -228,6 +233,7 @@ def test_clauses_and_their_gradients_are_raised_alike():
     )
 
 
+@pytest.mark.thorough
 def test_the_radius_shrinks_when_nothing_new_comes():
     cube, search = Cube((0, 0)), Diverse(Uniform(), radius=0.2, patience=3, shrink=0.5)
     state = search.init(jax.random.key(0), cube, 2)
@@ -248,6 +254,7 @@ def test_distances_count_places_and_choices():
     assert float(apart(cube, one, one)[0, 0]) == 0.0
 
 
+@pytest.mark.thorough
 def test_distinct_points():
     points = np.array([[0.1, 0.1], [0.11, 0.1], [0.8, 0.8], [0.1, 0.12]])
     assert distinct(points, 0.1).tolist() == [0, 2]

@@ -33,6 +33,7 @@ def noise(u):
     return 1 + (bits >> 8).astype(jnp.float32) * 2.0**-24
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("epsilon", [0.1, 0.37, 1.0])
 def test_the_share_of_the_prior(epsilon):
     search = EpsilonGreedy(epsilon=epsilon)
@@ -50,6 +51,7 @@ def test_the_share_of_the_prior(epsilon):
         assert abs(np.mean(rows) - epsilon) < 0.01
 
 
+@pytest.mark.thorough
 def test_learns_before_the_first_failure():
     cube = Cube((0, 0, 0))
     target = jnp.array([0.3, 0.9, 0.0])
@@ -61,6 +63,7 @@ def test_learns_before_the_first_failure():
     assert np.mean(distance[-48:] > 0.5) > 0.02
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("ordered", [True, False])
 def test_finds_the_best_cells(ordered):
     cube = Cube((6, 40, 3), ordered=(ordered, True, False))
@@ -76,6 +79,7 @@ def test_finds_the_best_cells(ordered):
     assert np.median(np.abs(cells[:, 1] - 31)) <= 3
 
 
+@pytest.mark.thorough
 def test_gives_up_greed_that_does_not_pay():
     def share_of_starts(rho):
         states, _ = learned(EpsilonGreedy(patience=10**4), Cube((0, 0)), rho, 100)
@@ -96,6 +100,7 @@ def test_draws_the_prior_where_all_points_are_equal():
     assert abs(np.mean(distance.min(axis=1)) * np.sqrt(960) - 0.5) < 0.05
 
 
+@pytest.mark.thorough
 def test_starts_again_after_patience():
     # All points around the best one fail alike: after a while it looks elsewhere.
     def rho(u):
@@ -109,6 +114,7 @@ def test_starts_again_after_patience():
     assert np.mean(fails) > 0.3
 
 
+@pytest.mark.thorough
 def test_rows_of_any_magnitude():
     # Only the order of the robustness matters.
     def rho(u):
@@ -119,6 +125,7 @@ def test_rows_of_any_magnitude():
     np.testing.assert_array_equal(one, two)
 
 
+@pytest.mark.thorough
 def test_warm_start():
     search, cube = EpsilonGreedy(), Cube((0, 0))
     state = search.init(jax.random.key(0), cube, 16)

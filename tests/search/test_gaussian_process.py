@@ -33,6 +33,7 @@ def data(rows=40, padding=24, dtype=jnp.float32):
 PLAIN = GaussianProcess((False,) * 3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("wide", "tolerance"), [(False, 1e-3), (True, 1e-6)])
 def test_agrees_with_scikit_learn(wide, tolerance):
     from sklearn.gaussian_process import GaussianProcessRegressor
@@ -75,6 +76,7 @@ def test_codes_count_by_whether_they_are_the_same():
             np.testing.assert_allclose(got[i, j], expected, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_evidence_is_the_density_of_the_targets():
     with jax.enable_x64(True):
         seen, x, y = data(rows=12, padding=3, dtype=jnp.float64)
@@ -87,6 +89,7 @@ def test_evidence_is_the_density_of_the_targets():
         np.testing.assert_allclose(CODES.evidence(hyper(jnp.float64), given), expected, rtol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("process", [PLAIN, CODES], ids=["plain", "codes"])
 def test_sampled_functions_have_the_moments_of_the_posterior(process):
     rng = np.random.default_rng(3)
@@ -116,6 +119,7 @@ def test_sampled_functions_have_the_moments_of_the_posterior(process):
     assert np.all(np.abs(std) > 0.03)
 
 
+@pytest.mark.thorough
 def test_fitting_finds_the_coordinates_that_matter():
     rng = np.random.default_rng(4)
     x = rng.random((96, 3))
@@ -138,6 +142,7 @@ def test_fitting_finds_the_coordinates_that_matter():
     assert abs(posterior(fit(fitted, seen, 60)) - posterior(fitted)) < 2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("x", "y", "mask"),
     [
@@ -163,6 +168,7 @@ def test_degenerate_observations(x, y, mask):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(all_of_it(seen)))
 
 
+@pytest.mark.thorough
 def test_a_singular_covariance_is_made_regular():
     # Twice the same points without any noise: the plain factor does not exist.
     seen, _, _ = data(rows=40, padding=0)
@@ -173,6 +179,7 @@ def test_a_singular_covariance_is_made_regular():
     assert np.all(np.isfinite(std))
 
 
+@pytest.mark.thorough
 def test_no_coordinates():
     empty = GaussianProcess(())
     seen = TrainingData(jnp.zeros((4, 0)), jnp.full(4, 2.0), jnp.ones(4, bool))

@@ -39,6 +39,7 @@ def test_mixed_as_verifai():
     np.testing.assert_array_equal(cube.cells(u)[:, 0], [0, 1, 0, 1])
 
 
+@pytest.mark.thorough
 def test_every_combination_once_in_order():
     cube = Cube(
         (3, 0, 2, 0, 1),
@@ -81,6 +82,7 @@ def test_totals():
     np.testing.assert_array_equal(whole(Grid(1), Cube((0,) * 200), batch=1), np.full((1, 200), 0.5))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "cube",
     [
@@ -94,6 +96,7 @@ def test_contract(cube):
     check_search(Grid(), cube)
 
 
+@pytest.mark.thorough
 def test_contract_of_many_dimensions():
     check_search(Grid(1), Cube((0,) * 200))
     check_batch_independence(Grid(), Cube((0, 0, 5)))
@@ -112,6 +115,7 @@ def test_spaces_that_do_not_fit(search, cube, message):
         search.check(cube)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("points", "message"),
     [

@@ -38,6 +38,7 @@ def play(proposals, rounds, gradient):
     return np.concatenate(seen)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     [
@@ -80,6 +81,7 @@ def test_accepted_samples_follow_the_prior_given_the_constraint():
     assert stats.kstest(points[:, 1] / points[:, 0], "uniform").pvalue > 1e-3
 
 
+@pytest.mark.thorough
 def test_sequences_do_not_depend_on_the_batch():
     for name in ("uniform", "halton", "sobol"):
         small, large = (

@@ -45,6 +45,7 @@ EACH = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", LANDSCAPES)
 def test_the_failure_rates_are_as_stated(name):
     rho, cube, share = LANDSCAPES[name]
@@ -53,6 +54,7 @@ def test_the_failure_rates_are_as_stated(name):
     assert abs(failures - share * 2**18) < 5 * math.sqrt(share * 2**18)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
     [

@@ -100,6 +100,7 @@ class TestHalton:
             assert counts.min() >= len(u) // cells - 1
             assert counts.max() <= len(u) // cells + 1
 
+    @pytest.mark.thorough
     def test_scrambled_coordinates_do_not_run_in_step(self):
         def together(u):
             return np.max(np.abs(np.corrcoef(u[:, -10:].T) - np.eye(10)))

@@ -45,6 +45,7 @@ def test_equals_scipy_bit_for_bit():
     np.testing.assert_array_equal(points(Sobol(scramble=False), 250, 1024), reference)
 
 
+@pytest.mark.thorough
 def test_large_indices():
     cube, search = Cube((0,) * 12), Sobol(scramble=False)
     state = search.init(jax.random.key(0), cube, 16)
@@ -93,6 +94,7 @@ def test_the_key_decides_only_if_scrambled():
     np.testing.assert_array_equal(points(plain, 2, 8, 0), points(plain, 2, 8, 1))
 
 
+@pytest.mark.thorough
 def test_contract():
     for cube in (Cube(()), Cube((0,) * 200)):
         check_search(Sobol(), cube)

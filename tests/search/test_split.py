@@ -27,6 +27,7 @@ CUBE = Cube(
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "search",
     [
@@ -40,6 +41,7 @@ def test_contract(search):
     check_search(search, CUBE)
 
 
+@pytest.mark.thorough
 def test_parts_are_what_they_are_alone():
     search, key = Split({"cars": Halton()}, Uniform()), jax.random.key(0)
     u, _ = search.ask(search.init(key, CUBE, 8), CUBE, 8)
@@ -49,6 +51,7 @@ def test_parts_are_what_they_are_alone():
     assert len(np.unique(np.asarray(u[:, 0]))) == 8
 
 
+@pytest.mark.thorough
 def test_parts_learn_from_their_own_coordinates():
     search = Split({"x": Gradient()}, Uniform())
     ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)

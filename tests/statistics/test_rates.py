@@ -41,6 +41,7 @@ def test_bad_counts_are_refused(arguments):
 
 
 class TestStopping:
+    @pytest.mark.thorough
     def test_interval_holds_at_all_times_together(self):
         # 400 runs of 1000 samples, looked at after every twentieth one: the fixed-size interval
         # would be wrong at some time in about a third of them.

@@ -56,6 +56,7 @@ def whole():
         return sweep(drifting(seeds=2), configurations=5, samples=64)
 
 
+@pytest.mark.thorough
 def test_one_row_a_policy(whole):
     columns = whole.record.columns
     assert list(columns) == [*BEFORE, "rate", *AFTER]
@@ -138,6 +139,7 @@ def test_a_training_that_raises_is_a_row(monkeypatch):
     assert (table["status"] == "trained").sum() == 2 * 2 * 3
 
 
+@pytest.mark.thorough
 def test_algorithms_and_widths_in_one_sweep():
     space = {
         "algorithm": vj.Categorical("slow", "fast"),
@@ -201,6 +203,7 @@ CASES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES)
 def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_path):
     study, how = drifting(), {"samples": 64, **CASES[case]}

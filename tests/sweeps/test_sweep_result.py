@@ -369,12 +369,14 @@ def test_the_picture_is_written(small, tmp_path):
     assert "wanted: below 1 %" in values_of_features
 
 
+@pytest.mark.thorough
 def test_a_large_sweep_shows_what_matters(large):
     figure = large.plot()
     assert figure.axes[2].get_title() == "Importance"
     assert {text.get_text() for text in figure.axes[2].get_yticklabels()} >= {"learning_rate"}
 
 
+@pytest.mark.thorough
 def test_nothing_heavy_is_imported_to_read_a_summary():
     code = (
         "import sys, verifai_jax.sweeps.result\n"

@@ -31,6 +31,7 @@ def mended():
     return repair(first_order, ["k"], 6000)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gradient", [True, False])
 def test_the_least_change_that_is_enough(mended, gradient):
     result = mended if gradient else repair(first_order, "k", 6000, gradient=False)
@@ -68,6 +69,7 @@ def test_the_repaired_problem_is_ready(mended):
     assert mended.problem.space.dim == 2
 
 
+@pytest.mark.thorough
 def test_counterexamples_of_a_run_come_first():
     run = vj.falsify(first_order, "uniform", 512, batch=256)
     result = repair(run, ["k"], 6000, gradient=False)
@@ -114,6 +116,7 @@ def rows():
     return vj.Problem("rows", space, system_of(ROWS), "always abs(x) <= 1")
 
 
+@pytest.mark.thorough
 def test_arrays_of_parameters(rows):
     result = repair(rows, ROWS, 6000, system_of=system_of)
     assert result.repaired
@@ -127,6 +130,7 @@ def test_arrays_of_parameters(rows):
     assert 0.97 < jnp.max(jnp.abs(worst)) <= 1
 
 
+@pytest.mark.thorough
 def test_a_black_box():
     def simulate(features):
         ends = np.exp(-features["k"] * np.arange(41) * 0.1)
@@ -142,6 +146,7 @@ def test_a_black_box():
 NAMES = ["k_x", "k_x_dot", "k_theta", "k_theta_dot"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_cart_pole_is_tuned(gradient):
     result = repair(gains, NAMES, gradient=gradient)
@@ -243,6 +248,7 @@ def test_arrays_must_be_real():
         repair(first_order, {"a": np.ones(2, int)}, system_of=system_of)
 
 
+@pytest.mark.thorough
 def test_command(tmp_path):
     arguments = ["specs/tuning.py:first_order", "--parameters", "k", "--budget", "2500"]
     options = ["--no-gradient", "--attack", "halton", "--held-out", "100"]

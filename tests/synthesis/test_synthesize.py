@@ -37,6 +37,7 @@ def found():
     return synthesize(first_order, ["k"], 6000)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gradient", [True, False])
 def test_the_best_gain_is_found_and_its_margin(found, gradient):
     result = found if gradient else synthesize(first_order, "k", 6000, gradient=False)
@@ -110,6 +111,7 @@ def test_no_gain_is_safe():
     assert "NONE FOUND that holds: the best so far has robustness -0." in str(result)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_all_features_are_parameters(gradient):
     problem = vj.Problem(
@@ -146,6 +148,7 @@ def black_box(features):
     return vj.Trace({"x": x, "u": rate * x}, dt=0.1)
 
 
+@pytest.mark.thorough
 def test_a_black_box_with_a_choice_and_simulations_that_raise():
     problem = vj.Problem(
         "box",

@@ -11,6 +11,7 @@ def step(carry, k):
     return carry, {"carry": carry, "k": k}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("length", [5, 600, 613])
 def test_is_one_scan(length):
     start = jnp.array([0.3, -1.0])

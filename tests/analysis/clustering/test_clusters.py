@@ -27,6 +27,7 @@ def blobs(n=240, seed=0, choices=True):
     return frame.assign(rho=rho), pd.Series(kind)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["auto", "kmeans", "kmodes", "kprototypes", "dbscan"])
 def test_finds_three_blobs(method):
     frame, kind = blobs()
@@ -186,6 +187,7 @@ def test_refused():
         clusters(frame, radius=1.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["kmeans", "kmodes", "kprototypes", "dbscan"])
 def test_tells_and_draws(method, tmp_path):
     found = clusters(blobs()[0], method, columns=["x", "size", "weather"])

@@ -258,6 +258,7 @@ def test_generators():
         generator(-1)
 
 
+@pytest.mark.thorough
 def test_columns_of_every_kind_of_domain():
     item = Struct({"x": Normal(0, 1), "n": DiscreteBox(1, 9), "g": Categorical(3, 1)})
     space = FeatureSpace(

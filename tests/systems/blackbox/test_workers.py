@@ -38,6 +38,7 @@ def outcomes(system, features, seeds=None):
     return [outcome for _, outcome in sorted(found, key=lambda pair: pair[0])]
 
 
+@pytest.mark.thorough
 def test_each_trouble_is_a_row_and_stops_no_other(troublesome):
     found = outcomes(troublesome, [{"a": a} for a in (0, 1, 3, 4, 5, 6, 7, 8, 9.5)])
     messages = [(o.status.name, re.sub(HERE, "", o.message)) for o in found]
@@ -69,6 +70,7 @@ def test_one_simulation_raises_what_went_wrong(troublesome):
         single_trace(iter([(0, late)]))
 
 
+@pytest.mark.thorough
 def test_workers_are_used_again_and_end_with_the_pool(troublesome):
     found = outcomes(troublesome, [{"a": 9}] * 20) + outcomes(troublesome, [{"a": 9}] * 20)
     pids = {int(outcome.trace["x"][0]) for outcome in found}
@@ -81,6 +83,7 @@ def test_workers_are_used_again_and_end_with_the_pool(troublesome):
     assert outcomes(troublesome, [{"a": 0}])[0].status == Status.OK
 
 
+@pytest.mark.thorough
 def test_a_pool_that_is_forgotten_ends_its_workers():
     system = blackbox(host_systems.troublesome, workers=1)
     (outcome,) = outcomes(system, [{"a": 9}])
@@ -206,6 +209,7 @@ def test_a_function_of_the_script_itself(tmp_path):
     assert done.stderr == ""
 
 
+@pytest.mark.thorough
 def test_a_script_without_a_guard_is_told_so(tmp_path):
     done = run(script(tmp_path, SCRIPT + "\n    main()\n"))
     assert done.returncode == 1
@@ -260,6 +264,7 @@ def sleeping(tmp_path):
         process.kill()
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_the_workers(sleeping):
     process, worker = sleeping
     process.send_signal(signal.SIGINT)

@@ -105,6 +105,7 @@ def jitter(observation, key):
     return -observation[:1] + jax.random.normal(key, (1,))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("policy", [push, jitter])
 def test_equal_to_the_environment_stepped_by_hand(policy):
     env, keys = Slide(), episode_keys(KEY)
@@ -181,6 +182,7 @@ def test_gradients_are_finite_differences(changed):
     assert abs(float(slope[0])) > 1e-2
 
 
+@pytest.mark.thorough
 def test_falsified_in_batches(changed):
     problem = vj.Problem(
         "slide",

@@ -56,6 +56,7 @@ def by_hand(name, choose, steps, key, **changes):
     return [np.array(column) for column in zip(*seen, strict=True)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("policy", [lean, right, coin])
 def test_equal_to_the_environment_stepped_by_hand(policy):
     choose = policy if policy is coin else lambda o, key: policy(o)
@@ -81,6 +82,7 @@ def test_an_environment_that_is_over_is_not_reset_in_the_trace():
     assert int(trace.status) == Status.OK
 
 
+@pytest.mark.thorough
 def test_cartpole_is_that_of_our_own_equations():
     policy = load_policy(cp.POLICY_FILE)
     theirs = gymnax(
@@ -179,6 +181,7 @@ def test_time_limit_cuts_only_when_asked():
     assert int(cut({}, KEY).valid) == 6
 
 
+@pytest.mark.thorough
 def test_signal_feature_sets_a_parameter_as_it_changes():
     system = gymnax(
         "Pendulum-v1",

@@ -144,6 +144,7 @@ def full_inertia(compiled):
     return np.stack(full)
 
 
+@pytest.mark.thorough
 def test_inertia_follows_size_and_mass(oracle, in_jax, in_c):
     for got in (in_jax, in_c):
         np.testing.assert_allclose(full_inertia(got), full_inertia(oracle), rtol=1e-9, atol=1e-12)
@@ -202,6 +203,7 @@ def test_what_cannot_be_recomputed_is_refused(source, bind, message):
         model(source, duration=0.02, control_period=0.02, bind={"a": bind})
 
 
+@pytest.mark.thorough
 def test_the_users_model_stays_as_it_is():
     compiled = mujoco.MjModel.from_xml_string(TEXT)
     before = copy.copy(compiled)

@@ -104,6 +104,7 @@ def test_backends_agree_on_how_it_ends(traces):
     assert not in_c.status.any()
 
 
+@pytest.mark.thorough
 def test_rows_are_what_mujoco_gives_for_such_a_model(traces):
     """One row by hand: another model, compiled from a changed spec, stepped with mj_step."""
     spec, features = mujoco.MjSpec.from_file(CART), jax.tree.map(lambda leaf: leaf[1], rows())
@@ -145,6 +146,7 @@ def test_one_simulation_is_its_row_of_the_batch(traces):
     np.testing.assert_array_equal(one.signals["x"], traces[0].signals["x"][2])
 
 
+@pytest.mark.thorough
 def test_a_batch_of_any_size_is_the_same_rows():
     """Sizes share programs, and batches of MuJoCo are used again: no row depends on the others."""
     system = loop(backend="native", terminate=None, duration=0.2)
@@ -248,6 +250,7 @@ def test_default_signals_are_joints_and_sensors():
     assert trace.finite == ("slider", "slider_vel", "hinge", "hinge_vel")
 
 
+@pytest.mark.thorough
 def test_models_come_from_files_text_specs_and_compiled():
     text = Path(CART).read_text()
     sources = [Path(CART), text, mujoco.MjSpec.from_string(text)]
@@ -400,6 +403,7 @@ def test_contacts_need_a_model_that_can_be_given_a_sensor():
         loop(signals={"hit": "contact/pole/cat"})
 
 
+@pytest.mark.thorough
 def test_a_row_in_which_mujoco_raises_is_an_error_and_the_others_go_on(monkeypatch):
     from mujoco.batch import Batch, SimulationError
 

@@ -125,6 +125,7 @@ def test_backends_agree_on_every_kind_of_feature():
             assert max(changes) > 1e-3, name
 
 
+@pytest.mark.thorough
 def test_sensors_are_of_the_instant_but_those_of_acceleration():
     names = ("spin", "roll")
     trace = system(names, backend="native")({"spin": jnp.float32(2.0), "roll": jnp.float32(1.0)})

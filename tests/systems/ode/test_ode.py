@@ -282,6 +282,7 @@ def test_a_state_that_blows_up_is_not_finite_and_not_terminated(terminate):
         np.testing.assert_array_equal(traces.valid, [61, 61, 61])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("unroll", [1, 3])
 @pytest.mark.parametrize("period", [None, 0.05])
 def test_vmap_and_derivatives_agree_with_single_runs(unroll, period):
@@ -456,6 +457,7 @@ def test_names_that_clash_or_are_missing_are_refused():
         twice({}, KEY)
 
 
+@pytest.mark.thorough
 def test_signals_that_are_the_state_are_vouched_for():
     def signals(time, state, control, features):
         return {"p": state["p"], "twice": 2 * state["p"], "inverse": 1 / state["p"]}

@@ -577,6 +577,7 @@ def test_a_simulation_that_takes_too_long():
         assert stuck.refusal() == f"point {first}, {second} took longer than 0.4 s"
 
 
+@pytest.mark.thorough
 def test_time_is_counted_from_when_a_client_can_begin():
     with remote(timeout=0.6) as system:
         peer = Peer(system.address, capacity=8)
@@ -735,6 +736,7 @@ def process(tmp_path, port, *options):
     return subprocess.Popen([*command, *options, f"{file}:simulate"], stderr=subprocess.DEVNULL)
 
 
+@pytest.mark.thorough
 def test_four_clients_one_killed_one_that_sends_garbage(tmp_path):
     space = {"a": vj.Box(-1.0, 1.0), "b": vj.Box(-1.0, 1.0)}
     done = threading.Event()
