@@ -99,7 +99,7 @@ def test_only_constant_columns():
     assert "nothing varies" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_runs_are_described_by_their_search(tmp_path):
     def system(features, key):
         broken = features["a"] > 0.9

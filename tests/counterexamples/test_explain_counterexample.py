@@ -115,7 +115,7 @@ def test_pictures(explained, tmp_path):
     assert [t.get_text() for t in bars.get_yticklabels()] == ["throttle", "mass", "brake"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_absolute_value_over_two_formulas_and_a_black_box():
     def simulate(features):
         x = features["x"] * np.linspace(0, 1, 11)

@@ -95,7 +95,7 @@ def edges():
     return vj.falsify(problem_of("edge", 3, edge), "uniform", 512, batch=512, progress=False)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_edge_of_two_half_spaces(edges):
     for seed, row in enumerate(starts(edges, 3)):
         checked(edges, row, EDGE, EDGE[1], seed=seed)
@@ -191,7 +191,7 @@ def test_without_a_counterexample():
         shrink(run)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_choices_integers_and_a_constraint():
     space = vj.FeatureSpace(
         {
@@ -219,7 +219,7 @@ def test_choices_integers_and_a_constraint():
     assert found.replay().violated
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_black_box_without_gradients():
     problem = problem_of("box", 3, half([0.8, 0.6, 0.0], 0.3), black_box=True)
     run = vj.falsify(problem, "uniform", 64, batch=64, progress=False)
@@ -303,7 +303,7 @@ def test_the_command(edges, tmp_path):
     assert (tmp_path / "run" / f"shrunk-{run.best.name}.png").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [2, 5, 10, 20])
 def test_half_spaces(d):
     a = np.random.default_rng(d).normal(size=d)
@@ -315,7 +315,7 @@ def test_half_spaces(d):
         checked(run, row, fewest_of_half(a, 0.3), 0.3, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("d", [2, 4, 6])
 def test_the_nearer_of_two_modes(d):
     run = vj.falsify(problem_of("modes", d, two_modes), "uniform", 4096, batch=4096, progress=False)
@@ -323,7 +323,7 @@ def test_the_nearer_of_two_modes(d):
         checked(run, row, (1, 0.2), 0.2, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_curved_boundaries():
     def ball(u):
         return jnp.linalg.norm(u - jnp.array([0.8, 0.75, 0.5, 0.5, 0.5]) + 1e-9) - 0.14
@@ -342,7 +342,7 @@ def test_curved_boundaries():
         checked(run, row, (1, 0.2), 0.2, seed=seed, others=seed % 2 == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_robustness_of_two_values():
     def yes_or_no(u):
         return jnp.where((u[0] > 0.75) & (u[2] < 0.3), -1.0, 1.0)

@@ -93,7 +93,7 @@ def test_what_is_recorded_is_what_was_replayed(seen, motion):
     assert seen.problem.system.loop.compiled.geom("ball").size[0] == pytest.approx(0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_mjx_simulated_is_recorded_in_mjx():
     row = {"size": 0.2, "wind": 3.0, "vx": 2.0}
     for precision in ("float32", "float64"):
@@ -184,7 +184,7 @@ def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch
     assert "Cannot initialize a EGL device display.; without a screen set" in message
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("setting", ["disable", "glfw", "egl", None])
 def test_real_settings_draw_or_explain(setting):
     code = f"""

@@ -26,7 +26,7 @@ def jitted(search):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("names", [FLAT, ("mixed",), ("few_of_many",)], ids="-".join)
 def test_beats_uniform(names):
     values = play(SMALL, names, 8, 11, 9, together=False)[1]
@@ -34,13 +34,13 @@ def test_beats_uniform(names):
         assert gain(name, value) > 5, name
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_expected_improvement_beats_uniform():
     (value,) = play(IMPROVEMENT, ("ball",), 8, 11, 9, together=False)[1]
     assert gain("ball", value) > 5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_goes_on_failing():
     u, value = play(SMALL, FLAT, 8, 11, 9, together=False)
     late = value[0, :, -40:] < 0
@@ -68,7 +68,7 @@ def asked(search, cube, rho, rounds, batch=8, valid=True):
     [
         (np.nan, True),
         *(
-            pytest.param(*case, marks=pytest.mark.slow)
+            pytest.param(*case, marks=pytest.mark.thorough)
             for case in [(1.0, True), (-1.0, True), (np.inf, True), (np.nan, False)]
         ),
     ],
@@ -79,7 +79,7 @@ def test_the_same_robustness_everywhere_gives_the_prior(value, valid):
     np.testing.assert_allclose(u, expected, atol=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_space_of_few_points_is_searched_through():
     # Eleven of twelve choices are tried before any is tried again, but for exploration.
     cube = Cube((4, 3), ordered=(False, False))
@@ -94,7 +94,7 @@ def test_a_space_of_few_points_is_searched_through():
     assert int(state.verdicts) == 32
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_huge_values_do_not_hide_the_others():
     # The process sees a bowl whether or not a far part of it is enormous.
     def rho(u):
@@ -123,7 +123,7 @@ def test_what_is_kept():
     assert set(times.tolist()) == {0, 1, 2, 3}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_explores_for_ever_and_more_when_it_leads_nowhere():
     cube, search = Cube((0, 0)), Bayes(capacity=32, candidates=32)
     ask, _ = jitted(search)
@@ -135,7 +135,7 @@ def test_explores_for_ever_and_more_when_it_leads_nowhere():
         assert abs(int(state.explored) / 200 - share) < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("batch", [1, 48])
 @pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
 def test_small_and_large_batches(search, batch):
@@ -149,7 +149,7 @@ def test_small_and_large_batches(search, batch):
     assert np.mean(late[:, ::2]) < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
 def test_contract(search):
     cube = Cube((3, 0, 9), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True))

@@ -37,7 +37,7 @@ EACH = [
         search,
         cube,
         id=f"{search!r}-{name}",
-        marks=pytest.mark.slow if type(search).__name__ in LARGE and name != "empty" else (),
+        marks=pytest.mark.thorough if type(search).__name__ in LARGE and name != "empty" else (),
     )
     for search in SEARCHES
     for name, cube in CUBES.items()

@@ -22,9 +22,9 @@ MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
     [
         (CrossEntropy(), MIXED),
         (Uniform(), Cube((0, 0, 0))),
-        pytest.param(CrossEntropy(), Cube((0, 0, 0)), marks=pytest.mark.slow),
-        pytest.param(Uniform(), MIXED, marks=pytest.mark.slow),
-        pytest.param(CrossEntropy(), Cube(()), marks=pytest.mark.slow),
+        pytest.param(CrossEntropy(), Cube((0, 0, 0)), marks=pytest.mark.thorough),
+        pytest.param(Uniform(), MIXED, marks=pytest.mark.thorough),
+        pytest.param(CrossEntropy(), Cube(()), marks=pytest.mark.thorough),
     ],
     ids=str,
 )
@@ -127,7 +127,7 @@ def modes_found(search, d, count, batch, rounds, seeds, after):
     return np.asarray(jax.jit(jax.vmap(one))(centres, radii, keys))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_all_modes_are_found_where_the_plain_search_finds_few():
     d, count = 4, 6
     plain = modes_found(CrossEntropy(), d, count, 32, 120, 10, after=100)
@@ -137,7 +137,7 @@ def test_all_modes_are_found_where_the_plain_search_finds_few():
     assert np.sum(diverse == count) >= 7
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(("d", "count", "least"), [(2, 5, 4.8), (3, 8, 7.0), (10, 2, 1.5)])
 def test_modes_in_other_dimensions(d, count, least):
     found = modes_found(Diverse(CrossEntropy(), capacity=64), d, count, 32, 200, 20, after=100)
@@ -178,7 +178,7 @@ def test_what_is_near_a_failure_is_told_as_worse_than_safe():
     assert float(seen.rho[3]) == np.float32(0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_gradient_is_that_of_the_raised_robustness():
     cube, search = Cube((0, 0, 0)), Diverse(Descent(), radius=0.3)
     state = search.init(jax.random.key(0), cube, 4)

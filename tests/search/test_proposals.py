@@ -42,7 +42,7 @@ def play(proposals, rounds, gradient):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in ("bayes", "cmaes") else ())
+        pytest.param(name, marks=pytest.mark.thorough if name in ("bayes", "cmaes") else ())
         for name in names()
         if name != "grid"
     ],

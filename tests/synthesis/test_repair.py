@@ -147,7 +147,7 @@ NAMES = ["k_x", "k_x_dot", "k_theta", "k_theta_dot"]
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_a_cart_pole_is_tuned(gradient):
     result = repair(gains, NAMES, gradient=gradient)
     assert result.repaired
@@ -156,7 +156,7 @@ def test_a_cart_pole_is_tuned(gradient):
     assert result.change < (0.3 if gradient else 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_weights_of_a_network():
     """The trained cart-pole network, which fails in three of a hundred environments."""
     layers = cartpole._preferring(load_policy(cartpole.POLICY_FILE))

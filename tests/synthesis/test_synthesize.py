@@ -112,7 +112,7 @@ def test_no_gain_is_safe():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("gradient", [False, pytest.param(True, marks=pytest.mark.thorough)])
 def test_all_features_are_parameters(gradient):
     problem = vj.Problem(
         "all",

@@ -200,7 +200,7 @@ def test_falsified_in_batches(changed):
     assert 0 < len(run.table.counterexamples) < 64
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_keeps_the_contract_of_systems():
     system = brax(Slide(), jitter, steps=30, features={"mass": "mass[0]", "drag": "drag"})
     check_system(system, vj.FeatureSpace({"mass": vj.Box(1.0, 4.0), "drag": vj.Box(0.0, 1.0)}))
@@ -338,7 +338,7 @@ def test_an_error_within_brax_names_the_versions():
         brax("swimmer", push, steps=3, backend="mjx")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_names_in_the_environments_of_brax():
     with pytest.raises(UnknownNameError, match="environment of brax 'hoper'; did you mean 'hopper"):
         brax("hoper", push, steps=3)
@@ -368,7 +368,7 @@ def test_names_in_the_environments_of_brax():
     assert {name: str(place) for name, place in start.items()} == {"a": "q[1]"}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("backend", "path"), [("spring", "link.inertia.mass[pole]"), ("mjx", "body_mass[pole]")]
 )

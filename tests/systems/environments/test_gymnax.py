@@ -145,7 +145,7 @@ def test_gradient_that_the_environment_stops_is_refused():
         jax.eval_shape(jax.grad(lambda t: system({"theta0": t}, KEY)["x"][-1]), 0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_falsified_in_batches():
     problem = vj.Problem(
         "gymnax",
@@ -159,7 +159,7 @@ def test_falsified_in_batches():
     assert run.replay(run.table.counterexamples.index[0]).trace.length < 51
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_keeps_the_contract_of_systems():
     system = gymnax(
         "CartPole-v1", coin, steps=50, features=["masspole"], initial={"spin": "theta_dot"}

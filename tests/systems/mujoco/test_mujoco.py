@@ -83,7 +83,7 @@ def traces():
     return in_c, in_jax
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SIGNALS)
 def test_backends_agree(traces, name):
     in_c, in_jax = traces
@@ -93,7 +93,7 @@ def test_backends_agree(traces, name):
     np.testing.assert_allclose(in_c.signals[name], in_jax.signals[name], atol=2e-5 * scale)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_backends_agree_on_how_it_ends(traces):
     in_c, in_jax = traces
     for name in ("valid", "status"):
@@ -425,7 +425,7 @@ def test_a_row_in_which_mujoco_raises_is_an_error_and_the_others_go_on(monkeypat
     np.testing.assert_array_equal(trace.signals["x"][[0, 2, 3]], alone.signals["x"][[0, 2, 3]])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_one_system_in_both_precisions():
     system = loop(backend="native", terminate=None, duration=0.2)
     single = system.simulate_batch(rows(), KEYS).signals["x"]
