@@ -97,6 +97,19 @@ def test_an_end_that_a_person_or_a_file_wrote_is_rounded_inwards(column, precisi
         space.check({name: np.asarray([0.5, 61.20001]) if name == "vector" else 61.20001})
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_sum_that_is_an_end_but_for_rounding_is_that_end(precision):
+    assert 0.1 + 0.2 > 0.3
+    with in_precision(precision):
+        for domain in (vj.Box(0, 0.3), vj.TruncatedNormal(0, 1, -1, 0.3), vj.Box(0.1 + 0.2, 1)):
+            space = vj.FeatureSpace({"x": domain})
+            value = float(space.coerce({"x": 0.1 + 0.2})["x"])
+            low, high = domain.ends(precision)
+            assert low <= value <= high
+        with pytest.raises(ValueError, match=r"must lie in \[0, 0.3\)"):
+            vj.FeatureSpace({"x": vj.Box(0, 0.3, closed="left")}).check({"x": 0.1 + 0.2})
+
+
 def test_a_run_and_its_table_stay_inside():
     def system(features, key):
         return vj.Trace({"x": features["x"] * jnp.ones(2)}, dt=1.0)

@@ -28,9 +28,9 @@ from verifai_jax.features.ends import (
     check_closed,
     clip_to_ends,
     ends_within,
+    is_inside,
     replace_where,
     round_inwards,
-    rounded_ends,
 )
 
 NARROW = 16
@@ -132,12 +132,7 @@ class Box(Domain):
     def check(self, value: object, name: str) -> None:
         numbers = as_numbers(value, name)
         _check_shape(numbers, self.low, name)
-        first, last = self.ends(np.float64)
-        under, over = rounded_ends(self.low, self.high)  # pyright: ignore[reportArgumentType]
-        inside = (numbers >= first) & (numbers <= last)
-        # An end that was rounded to float32 is that end, if it belongs to the box.
-        inside |= (numbers == under) & (self.closed in ("both", "left"))
-        inside |= (numbers == over) & (self.closed in ("both", "right"))
+        inside = is_inside(numbers, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
         opening = "[" if self.closed in ("both", "left") else "("
         closing = "]" if self.closed in ("both", "right") else ")"
         for column, ok, x, low, high in zip(

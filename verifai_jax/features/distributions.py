@@ -35,9 +35,9 @@ from verifai_jax.features.ends import (
     Reals,
     clip_to_ends,
     ends_within,
+    is_inside,
     replace_where,
     round_inwards,
-    rounded_ends,
 )
 
 OUTERMOST = 2.0**-26
@@ -98,10 +98,7 @@ class Continuous(Domain):
         if number.shape != ():
             raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
         low, high = self.support
-        under, over = rounded_ends(low, high)
-        # An end that was rounded to float32 is that end.
-        inside = low <= number <= high or number in (under, over)
-        if not (inside and np.isfinite(number)):
+        if not (is_inside(number, low, high) and np.isfinite(number)):
             raise ValueError(f"{name} must {_bounds_text(low, high)}; got {short(number.item())}")
         nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
         lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))

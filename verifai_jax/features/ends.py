@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from verifai_jax.core.errors import unknown_name
 
@@ -72,10 +72,18 @@ def replace_where(
     return jnp.where(condition, value + (x - jax.lax.stop_gradient(x)), x)
 
 
-def rounded_ends(low: End, high: End) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends rounded to single precision, as numbers of double precision."""
-    ends = _ends(low, high, np.dtype(np.float64), "both")
-    return ends.under, ends.over
+def is_inside(
+    numbers: Float[np.ndarray, "*shape"], low: End, high: End, closed: str = "both"
+) -> Bool[np.ndarray, "*shape"]:
+    """Return which numbers of double precision lie in intervals, up to rounding.
+
+    One that is an end in single precision is that end, if this belongs to the interval.
+    """
+    first, last, under, over, _ = _ends(low, high, np.dtype(np.float64), closed)
+    single = _single(numbers, np)
+    at_low = (single == under) & (closed in ("both", "left"))
+    at_high = (single == over) & (closed in ("both", "right"))
+    return np.asarray(((numbers >= first) & (numbers <= last)) | at_low | at_high)
 
 
 def round_inwards(
@@ -97,8 +105,9 @@ def round_inwards(
     if inside:
         return value
     xp: Any = np if isinstance(value, np.ndarray) else jnp
-    value = xp.where((value < first) & (value == under), first, value)
-    return xp.where((value > last) & (value == over), last, value)
+    single = _single(value, xp)
+    value = xp.where((value < first) & (single == under), first, value)
+    return xp.where((value > last) & (single == over), last, value)
 
 
 class _Ends(NamedTuple):
@@ -106,7 +115,7 @@ class _Ends(NamedTuple):
 
     - `first`, `last`: the least and the greatest number within.
     - `under`, `over`: the ends as they are rounded to single precision.
-    - `inside`: True where these are within.
+    - `inside`: True where nothing can be rounded to a number outside.
     """
 
     first: np.ndarray
@@ -122,8 +131,16 @@ def _ends(low: End, high: End, dtype: np.dtype, closed: str) -> _Ends:
     first = _at_least(lowest, dtype, closed in ("both", "left"))
     last = np.asarray(-_at_least(np.asarray(-highest), dtype, closed in ("both", "right")))
     under, over = (end.astype(np.float32).astype(dtype) for end in (lowest, highest))
-    inside = bool(np.all(under >= first) and np.all(over <= last))
+    # In double precision a number may be an end but for rounding: 0.1 + 0.2 is more than 0.3.
+    inside = dtype == np.float32 and bool(np.all(under >= first) and np.all(over <= last))
+    inside |= bool(np.all(np.isinf(lowest)) and np.all(np.isinf(highest)))
     return _Ends(first, last, under, over, inside)
+
+
+def _single(value: Any, xp: Any) -> Any:
+    """Return numbers as they are in single precision, in their own."""
+    with np.errstate(over="ignore"):
+        return xp.asarray(value).astype(np.float32).astype(value.dtype)
 
 
 def _at_least(bound: Float[np.ndarray, "*shape"], dtype: DTypeLike, included: bool) -> np.ndarray:
