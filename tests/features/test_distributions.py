@@ -203,3 +203,28 @@ class TestRefused:
     def test_values_outside(self, domain, value, message):
         with pytest.raises(ValueError, match=message):
             domain.check(value, "f")
+
+
+@pytest.mark.parametrize(
+    "domain",
+    [
+        Normal(-3.0, 0.01),
+        TruncatedNormal(0.0, 1.0, 3.5, 4.5),
+        TruncatedNormal(100.0, 30.0, -500.0, 500.0),
+        LogUniform(1e-30, 1e30),
+    ],
+)
+def test_coordinates_reach_central_values_which_are_not_tried(domain):
+    low, high = domain.support
+    if not isinstance(domain, LogUniform):
+        low = max(low, domain.mean - 4 * domain.std)
+        high = min(high, domain.mean + 4 * domain.std)
+    lower, upper = (float(domain.quantile(jnp.float32(u))) for u in (0.25, 0.75))
+    spread = 0.1 * (upper - lower)
+    for share in (0.0, 0.1, 0.5, 0.9, 1.0):
+        value = low + share * (high - low)
+        if isinstance(domain, LogUniform):
+            value = low * (high / low) ** share
+        assert domain._is_central(value)
+        reached = float(domain.from_unit(domain.to_unit(jnp.float32(value))))
+        assert abs(reached - value) <= spread + 1e-5 * abs(value)

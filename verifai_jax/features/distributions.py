@@ -42,6 +42,8 @@ from verifai_jax.features.ends import (
 
 OUTERMOST = 2.0**-26
 """The probability beyond the outermost points: what float32 rounds away when taken from 1."""
+CENTRAL = 4.0
+"""Standard deviations from the mean within which float32 coordinates are closely spaced."""
 DEEPEST = 1e-29
 """Share of a normal distribution that has to lie between the ends of a truncated one."""
 
@@ -100,6 +102,8 @@ class Continuous(Domain):
         low, high = self.support
         if not (is_inside(number, low, high) and np.isfinite(number)):
             raise ValueError(f"{name} must {_bounds_text(low, high)}; got {short(number.item())}")
+        if self._is_central(number.item()):
+            return  # What follows takes JAX a second the first time.
         nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
         lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))
         if abs(nearest - number) > 0.1 * (upper - lower) + 1e-5 * abs(number):
@@ -107,6 +111,10 @@ class Continuous(Domain):
                 f"{name} is so far in the tail of {self!r} that a float32 coordinate cannot reach "
                 f"it; the nearest value is {nearest:.6g}; got {short(number.item())}"
             )
+
+    def _is_central(self, value: float) -> bool:
+        """Return whether a float32 coordinate surely reaches a value of the support."""
+        return False
 
     def columns(self, name: str) -> tuple[str, ...]:
         return (name,)
@@ -147,6 +155,9 @@ class Normal(Continuous):
     @property
     def support(self) -> tuple[float, float]:
         return (-math.inf, math.inf)
+
+    def _is_central(self, value: float) -> bool:
+        return abs(value - self.mean) <= CENTRAL * self.std
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         left = u < 0.5
@@ -223,6 +234,9 @@ class TruncatedNormal(Continuous):
         # The difference of the smaller ones cancels least.
         return below_high - below_low if below_high < 0.5 else 1 - below_low - above_high
 
+    def _is_central(self, value: float) -> bool:
+        return abs(value - self.mean) <= CENTRAL * self.std
+
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         below, _, _, above = self._tails
         left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
@@ -281,6 +295,9 @@ class LogUniform(Continuous):
     @property
     def _width(self) -> float:
         return math.log(self.high) - math.log(self.low)
+
+    def _is_central(self, value: float) -> bool:
+        return True
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         left = u < 0.5
