@@ -21,7 +21,6 @@ from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.confirmation import (
     IN_WORDS,
     MEANING,
-    MOST,
     VERDICTS,
     Checked,
     Confirmer,
@@ -146,7 +145,7 @@ class Confirmations:
 
 @overload
 def confirm(
-    run: Run, row: None = None, *, simulator: Simulator = None, most: int = MOST
+    run: Run, row: None = None, *, simulator: Simulator = None, most: int | None = None
 ) -> Confirmations: ...
 @overload
 def confirm(
@@ -154,7 +153,7 @@ def confirm(
     row: int | np.integer | pd.Series | Mapping[str, Any],
     *,
     simulator: Simulator = None,
-    most: int = MOST,
+    most: int | None = None,
 ) -> Confirmation: ...
 @suggests_options
 def confirm(
@@ -162,7 +161,7 @@ def confirm(
     row: Row = None,
     *,
     simulator: Simulator = None,
-    most: int = MOST,
+    most: int | None = None,
 ) -> Confirmation | Confirmations:
     """Replay counterexamples more finely than they were found, and decide which are real.
 
@@ -173,7 +172,8 @@ def confirm(
       counterexamples of the table when left out.
     - `simulator`: another system for the same features and signals, a problem with one, or the
       name of another backend, that has to agree.
-    - `most`: how many rows are replayed at least; of more, those nearest to zero, until the rest
+    - `most`: how many rows are replayed at least, by default 256, and more where a row takes few
+      replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `confirmation.Confirmer`).
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.

@@ -11,7 +11,7 @@ quarter of the step, there in single precision too, and with features that are o
 and if it fails by more than the finer step has moved it, and by far more than rounding has.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -51,7 +51,9 @@ AMPLIFIED = 4.0
 """Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
 roundings into any of its outcomes, and two or three programs may agree by chance."""
 MOST = 256
-"""Rows that are examined in any case; each costs as much as 15 simulations of the run."""
+"""Rows that are examined in any case, ..."""
+COST = 4096
+"""... or as many as cost so many simulations, where these are more: 15 a row with finer steps."""
 LIMIT = 1024
 """Rows that a falsification examines at most, ..."""
 SHARE = 128
@@ -73,7 +75,7 @@ IN_WORDS = {
 """Each check as people read it."""
 
 
-def describe_checks(checks: Sequence[str], exact_step: bool = False) -> str:
+def describe_checks(checks: Collection[str], exact_step: bool = False) -> str:
     """Describe the checks that a confirmed row has passed, in words.
 
     **Arguments:**
@@ -142,7 +144,8 @@ class Confirmer:
     - `seed`: of the run; a simulation gets the random key that it had.
     - `simulator`: another system for the same features and signals, or a problem with one, that
       has to agree.
-    - `most`: how many rows are examined whatever comes. Of more, those nearest to zero are, and
+    - `most`: how many rows are examined whatever comes; by default 256, and more where a row takes
+      few replays: 2048 where the step stays. Of more, those nearest to zero are, and
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`.
 
@@ -159,9 +162,11 @@ class Confirmer:
         seed: int = 0,
         *,
         simulator: System | Callable[..., Trace] | Problem | str | None = None,
-        most: int = MOST,
+        most: int | None = None,
     ) -> None:
-        if isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1:
+        if most is not None and (
+            isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1
+        ):
             raise ValueError(f"most must be a positive integer; got {most!r}")
         in_precision(precision)
         self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
@@ -193,10 +198,14 @@ class Confirmer:
         if not len(numbers):
             return Checked(np.empty(0, object), {}, np.zeros(0), [], ())
         run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
+        if self._plan is None:
+            self._plan = _make_plan(self, rows)
+            self.checked = describe_checks(self._plan.checks, self.problem.system.exact_step)
+        most = max(MOST, COST // self._plan.cost) if self.most is None else self.most
         order = np.arange(len(numbers)) if run is None else _order(run)
         parts: list[tuple[np.ndarray, _Decision]] = []
         while len(order):
-            free = self.most - self.examined
+            free = most - self.examined
             if run is None:
                 free = len(order)
             elif free <= 0 and self.far(float(np.min(np.abs(run[order])))):
@@ -208,12 +217,13 @@ class Confirmer:
                     break
             block, order = np.split(order, [size])
             taken = {name: column[block] for name, column in rows.items()}
-            parts.append((block, self._examine(taken, numbers[block], taken.get("rho"))))
+            found = self._examine(self._plan, taken, numbers[block], taken.get("rho"))
+            parts.append((block, found))
             self.examined += len(block)
-            lost = np.flatnonzero(parts[-1][1].verdict == "raised")
+            lost = np.flatnonzero(found.verdict == "raised")
             if len(lost) and not self.raised:
-                self.raised = (f"not confirmed: {parts[-1][1].why[lost[0]]}",)
-            self.band = max(self.band, float(np.max(parts[-1][1].band)))
+                self.raised = (f"not confirmed: {found.why[lost[0]]}",)
+            self.band = max(self.band, float(np.max(found.band)))
         return self._join(parts, order, run)
 
     @property
@@ -243,22 +253,22 @@ class Confirmer:
         return bool(abs(rho) > SAFE * self.band)
 
     def _examine(
-        self, rows: Mapping[str, np.ndarray], numbers: np.ndarray, run: np.ndarray | None
+        self,
+        plan: "_Plan",
+        rows: Mapping[str, np.ndarray],
+        numbers: np.ndarray,
+        run: np.ndarray | None,
     ) -> "_Decision":
-        if self._plan is None:
-            self._plan = _make_plan(self, rows)
-            exact = self.problem.system.exact_step
-            self.checked = describe_checks(tuple(self._plan.checks), exact)
         features: dict[str, Any] = {}
         found = {}
-        for name, check in self._plan.checks.items():
+        for name, check in plan.checks.items():
             if check.precision not in features:
                 features[check.precision] = self.problem.space.features_of(rows, check.precision)
             values = features[check.precision]
             if name == "nudged":
                 values = self.problem.space.nudged(values)
             found[name] = check.replays(check.factor, values, numbers)
-        return _decide(len(numbers), found, run, self._plan)
+        return _decide(len(numbers), found, run, plan)
 
     def _join(
         self, parts: list[tuple[np.ndarray, "_Decision"]], rest: np.ndarray, run: np.ndarray | None
@@ -266,8 +276,8 @@ class Confirmer:
         """Join the rows of all parts in their order, and those that were left out."""
         count = sum(len(block) for block, _ in parts) + len(rest)
         verdict = np.full(count, "unexamined", object)
-        # A run that goes on may have examined enough rows before it was interrupted.
-        checks, said = ((), ()) if self._plan is None else (self._plan.checks, self._plan.notes)
+        assert self._plan is not None
+        checks, said = self._plan.checks, self._plan.notes
         rho = {name: np.full(count, np.nan) for name in checks}
         band, why, notes = np.full(count, np.nan), [""] * count, list(said)
         for block, found in parts:
@@ -314,6 +324,11 @@ class _Plan(NamedTuple):
     notes: tuple[str, ...]
     independent: bool
     raised: str = ""
+
+    @property
+    def cost(self) -> int:
+        """Simulations at the run's step that the replays of a row cost."""
+        return max(1, sum(check.factor for check in self.checks.values()))
 
 
 def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
