@@ -27,6 +27,7 @@ import struct
 import subprocess
 import sys
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -250,8 +251,18 @@ def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], A
     try:
         return encoded(point["id"], simulate(features_of(point["features"]), point["seed"]))
     except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-        return _framed({"type": "result", "id": point["id"], "error": message})
+        return _framed({"type": "result", "id": point["id"], "error": described(error)})
+
+
+def described(error: BaseException) -> str:
+    """Write an error in one line, with the line of the simulator where it arose."""
+    words = " ".join(str(error).split())
+    text = f"{type(error).__name__}: {words[:300]}{'...' * (len(words) > 300)}"
+    libraries = (os.path.dirname(os.__file__), os.path.dirname(np.__path__[0]), __file__, "<")
+    for step in reversed(traceback.extract_tb(error.__traceback__)):
+        if not step.filename.startswith(libraries):
+            return f"{text} ({step.filename}, line {step.lineno}, in {step.name})"
+    return text
 
 
 def features_of(value: object) -> Any:

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification.validation import needs_gradient
@@ -51,7 +52,7 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
 
 
 def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple[str, ...]:
-    """Simulate the nominal features once, and return a note if they fail themselves.
+    """Return a note if the nominal features fail themselves; simulated once for each problem.
 
     Nothing is simulated where the problem does not say what is nominal, and where a batch of the
     engine may take long: its program has one shape, however few its rows.
@@ -64,6 +65,15 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
     """
     if problem.nominal is None or isinstance(search, PointList):
         return ()
+    precision = evaluate.engine.precision
+    return problem.programs.get(NOMINAL, precision, lambda: _nominal_note(problem, evaluate))
+
+
+NOMINAL: Slot[str, tuple[str, ...]] = Slot("nominal")
+"""The note on the nominal features, or none, by precision."""
+
+
+def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     engine = evaluate.engine
     if isinstance(engine, HostEngine):
         # One of its own: the journal of the run keeps rows of its table only.
@@ -71,7 +81,8 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
     elif not traced_by_default(problem.system):
         return ()
     space = problem.space
-    varied = {name: problem.nominal[name] for name, domain in space.root.fields if domain.size}
+    nominal = problem.nominal or {}
+    varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
     u = np.asarray(jax.jit(space.flatten)(space.coerce(varied)), np.float32)
     verdict = engine.evaluate(u[None], evaluate.key, 0)
     if not verdict.violated[0]:
