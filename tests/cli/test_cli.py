@@ -230,6 +230,10 @@ def test_exit_codes(call, tmp_path, monkeypatch):
     assert output.splitlines()[-1] == last
     output = call("falsify", "specs/broken.py:raising", *few, "--fail-on", "counterexample", code=3)
     assert "32 error. The first says: RuntimeError: no road (specs/broken.py, line 6" in output
+    for command in ("analyze", "confirm", "shrink", "explain", "replay"):
+        output = call(command, "runs/nan-1", code=3)
+        assert "no simulation of the run in runs/nan-1 had a verdict, of 32" in output
+    assert "status nonfinite" in call("replay", "runs/nan-1", 0, "--no-pictures")
     output = call("estimate", "specs/broken.py:nan", "--budget", 64, code=3)
     assert "no simulation had a verdict" in output
     assert "goes with --p0" in call("estimate", "specs/ramp.py:calm", "--fail-on", "p0", code=2)

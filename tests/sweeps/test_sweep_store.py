@@ -91,9 +91,14 @@ def test_notes(tmp_path):
 def test_files_of_another_kind(tmp_path):
     text = tmp_path / "text.sqlite"
     text.write_text("no database, but longer than the header of one" * 10)
-    with pytest.raises(CacheError, match=r"text\.sqlite is no cache of a sweep: file is not"):
+    with pytest.raises(CacheError, match=r"text\.sqlite is no cache of a sweep: it is a file"):
         Cache(text)
     assert text.read_text().startswith("no database")
+    # So short that SQLite takes it for an empty database.
+    text.write_text("keep me")
+    with pytest.raises(CacheError, match="it is a file of another kind"):
+        Cache(text)
+    assert text.read_text() == "keep me"
     foreign = tmp_path / "foreign.db"
     base = sqlite3.connect(foreign)
     base.execute("CREATE TABLE trials (number INTEGER)")

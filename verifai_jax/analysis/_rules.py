@@ -30,6 +30,8 @@ from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
 FEWEST = 10
 """Failing rows, and safe rows, from which on rules are made and measured."""
+FEW = 100
+"""Failing rows below which their number may be why there is no rule."""
 SUPPORT = 3
 """Failing rows in a rule at least, of those it is made from and of those it is measured on."""
 WORTH = 1.02
@@ -143,9 +145,10 @@ class Rules:
                 f"no rule for the {failures:,} failures of {name!r}: {_UNSUPPORTED}. With more "
                 "failures there may be one"
             )
+        few = f", or are too few ({failures:,} of {len(self.samples):,})" if failures < FEW else ""
         return (
             f"no rule describes the failures of {name!r} much better than chance: "
-            "they lie everywhere, or depend on what is not in the table; "
+            f"they lie everywhere, or depend on what is not in the table{few}; "
             "a greater depth allows more conditions"
         )
 

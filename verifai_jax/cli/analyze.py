@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_run
+from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_judged_run
 
 
 @click.command()
@@ -13,6 +13,6 @@ from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_run
 @FOLDER
 def analyze(folder: Path, target: str | None, into: Path | None) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
-    analysis = load_run(folder, target).analyze()
+    analysis = load_judged_run(folder, target).analyze()
     click.echo(str(analysis))
     click.echo(f"  written      {analysis.save((into or folder) / 'analysis')}")

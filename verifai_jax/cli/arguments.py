@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
+
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
     from verifai_jax.problem import Problem
@@ -137,6 +139,18 @@ def load_problem(target: str, only: str | None = None) -> "Problem":
 
     problem = load_target(target, Problem)
     return problem if only is None else problem.only(*split_names(only))
+
+
+def load_judged_run(folder: Path, target: str | None) -> "Run":
+    """Load the run in a folder as `load_run` does; one without any verdict ends the command."""
+    run = load_run(folder, target)
+    if len(run.table.failed) == run.simulations:
+        raise CommandError(
+            f"no simulation of the run in {folder} had a verdict, of {run.simulations:,}; "
+            f"verifai-jax replay {folder} ROW simulates one again",
+            BROKEN,
+        )
+    return run
 
 
 def load_run(folder: Path, target: str | None) -> "Run":

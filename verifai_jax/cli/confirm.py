@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, fail_on, load_run
+from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, fail_on, load_judged_run
 from verifai_jax.cli.exit_codes import fail_gate
 
 
@@ -24,7 +24,7 @@ def confirm(
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
     from verifai_jax import counterexamples
 
-    run = load_run(folder, target)
+    run = load_judged_run(folder, target)
     result = counterexamples.confirm(run, row, simulator=simulator)
     click.echo(str(result))
     if isinstance(result, counterexamples.Confirmation):

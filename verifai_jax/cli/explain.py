@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_run
+from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run
 
 
 @click.command()
@@ -21,7 +21,7 @@ def explain(
 
     from verifai_jax import counterexamples
 
-    run = load_run(folder, target)
+    run = load_judged_run(folder, target)
     why = counterexamples.explain(run, row)
     click.echo(textwrap.fill(str(why), 88, break_on_hyphens=False))
     if pictures:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_run
+from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run, load_run
 
 
 @click.command()
@@ -29,7 +29,7 @@ def replay(
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
     from verifai_jax.plotting import write_replay_pictures
 
-    run = load_run(folder, target)
+    run = (load_judged_run if row is None else load_run)(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]
     if precision is None:
         assert run.problem is not None

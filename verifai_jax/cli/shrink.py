@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, SEED, load_run
+from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, SEED, load_judged_run
 
 
 @click.command()
@@ -43,7 +43,7 @@ def shrink(
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
     from verifai_jax import counterexamples
 
-    run = load_run(folder, target)
+    run = load_judged_run(folder, target)
     small = counterexamples.shrink(run, row, by=by, budget=budget, seed=seed, others=others)
     click.echo(str(small))
     if pictures:

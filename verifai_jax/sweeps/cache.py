@@ -27,6 +27,8 @@ _MARK = 0x564A5357
 """SQLite's application id of a cache: "VJSW"."""
 _FORMAT = 2
 """Format of the file; files of another format are refused."""
+_BEGIN = b"SQLite format 3\0"
+"""First bytes of a database; an empty file has none yet."""
 _FILE = "sweep.sqlite"
 """Name of the file in a folder."""
 _KINDS = "biufU"
@@ -53,6 +55,7 @@ class Cache:
         self.computed = 0
         """Entries that this process computed."""
         if self.path is not None:
+            _refuse_other_files(self.path)
             self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             # Transactions begin and end in `_transaction`, not by the module.
@@ -196,6 +199,15 @@ class Cache:
             return _decode(json.loads(form), data)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise CacheError(f"{self.path} is damaged in {name!r}: {error}") from error
+
+
+def _refuse_other_files(path: Path) -> None:
+    """Refuse a file that SQLite would take for an empty database, and write over."""
+    if path.is_file():
+        with open(path, "rb") as file:
+            begin = file.read(len(_BEGIN))
+        if begin not in (b"", _BEGIN):
+            raise CacheError(f"{path} is no cache of a sweep: it is a file of another kind")
 
 
 def cache_file(path: Path) -> Path:
