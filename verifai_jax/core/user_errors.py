@@ -35,29 +35,28 @@ MOST_NAMES = 12
 """Names that a message lists."""
 
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
-AS_PYTHON = "or run the system as plain Python, without gradients, by vj.blackbox"
+AS_PYTHON = "; or run the system as plain Python, without gradients, by vj.blackbox"
 
 TRACING: tuple[tuple[type[Exception], str], ...] = (
     (
         jax.errors.TracerBoolConversionError,
         f"it asks whether a value is true, and {ONCE_FOR_ALL}. Choose between values by "
         "jnp.where(condition, one, other), between computations by jax.lax.cond, and join "
-        f"conditions by & and | instead of and and or; {AS_PYTHON}",
+        "conditions by & and | instead of and and or",
     ),
     (
         jax.errors.TracerIntegerConversionError,
         f"it uses a value as a plain integer, an index of a list or a count, and {ONCE_FOR_ALL}. "
-        "Index jnp.array(the_list) instead of the list, and count by jax.lax.fori_loop; "
-        f"{AS_PYTHON}",
+        "Index jnp.array(the_list) instead of the list, and count by jax.lax.fori_loop",
     ),
     (
         jax.errors.TracerArrayConversionError,
-        f"it gives a value to NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np; {AS_PYTHON}",
+        f"it gives a value to NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np",
     ),
     (
         jax.errors.NonConcreteBooleanIndexError,
         f"it selects entries by a condition, and {ONCE_FOR_ALL}, so neither is their number. Use "
-        f"jnp.where(condition, values, other); {AS_PYTHON}",
+        "jnp.where(condition, values, other)",
     ),
     (
         jax.errors.UnexpectedTracerError,
@@ -68,7 +67,7 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
         jax.errors.ConcretizationTypeError,
         f"it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
         f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp in place of math, and "
-        f"jax.lax.fori_loop for a number of turns; {AS_PYTHON}",
+        "jax.lax.fori_loop for a number of turns",
     ),
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
@@ -121,20 +120,24 @@ def source_line(traceback: object) -> str | None:
     return None
 
 
-def explain_user_error(error: BaseException, features: object = None) -> str:
+def explain_user_error(
+    error: BaseException, features: object = None, *, system: bool = True
+) -> str:
     """Write what a user's code did, where, and what to do about it, in one line.
 
     **Arguments:**
 
     - `error`: as the code raised it.
     - `features`: that the code was called with, to tell a misspelt one from another missing key.
+    - `system`: whether the code belongs to a system, which could also run as a black box.
     """
     step = _user_step(error)
     if step is None:
         return _said(error)
     line = _line(step.tb_frame.f_code, step.tb_lineno)
     code = f" (`{shorten(line.code, MOST_CODE)}`)" if line.code else ""
-    return f"{line}{code}: {_sentence(error, step, features)}"
+    more = AS_PYTHON if system and _is_of_tracing(error) else ""
+    return f"{line}{code}: {_sentence(error, step, features)}{more}"
 
 
 def format_user_error(error: BaseException) -> str:
@@ -162,6 +165,11 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
             fields: list[str] = [*getattr(owner, "_fields", ())]
             return f"there is no {name!r}{_known('It has', name, fields)}"
     return _said(error)
+
+
+def _is_of_tracing(error: BaseException) -> bool:
+    kept = isinstance(error, jax.errors.UnexpectedTracerError)
+    return not kept and any(isinstance(error, kind) for kind, _ in TRACING)
 
 
 def _missing_key(key: object, step: TracebackType, features: object) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.text import format_percent
+from verifai_jax.core.user_errors import explain_user_error
 
 SAMPLES = 65_536
 """Samples of the prior at most."""
@@ -41,15 +42,9 @@ def acceptance_rate(
     """
     try:
         answer = jax.eval_shape(where, jax.ShapeDtypeStruct((dim,), jnp.float32))
-    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
-        raise ValueError(
-            "where is traced by JAX, so it cannot use `and`, `or`, `not`, `if` or NumPy on "
-            f"features: use &, |, ~, jnp.where and jnp ({type(error).__name__})"
-        ) from error
     except Exception as error:
-        raise ValueError(
-            f"where raised {type(error).__name__} for the features {list(names)}: {error}"
-        ) from error
+        why = explain_user_error(error, dict.fromkeys(names), system=False)
+        raise ValueError(f"where must be a JAX function of the features: {why}") from error
     if getattr(answer, "shape", None) != () or answer.dtype != jnp.bool_:
         shown = type(answer).__name__
         if hasattr(answer, "shape"):

@@ -104,7 +104,7 @@ def _form(search: Search, name: str, function: Any, *arguments: PyTree) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
     except Exception as error:
-        why = explain_user_error(error).partition("; or run the system as plain Python")[0]
+        why = explain_user_error(error, system=False)
         raise SearchError(f"{name} of search {search!r} cannot be run: {why}") from error
 
 
