@@ -129,6 +129,7 @@ def test_a_failure_is_what_falsify_claims(artefact):
     assert "(as simulated, not confirmed)" in repr(simulated)
 
 
+@pytest.mark.thorough
 def test_a_search_that_plans_learns_what_is_not_claimed(artefact):
     trials = vj.repeat(artefact, "gradient", 60, batch=4, seeds=6)
     assert trials.not_claimed.any()
@@ -142,6 +143,19 @@ def test_a_search_that_plans_learns_what_is_not_claimed(artefact):
         assert trials.first_failure[seed] == (claimed.index[0] + 1 if len(claimed) else np.inf)
 
 
+@pytest.mark.thorough
+def test_double_precision(artefact):
+    trials = vj.repeat(artefact, "gradient", 16, batch=4, seeds=2, precision="float64")
+    for seed in range(2):
+        run = vj.falsify(
+            artefact, "gradient", 16, batch=4, seed=seed, precision="float64", progress=False
+        )
+        count = int(min(trials.first_failure[seed], 16))
+        rho = run.table.all["rho"][:count]
+        np.testing.assert_allclose(trials.rho[seed, :count], rho, atol=1e-6)
+
+
+@pytest.mark.thorough
 def test_a_random_system_loses_no_failure():
     def noisy(features, key):
         x = features["k"] + jax.random.uniform(key)

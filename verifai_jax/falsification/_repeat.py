@@ -190,7 +190,8 @@ def repeat(
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
     claims = SeedClaims(traced, precision, every, not stop_early) if confirm else None
     if search.wants_clauses:
-        with in_precision(precision):
+        # The search is in single precision whatever the simulations are, as in `falsify`.
+        with in_precision("float32"):
             found = lockstep(traced, search, every, budget, batch, precision, stop_early, claims)
         return Trials(
             problem.name,
