@@ -109,6 +109,40 @@ def signal_indexed(f, key):
     return constant(f["wind"][0])
 
 
+def length_of_an_array(f, key):
+    return constant(jnp.zeros(f["mass"].astype(int)).sum())
+
+
+def piece_of_an_array(f, key):
+    return constant(jnp.ones(9)[: f["mass"].astype(int)].sum())
+
+
+def key_of_a_dictionary(f, key):
+    return constant({0: 1.0}[f["mass"]])
+
+
+def writes_a_text(f, key):
+    return constant(float(f"{f['mass']:.2f}"))
+
+
+def writes_into_numpy(f, key):
+    values = np.zeros(3)
+    values[0] = f["mass"]
+    return constant(values.sum())
+
+
+def list_as_a_signal(f, key):
+    return vj.Trace({"x": [f["mass"], 1.0]}, dt=0.1)
+
+
+def function_as_a_signal(f, key):
+    return vj.Trace({"x": f["wind"]}, dt=0.1)
+
+
+def period_that_varies(f, key):
+    return vj.Trace({"x": jnp.ones(3)}, dt=f["mass"])
+
+
 def loops(f, key):
     summed = jax.lax.scan(lambda c, _: (jnp.sum(c), c), jnp.ones(3), None, 5)[0]
     return constant(summed * f["mass"])
@@ -134,6 +168,14 @@ WRONG = [
     (signal_in_jax, 'jnp.sin(f["wind"])', CALLED),
     (signal_in_numpy, 'np.sin(f["wind"])', CALLED),
     (signal_indexed, '["wind"][0]', CALLED),
+    (length_of_an_array, "jnp.zeros(f", "jnp.where(jnp.arange(most) < length"),
+    (piece_of_an_array, "jnp.ones(9)[", "jax.lax.dynamic_slice"),
+    (key_of_a_dictionary, "{0: 1.0}[", "Index a jnp.array"),
+    (writes_a_text, ":.2f", "jax.debug.print"),
+    (writes_into_numpy, "values[0] = ", "jnp in place of np"),
+    (list_as_a_signal, '[f["mass"], 1.0]', "join them by jnp.stack"),
+    (function_as_a_signal, '{"x": f["wind"]}', "call it with the sample times"),
+    (period_that_varies, 'dt=f["mass"]', "dt must be a plain number"),
     (loops, "lax.scan(", "carry input and carry output must have equal types"),
 ]
 
@@ -141,7 +183,7 @@ WRONG = [
 @pytest.mark.parametrize(("system", "code", "words"), WRONG)
 def test_a_system_that_cannot_be_traced(system, code, words):
     problem = vj.Problem("p", SPACE, system, "always x < 2")
-    with pytest.raises(vj.ProblemError) as raised:
+    with unchecked(), pytest.raises(vj.ProblemError) as raised:
         problem.check()
     message = str(raised.value)
     start = LINES[number_of(f"def {system.__name__}(") :]
@@ -153,6 +195,15 @@ def test_a_system_that_cannot_be_traced(system, code, words):
     assert words in message
     assert "\n" not in message
     assert len(message) < 700
+
+
+def test_a_system_without_a_key():
+    def forgetful(f):
+        return constant(f["mass"])
+
+    message = r"called with \(features, key\) \(tests.*test_user_errors.py, line \d+\)$"
+    with pytest.raises(vj.ProblemError, match=message):
+        vj.Problem("p", SPACE, forgetful, "always x < 2").check()
 
 
 def test_the_parts_of_a_closed_loop():

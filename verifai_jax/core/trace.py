@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
 Samples: TypeAlias = (
@@ -72,7 +73,7 @@ class Trace:
             raise ValueError("a trace needs at least one signal; got none")
         lengths = {}
         for name, signal in self.signals.items():
-            shape = np.shape(signal)
+            shape = _shape(name, signal)
             if len(shape) not in (1, 2):
                 raise ValueError(
                     f"signal {name!r} must have shape [time] or [time, k]; got {list(shape)}"
@@ -86,6 +87,11 @@ class Trace:
             raise ValueError("a trace needs at least one sample; got signals of length 0")
         if (self.dt is None) == (self.times is None):
             raise ValueError("a trace has either a sampling period dt or sample times; give one")
+        if isinstance(self.dt, Tracer):
+            raise ValueError(
+                "the sampling period dt must be a plain number, the same in all simulations; got a "
+                "value that JAX traces"
+            )
         if self.dt is not None and not self.dt > 0:
             raise ValueError(f"the sampling period dt must be positive; got {self.dt}")
         if self.times is not None and np.shape(self.times) != (length,):
@@ -154,6 +160,21 @@ class Trace:
             if name == "status" and int(code) != Status.OK:
                 text += f", status {Status(int(code)).name.lower()}"
         return text
+
+
+def _shape(name: str, signal: Samples) -> tuple[int, ...]:
+    if callable(signal):
+        raise ValueError(
+            f"signal {name!r} must be an array of samples; got the function {signal!r}: call it "
+            "with the sample times"
+        )
+    try:
+        return np.shape(signal)
+    except TracerArrayConversionError:
+        raise ValueError(
+            f"signal {name!r} must be an array; got a {type(signal).__name__} of values: join them "
+            "by jnp.stack"
+        ) from None
 
 
 def _is_known(value: Leaf) -> bool:

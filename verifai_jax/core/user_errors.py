@@ -14,6 +14,7 @@ package, nor of Python, nor of an installed library.
 import ast
 import linecache
 import os
+import re
 import sysconfig
 from collections.abc import Callable, Mapping
 from functools import cache
@@ -72,6 +73,31 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
 """
+
+
+WRITES = (
+    f"it writes a value into an array of NumPy, and {ONCE_FOR_ALL}. Use jnp in place of np, and "
+    "array = array.at[i].set(value)"
+)
+
+TRACING_BY_WORDS = {
+    "Shapes must be 1D sequences of concrete": (
+        f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "
+        "length there can be, and jnp.where(jnp.arange(most) < length, values, other)"
+    ),
+    "Slice entries must be static": (
+        f"it cuts out a piece whose ends are values, and {ONCE_FOR_ALL}. Use "
+        "jax.lax.dynamic_slice for a piece of one length, or jnp.where over all entries"
+    ),
+    r"Tracer\.__format__": (
+        f"it writes a value into a text, and {ONCE_FOR_ALL}. Use jax.debug.print to see values"
+    ),
+    r"unhashable type: '\w*Tracer'": (
+        f"it looks a value up in a dictionary or a set, and {ONCE_FOR_ALL}. Index a jnp.array of "
+        "what is to be chosen; a Categorical of texts gives the place of the choice"
+    ),
+}
+"""The same for errors that only their words, patterns of `re`, tell from others."""
 
 
 class UserLine(NamedTuple):
@@ -136,7 +162,8 @@ def explain_user_error(
         return _said(error)
     line = _line(step.tb_frame.f_code, step.tb_lineno)
     code = f" (`{shorten(line.code, MOST_CODE)}`)" if line.code else ""
-    more = AS_PYTHON if system and _is_of_tracing(error) else ""
+    kept = isinstance(error, jax.errors.UnexpectedTracerError)
+    more = AS_PYTHON if system and not kept and _advice_on_tracing(error) else ""
     return f"{line}{code}: {_sentence(error, step, features)}{more}"
 
 
@@ -150,9 +177,8 @@ def format_user_error(error: BaseException) -> str:
 
 
 def _sentence(error: BaseException, step: TracebackType, features: object) -> str:
-    for kind, advice in TRACING:
-        if isinstance(error, kind):
-            return advice
+    if advice := _advice_on_tracing(error):
+        return advice
     if isinstance(error, TypeError) and "Waveform" in str(error):
         return f"{_said(error)}: {IS_CALLED}"
     if isinstance(error, KeyError) and error.args:
@@ -167,9 +193,18 @@ def _sentence(error: BaseException, step: TracebackType, features: object) -> st
     return _said(error)
 
 
-def _is_of_tracing(error: BaseException) -> bool:
-    kept = isinstance(error, jax.errors.UnexpectedTracerError)
-    return not kept and any(isinstance(error, kind) for kind, _ in TRACING)
+def _advice_on_tracing(error: BaseException) -> str:
+    """Write what to do about an error that comes of tracing; empty for others."""
+    # NumPy raises an error of its own from that of JAX.
+    for told in (error, error.__cause__):
+        for kind, advice in TRACING:
+            if isinstance(told, kind):
+                return WRITES if "array element" in str(error) else advice
+    if not isinstance(error, TypeError | IndexError):
+        return ""
+    words = str(error)
+    found = (advice for part, advice in TRACING_BY_WORDS.items() if re.search(part, words))
+    return next(found, "")
 
 
 def _missing_key(key: object, step: TracebackType, features: object) -> str:
@@ -256,7 +291,7 @@ def _user_step(error: BaseException) -> TracebackType | None:
     """Return the innermost step of an error's traceback that lies in a user's file."""
     found, step = None, error.__traceback__
     while step is not None:
-        if _is_user_file(step.tb_frame.f_code.co_filename):
+        if _is_of_user(step.tb_frame):
             found = step
         step = step.tb_next
     return found
@@ -265,6 +300,13 @@ def _user_step(error: BaseException) -> TracebackType | None:
 def _line(code: CodeType, number: int) -> UserLine:
     text = linecache.getline(code.co_filename, number).strip()
     return UserLine(_shown_file(code.co_filename), number, code.co_name, text)
+
+
+def _is_of_user(frame: FrameType) -> bool:
+    file = frame.f_code.co_filename
+    # Functions that dataclasses make belong to the module of the class.
+    module = frame.f_globals.get("__file__") if file == "<string>" else None
+    return _is_user_file(file) and (module is None or _is_user_file(module))
 
 
 @cache

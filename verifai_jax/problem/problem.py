@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import defined_at, explain_user_error
+from verifai_jax.core.user_errors import defined_at, explain_user_error, user_line
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.evaluate import End
@@ -225,6 +225,9 @@ class Problem:
 
     def _wrong_system(self, error: Exception, features: Mapping[str, Any]) -> ProblemError:
         why = explain_user_error(error, features)
+        if isinstance(error, TypeError) and "positional arg" in why and user_line(error) is None:
+            function = getattr(self.system, "__wrapped__", self.system)
+            why += f"; a system is called with (features, key){defined_at(function)}"
         return ProblemError(f"the system of problem {self.name!r} cannot be simulated: {why}")
 
     def __str__(self) -> str:
