@@ -82,6 +82,16 @@ def test_a_feature_that_nothing_reads():
     assert notes_of(both, space=space) == ()
 
 
+def test_a_choice_compared_with_a_text():
+    def system(f, key):
+        return vj.Trace({"x": (1.0 if f["alg"] == "sac" else f["a"]) * jnp.ones(3)}, dt=1.0)
+
+    space = {"a": vj.Box(0, 1), "alg": vj.Categorical("ppo", "sac")}
+    (note,) = notes_of(system, space=space)
+    assert note.startswith("feature 'alg' influences no signal")
+    assert note.endswith("has the place of the choice as its value, which no text equals")
+
+
 def test_a_state_of_a_loop_that_is_not_monitored():
     loop = vj.ode(
         lambda t, s, u, f: {"x": f["a"], "y": f["b"]},

@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.user_errors import source_line
-from verifai_jax.features import Domain
+from verifai_jax.features import Categorical, Domain
 from verifai_jax.features.compound import Struct
 from verifai_jax.mtl import Formula
 from verifai_jax.mtl.formula import Always, Eventually, Next, Until
@@ -36,6 +36,9 @@ END_OF_TRACE = {
     "hold": "its last sample is taken for all that comes after",
     "truncate": "what comes after is left out",
 }
+
+COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
+"""Advice on a choice that seems to be read: a comparison with a text is false, silently."""
 
 MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
 """Sentences on a problem."""
@@ -150,10 +153,12 @@ def _unread(problem: Problem, program: ClosedJaxpr, features: PyTree) -> Iterato
     if unread:
         one = len(unread) == 1
         more = f" and {len(unread) - 6} more" if len(unread) > 6 else ""
+        domains = [problem.space.domains[names[0]] for names in unread]
+        texts = any(isinstance(d, Categorical) and not d.numeric for d in domains)
         yield (
             f"feature{'' if one else 's'} {shown}{more} influence{'s' if one else ''} no signal "
             f"that the property speaks of ({', '.join(problem.monitored)}): "
-            f"the search varies {'it' if one else 'them'} for nothing"
+            f"the search varies {'it' if one else 'them'} for nothing{COMPARED if texts else ''}"
         )
 
 
