@@ -54,8 +54,9 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
 def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple[str, ...]:
     """Return a note if the nominal features fail themselves; simulated once for each problem.
 
-    Nothing is simulated where the problem does not say what is nominal, and where a batch of the
-    engine may take long: its program has one shape, however few its rows.
+    Nothing is simulated where the problem does not say what is nominal, and where it may take long:
+    an engine's program has one shape, however few its rows, and one of MuJoCo is compiled for each
+    number of rows.
 
     **Arguments:**
 
@@ -63,7 +64,7 @@ def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple
     - `evaluate`: the run's own, compiled.
     - `search`: of the run.
     """
-    if problem.nominal is None or isinstance(search, PointList):
+    if problem.nominal is None or problem.system.backends or isinstance(search, PointList):
         return ()
     precision = evaluate.engine.precision
     return problem.programs.get(NOMINAL, precision, lambda: _nominal_note(problem, evaluate))
