@@ -167,6 +167,12 @@ class TestRuns:
         again = vj.resume(found, budget=48)
         assert again.notes[0].startswith(note)
 
+    def test_what_may_take_long_is_not_simulated_for_it(self, monkeypatch):
+        monkeypatch.setattr("verifai_jax.falsification.silent_mistakes.MOST_SAMPLES", 100)
+        nominal = {"a": 0.5, "b": 0.5}
+        problem = vj.Problem("p", SPACE, both, "always x + y < 0.9", nominal=nominal)
+        assert vj.falsify(problem, "uniform", 40, batch=40).notes == ()
+
     def test_the_table_is_the_same(self):
         problem = vj.Problem("p", SPACE, both, "always x < 0.2")
         told = vj.Problem("p", SPACE, both, "always x < 0.2", nominal={"a": 0.5, "b": 0.5})

@@ -21,7 +21,7 @@ from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
-from verifai_jax.problem.silent_mistakes import silent_mistakes, traced_by_default
+from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, traced_by_default
 from verifai_jax.search import PointList, Search
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
 NOMINAL_FAILS = "the nominal features fail themselves"
 """Beginning of the note that they do."""
+MOST_SAMPLES = 5_000_000
+"""Samples of a whole batch up to which it is simulated for the nominal features alone."""
 HARDLY_MOVES = 0.05
 """Share of its least value within which a robustness hardly moves."""
 
@@ -79,7 +81,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     if isinstance(engine, HostEngine):
         # One of its own: the journal of the run keeps rows of its table only.
         engine = HostEngine(problem, engine.precision, monitor=engine.monitor)
-    elif not traced_by_default(problem.system):
+    elif not is_quick(problem) or _samples(problem, engine.padded) > MOST_SAMPLES:
         return ()
     space = problem.space
     nominal = problem.nominal or {}
@@ -92,6 +94,11 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         f"{NOMINAL_FAILS}, with robustness {verdict.least[0]:.4g}: "
         "are the formula and its units right?",
     )
+
+
+def _samples(problem: Problem, rows: int) -> int:
+    form = problem.form()
+    return rows * (1 if form is None else form.length)
 
 
 def notes_after(

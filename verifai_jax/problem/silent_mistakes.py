@@ -44,6 +44,10 @@ MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
 """Sentences on a problem."""
 
 
+SECONDS: Slot[None, float] = Slot("seconds of tracing")
+"""Seconds that one tracing of a problem's system takes."""
+
+
 def silent_mistakes(problem: Problem) -> tuple[str, ...]:
     """Return a sentence for each mistake of a problem that no error tells; found once.
 
@@ -105,7 +109,9 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
     started = time.perf_counter()
     program = _program(problem, features, key)
     yield from _unread(problem, program, features)
-    if time.perf_counter() - started > PATIENCE:
+    seconds = time.perf_counter() - started
+    problem.programs.get(SECONDS, None, lambda: seconds)
+    if seconds > PATIENCE:
         return
     differs, line = difference(program, _program(problem, features, key))
     if differs:
@@ -127,6 +133,12 @@ def traced_by_default(system: System) -> bool:
 
 
 @truncate_silently()
+def is_quick(problem: Problem) -> bool:
+    """Return whether a system was quick to trace, so that it is likely quick to simulate."""
+    seconds = problem.programs.peek(SECONDS, None)
+    return seconds is not None and seconds <= PATIENCE
+
+
 def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
     """Trace from features to the monitored signals, and the length of what counts of them."""
 
