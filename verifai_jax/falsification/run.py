@@ -268,13 +268,18 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
     - `problem`: needed to replay rows; a file names no code to run.
 
-    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record of
-    another format, or a problem whose name, formulas or features differ from the recorded ones.
+    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record that is
+    damaged or of another format, or a problem whose name, formulas or features differ from the recorded ones.
     """
     folder = Path(path)
     if not (folder / RECORD).exists():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
-    record = json.loads((folder / RECORD).read_text())
+    try:
+        record = json.loads((folder / RECORD).read_text())
+    except ValueError:
+        record = None
+    if not isinstance(record, dict):
+        raise ValueError(f"no run in {folder}: its {RECORD} is damaged, or of another program")
     if record.get("format") != FORMAT:
         raise ValueError(
             f"{folder / RECORD} has format {record.get('format')!r}, and this version of "
