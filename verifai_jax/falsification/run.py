@@ -269,7 +269,8 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     - `problem`: needed to replay rows; a file names no code to run.
 
     **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record that is
-    damaged or of another format, or a problem whose name, formulas or features differ from the recorded ones.
+    damaged or of another format, or a problem whose name, formulas or features differ from the
+    recorded ones.
     """
     folder = Path(path)
     if not (folder / RECORD).exists():
