@@ -132,13 +132,13 @@ def traced_by_default(system: System) -> bool:
     )
 
 
-@truncate_silently()
 def is_quick(problem: Problem) -> bool:
     """Return whether a system was quick to trace, so that it is likely quick to simulate."""
     seconds = problem.programs.peek(SECONDS, None)
     return seconds is not None and seconds <= PATIENCE
 
 
+@truncate_silently()
 def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
     """Trace from features to the monitored signals, and the length of what counts of them."""
 
