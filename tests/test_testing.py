@@ -42,7 +42,7 @@ class Crooked(Box):
 )
 def test_domains(flaw, message):
     with pytest.raises(AssertionError, match=message):
-        check_domain(Crooked(1, 3, flaw))
+        check_domain(Crooked(1, 3, flaw=flaw))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -83,6 +83,7 @@ def test_failures_are_those_of_the_samples(certificates):
         assert row.failures == np.sum(x > np.float32(t))
 
 
+@pytest.mark.thorough
 def test_the_attack_meets_what_samples_miss(certificates):
     for row, t in zip(certificates.rows, THRESHOLDS, strict=True):
         # The corner x = 1 is the worst there is.

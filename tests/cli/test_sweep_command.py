@@ -131,6 +131,7 @@ def test_errors_in_one_line(call, tmp_path):
     assert not (tmp_path / "sweeps").exists()
 
 
+@pytest.mark.thorough
 def test_only_some_vary(call):
     output = call(
         "specs/drift.py:safe",

@@ -66,6 +66,7 @@ def test_the_predicate_the_instant_and_the_features(explained):
     assert [i.name for i in explained.matter] == ["throttle", "mass"]
 
 
+@pytest.mark.thorough
 def test_single_control_points_and_slopes(explained):
     throttle = next(i for i in explained.influences if i.name == "throttle")
     gains = np.array([5 * 60, 5 * 40, 5 * 30, 3 * 20]) / 0.9

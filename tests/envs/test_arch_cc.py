@@ -133,6 +133,7 @@ def test_located_transitions_do_not_depend_on_the_step(located):
         finer.refined(0)
 
 
+@pytest.mark.thorough
 def test_single_precision_keeps_the_gaps():
     system, inputs = cc.chasing_cars(25.0), {"throttle": 1.0, "brake": 0.1}
     double = jax.jit(system.__call__)(inputs)

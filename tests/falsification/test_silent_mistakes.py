@@ -128,6 +128,7 @@ def test_a_formula_that_looks_beyond_the_trace():
         assert notes_of(both, spec) == ()
 
 
+@pytest.mark.thorough
 def test_the_specifications_of_this_project_get_no_false_note():
     checked = 0
     for file in sorted((ROOT / "specs").glob("**/*.py")):
@@ -194,6 +195,7 @@ class TestRuns:
         (note,) = vj.falsify(vj.Problem("p", SPACE, both, spec), "uniform", 40, batch=40).notes
         assert note.startswith("formula 'far' was never near being violated: its robustness lay")
 
+    @pytest.mark.thorough
     def test_a_search_that_follows_slopes_where_there_are_none(self):
         def steps(f, key):
             return vj.Trace({"x": jnp.floor(4 * f["a"] + f["b"]) * jnp.ones(3)}, dt=1.0)

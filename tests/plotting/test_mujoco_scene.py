@@ -103,6 +103,7 @@ def test_what_mjx_simulated_is_recorded_in_mjx():
         np.testing.assert_array_equal(motion.pushes[:, 1, 0], 3.0)
 
 
+@pytest.mark.thorough
 def test_the_picture_shows_the_ball_where_it_was(motion, gl):
     for sample, picture in zip([0, 10], scene.frames(motion, [0, 10], SIZE), strict=True):
         x, z = motion.qpos[sample, 0], 1.5 + motion.qpos[sample, 1]

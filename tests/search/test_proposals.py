@@ -194,6 +194,7 @@ def test_a_search_of_ones_own_that_leaves_the_cube(wrong, message):
         Proposals(Own(wrong), cube, 16, KEY).next(16)
 
 
+@pytest.mark.thorough
 def test_a_search_of_ones_own_that_is_right():
     cube = vj.FeatureSpace({"x": vj.Box(0, 1), "y": vj.Box(0, 1)}).cube
     check_search(Own(), cube)

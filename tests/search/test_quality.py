@@ -77,6 +77,7 @@ def test_beats_uniform_in_fifty_dimensions(search, name):
     assert gain(name, played(search, name)[1]) > GAIN[search]
 
 
+@pytest.mark.thorough
 @EACH
 def test_is_not_much_worse_than_uniform_where_nothing_can_be_learned(search):
     if (type(search), "needle") in POINTLESS:
@@ -84,6 +85,7 @@ def test_is_not_much_worse_than_uniform_where_nothing_can_be_learned(search):
     assert gain("needle", played(search, "needle")[1]) > 1 / 1.6
 
 
+@pytest.mark.thorough
 @EACH
 def test_goes_on_to_other_failures(search):
     u, value = played(search, "saddles")

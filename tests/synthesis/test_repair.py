@@ -43,6 +43,7 @@ def test_the_least_change_that_is_enough(mended, gradient):
     assert result.simulations <= 6000
 
 
+@pytest.mark.thorough
 def test_rates_before_and_after(mended):
     # The share of environments in which x goes too far with the gain of 0.5.
     rng = np.random.default_rng(0)

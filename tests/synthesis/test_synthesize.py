@@ -52,6 +52,7 @@ def test_the_best_gain_is_found_and_its_margin(found, gradient):
     assert result.held_out.bound == pytest.approx(1 - 0.05 ** (1 / 2000))
 
 
+@pytest.mark.thorough
 def test_the_tables(found):
     assert list(found.candidates) == ["k", "rho", "environments"]
     assert list(found.environments) == ["x0", "w", "rho"]

@@ -130,6 +130,7 @@ def test_rows_are_what_mujoco_gives_for_such_a_model(traces):
     assert np.ptp(xs) > 0.1
 
 
+@pytest.mark.thorough
 def test_samples_behind_the_end_repeat_it(traces):
     for trace in traces:
         for name, signal in trace.signals.items():
