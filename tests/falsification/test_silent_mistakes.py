@@ -202,4 +202,4 @@ class TestRuns:
 
         problem = vj.Problem("p", SPACE, steps, "always x < 4")
         notes = vj.falsify(problem, "gradient", 16, batch=16).notes
-        assert any("follows slopes and there are none" in note for note in notes)
+        assert any("follows gradients and there are none" in note for note in notes)

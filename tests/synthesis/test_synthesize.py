@@ -193,16 +193,16 @@ def test_exactly_zero_is_decided_by_the_comparator():
 
 
 def test_ctrl_c_returns_what_is_finished(monkeypatch):
-    judge, calls = FeatureParameters.judge, 0
+    evaluate, calls = FeatureParameters.evaluate, 0
 
     def interrupted(self, *arguments):
         nonlocal calls
         calls += 1
         if calls > 30:
             raise KeyboardInterrupt
-        return judge(self, *arguments)
+        return evaluate(self, *arguments)
 
-    monkeypatch.setattr(FeatureParameters, "judge", interrupted)
+    monkeypatch.setattr(FeatureParameters, "evaluate", interrupted)
     result = synthesize(first_order, ["k"], 6000)
     assert result.stopped == "interrupted"
     assert result.held_out is None
@@ -226,12 +226,12 @@ def test_parameters_of_every_kind_can_be_held():
     problem = vj.Problem("kinds", space, system, "always x >= 0")
     loop = FeatureParameters(problem, ["point", "count", "kind", "wave"], batch=8, gradient=False)
     theta = np.random.default_rng(1).random(loop.dim)
-    rho = loop.judge(theta[None], np.array([[0.25]])).rho[0, 0]
+    rho = loop.evaluate(theta[None], np.array([[0.25]])).rho[0, 0]
     held = loop.with_parameters(theta)
     assert held.space.dim == 1
     assert loop.values(theta)["kind"] in ("slow", "fast")
     again = FeatureParameters(held, ["e"], batch=8, gradient=False)
-    assert again.judge(np.array([[0.25]]), np.zeros((1, 0))).rho[0, 0] == pytest.approx(rho)
+    assert again.evaluate(np.array([[0.25]]), np.zeros((1, 0))).rho[0, 0] == pytest.approx(rho)
 
 
 @pytest.mark.parametrize(

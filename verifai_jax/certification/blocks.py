@@ -133,11 +133,11 @@ class Blocks:
         notes = list(self._notes)
         for simulator, places in self._simulators:
             if isinstance(simulator, SeparateSimulators):
-                told = simulator.messages
+                messages = simulator.messages
                 notes += [
-                    f"a simulation of policy {number} raised {told[place]}"
+                    f"a simulation of policy {number} raised {messages[place]}"
                     for number, place in places.items()
-                    if place in told
+                    if place in messages
                 ]
         return tuple(notes)
 
@@ -218,10 +218,10 @@ class Blocks:
             jax.eval_shape(simulated, policy, u, jax.eval_shape(lambda: jax.random.key(0)))
         except Exception as error:
             # With the numbers themselves it worked.
-            told = str(error).strip().split("\n")[0]
+            reason = str(error).strip().split("\n")[0]
             self._notes.append(
                 f"compiled one by one: {_list_policies(numbers)}; JAX could not trace "
-                f"problem_of in the policy's numbers ({type(error).__name__}: {told[:120]})"
+                f"problem_of in the policy's numbers ({type(error).__name__}: {reason[:120]})"
             )
             return False
         return True
@@ -296,9 +296,9 @@ def _check_same(first: Problem, problem: Problem, number: int) -> None:
 
 def _common_digest(problem: Problem, seed: int, lanes: int) -> str:
     """Hash all that blocks depend on but the policy and the samples; code is not in it."""
-    told = [problem.name, str(dict(problem.formulas)), problem.end, str(problem.space.columns)]
-    told += [str(problem.space.levels), str(seed), str(lanes), "float32"]
-    return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
+    parts = [problem.name, str(dict(problem.formulas)), problem.end, str(problem.space.columns)]
+    parts += [str(problem.space.levels), str(seed), str(lanes), "float32"]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def _fill_block(points: Float[np.ndarray, "m d"], lanes: int) -> Float[np.ndarray, "lanes d"]:

@@ -96,10 +96,10 @@ def digest(policy: Any, number: int = 0) -> str:
     if not is_numeric(policy):
         return f"policy-{number}"
     policy = jax.tree.map(_on_host, policy)
-    told = hashlib.sha256(structure_of(policy).encode())
+    digest = hashlib.sha256(structure_of(policy).encode())
     for leaf in jax.tree.leaves(policy):
-        told.update(np.ascontiguousarray(leaf).tobytes())
-    return told.hexdigest()[:32]
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:32]
 
 
 def _on_host(leaf: Any) -> np.ndarray:

@@ -299,8 +299,8 @@ class Engine:
                 robustness(formula, trace, semantics, end=self.problem.end)
                 for formula in self.problem.formulas.values()
             ]
-            judged = trace_verdict(self.problem, trace)
-            return jnp.min(jnp.stack(smoothed)), (*judged, features)
+            verdict = trace_verdict(self.problem, trace)
+            return jnp.min(jnp.stack(smoothed)), (*verdict, features)
 
         gradient, (rho, status, features) = self._derivative(objective, coordinates)
         dtype = coordinates.dtype
@@ -322,8 +322,8 @@ class Engine:
             trace = system(features, key).hold()
             values = goals.values(trace, hard, self.problem.end)
             nearest = jnp.argmin(jnp.max(values, axis=1))
-            judged = trace_verdict(self.problem, trace)
-            results = (*judged, features, values[nearest])
+            verdict = trace_verdict(self.problem, trace)
+            results = (*verdict, features, values[nearest])
             if not self.gradient:
                 return values[nearest], results
             semantics = smooth(temperature.astype(dtype))

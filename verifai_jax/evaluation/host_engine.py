@@ -42,7 +42,7 @@ class HostMonitor:
     """The compiled monitor of a problem for batches of traces that came from the host."""
 
     def __init__(self, problem: Problem) -> None:
-        self._judge = jax.jit(jax.vmap(lambda trace: trace_verdict(problem, trace)))
+        self._decide = jax.jit(jax.vmap(lambda trace: trace_verdict(problem, trace)))
         self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
 
     def __call__(
@@ -50,7 +50,7 @@ class HostMonitor:
     ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, " n"], Bool[np.ndarray, "n k"]]:
         """Return robustness, status and Boolean semantics, in one shape for many `count`."""
         padded = jax.tree.map(_power_of_two, traces)
-        rho, status = (np.asarray(leaf)[:count] for leaf in self._judge(padded))
+        rho, status = (np.asarray(leaf)[:count] for leaf in self._decide(padded))
         holds = np.ones(rho.shape, bool)
         if np.any(rho == 0):
             # Now, while the traces are here: simulating again may be dear.
@@ -203,10 +203,10 @@ class _Waiting:
 
     def __init__(
         self,
-        judge: Callable[[Sequence[Trace]], list[RowVerdict]],
+        decide: Callable[[Sequence[Trace]], list[RowVerdict]],
         keep: Callable[[int, RowVerdict], None],
     ) -> None:
-        self._judge, self._keep = judge, keep
+        self._decide, self._keep = decide, keep
         self._blocks: dict[Any, list[tuple[int, Trace]]] = {}
         self._since = time.monotonic()
 
@@ -225,7 +225,7 @@ class _Waiting:
 
     def _settle(self, form: Any) -> None:
         block = self._blocks.pop(form)
-        verdicts = self._judge([trace for _, trace in block])
+        verdicts = self._decide([trace for _, trace in block])
         for (row, _), verdict in zip(block, verdicts, strict=True):
             self._keep(row, verdict)
 

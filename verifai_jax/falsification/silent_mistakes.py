@@ -47,7 +47,7 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
     notes = silent_mistakes(problem)
     if needs_gradient(search) and traced_by_default(problem.system) and not has_gradient(problem):
         notes += (
-            f"search {search!r} follows slopes and there are none: the robustness is constant "
+            f"search {search!r} follows gradients and there are none: the robustness is constant "
             "between jumps; use 'cross_entropy' or another search without gradients",
         )
     return notes

@@ -48,12 +48,12 @@ def check_contract(search: Search, cube: Cube) -> None:
         return
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     state = _form(search, "init", lambda key: search.init(key, cube, BATCH), key)
-    asked = _form(search, "ask", lambda state: search.ask(state, cube, BATCH), state)
-    if not (isinstance(asked, tuple) and len(asked) == 2):
+    proposed = _form(search, "ask", lambda state: search.ask(state, cube, BATCH), state)
+    if not (isinstance(proposed, tuple) and len(proposed) == 2):
         raise SearchError(
-            f"ask of search {search!r} must return (points, state); got {type(asked).__name__}"
+            f"ask of search {search!r} must return (points, state); got {type(proposed).__name__}"
         )
-    points, following = asked
+    points, following = proposed
     shape, dtype = getattr(points, "shape", None), np.dtype(getattr(points, "dtype", object))
     if shape != (BATCH, cube.dim) or not jnp.issubdtype(dtype, jnp.floating):
         got = type(points).__name__ if shape is None else f"{dtype}{list(shape)}"
@@ -65,8 +65,8 @@ def check_contract(search: Search, cube: Cube) -> None:
     _check_state(search, "ask", state, following)
     if search.learns:
         rows = _rows(search, cube)
-        told = _form(search, "tell", lambda s, rows: search.tell(s, cube, rows), state, rows)
-        _check_state(search, "tell", state, told)
+        updated = _form(search, "tell", lambda s, rows: search.tell(s, cube, rows), state, rows)
+        _check_state(search, "tell", state, updated)
 
 
 def check_points(search: Search, cube: Cube, points: Float[Any, "n d"]) -> None:

@@ -269,7 +269,7 @@ class _Repair:
         if len(rows):
             order = np.argsort(rows["rho"].to_numpy(), kind="stable")[: 4 * ADDED]
             points = space.points(rows.iloc[order])
-            pairs = self.loop.judge(self.start[None], points)
+            pairs = self.loop.evaluate(self.start[None], points)
             failing = pairs.violates(self.margin)[0]
             self.environments = points[failing][: 2 * ADDED].astype(np.float32)
             if failing.any():

@@ -321,7 +321,7 @@ class _Synthesis:
         chosen = list(thetas.values())[: min(CANDIDATES, affordable)]
         if not chosen:
             return
-        pairs = self.loop.judge(np.stack([c.theta for c in chosen]), self.environments)
+        pairs = self.loop.evaluate(np.stack([c.theta for c in chosen]), self.environments)
         values = worst_case(pairs)
         self.final = [
             Choice(c.theta, float(v), len(self.environments))

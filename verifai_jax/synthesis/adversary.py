@@ -105,7 +105,7 @@ def attack(
         if not len(points):
             break
         warm = float(proposals.temperature) if search.wants_gradient else None
-        pairs = loop.judge(theta[None], points, warm)
+        pairs = loop.evaluate(theta[None], points, warm)
         parts.append((points, pairs))
         # A pair that cannot happen tells the search nothing.
         counted = pairs.proper[0] & np.isfinite(pairs.rho[0])
@@ -144,7 +144,7 @@ def _descend(
         tried.append(beside)
         down = -np.sign(gradients) * free
         moved = np.stack([np.clip(points + step * down, 0.0, 1.0) for step in STEPS], axis=1)
-        pairs = loop.judge(theta[None], moved.reshape(-1, points.shape[1]))
+        pairs = loop.evaluate(theta[None], moved.reshape(-1, points.shape[1]))
         tried.append((moved.reshape(-1, points.shape[1]), pairs))
         rho = np.where(pairs.proper[0], pairs.rho[0], np.inf).reshape(len(points), len(STEPS))
         least, which = rho.min(axis=1), rho.argmin(axis=1)
@@ -165,7 +165,7 @@ def _gradients(
 ) -> tuple[Float[np.ndarray, "n d"], tuple[np.ndarray, Pairs]]:
     """Return gradients by the environment, or differences, and what was simulated for them."""
     if loop.differentiable:
-        pairs = loop.judge(theta[None], points, warmth)
+        pairs = loop.evaluate(theta[None], points, warmth)
         assert pairs.by_environment is not None
         return pairs.by_environment[0], (points, pairs)
     places = np.flatnonzero(free)
@@ -173,7 +173,7 @@ def _gradients(
     gaps = np.where(points[:, places] > 0.5, -GAP, GAP)
     beside[:, 1 + np.arange(len(places)), places] += gaps
     rows = beside.reshape(-1, points.shape[1])
-    pairs = loop.judge(theta[None], rows)
+    pairs = loop.evaluate(theta[None], rows)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)[0]
     rho = rho.reshape(len(points), -1)
     gradients = np.zeros(points.shape)

@@ -99,7 +99,7 @@ def held_out(
     for start in range(0, len(points), ROUND):
         if limits is not None and limits.timed_out:
             break
-        pairs = loop.judge(theta[None], points[start : start + ROUND])
+        pairs = loop.evaluate(theta[None], points[start : start + ROUND])
         short = pairs.violates(margin) & ~pairs.failing
         parts.append((pairs.rho[0], pairs.proper[0], pairs.failing[0], short[0]))
     none = (np.zeros(0), *[np.zeros(0, bool)] * 3)

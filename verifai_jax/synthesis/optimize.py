@@ -99,7 +99,7 @@ def evaluate(
     loop: Parametric, thetas: Thetas, environments: Environments, archive: Archive | None = None
 ) -> Float[np.ndarray, " k"]:
     """Evaluate parameters `[k, p]` over the set; return their values."""
-    values = worst_case(loop.judge(thetas, environments))
+    values = worst_case(loop.evaluate(thetas, environments))
     if archive is not None:
         archive.add(thetas, values, len(environments))
     return values
@@ -162,7 +162,7 @@ def climb(
     thetas = np.array(thetas, np.float64)[: limits.left // max(1, len(environments))]
     if not len(thetas):
         return []
-    rho = loop.judge(thetas, environments)
+    rho = loop.evaluate(thetas, environments)
     now = [Choice(t, v, len(environments)) for t, v in zip(thetas, worst_case(rho), strict=True)]
     rhos = [np.where(ok, r, np.inf) for r, ok in zip(rho.rho, rho.proper, strict=True)]
     archive.add(thetas, [choice.value for choice in now], len(environments))
@@ -191,7 +191,7 @@ def climb(
                 range(len(candidates)), key=lambda j: merit(candidates[j], tried[j]), reverse=True
             )
             winner = candidates[order[0]]
-            whole = loop.judge(winner[None], environments)
+            whole = loop.evaluate(winner[None], environments)
             value = float(worst_case(whole)[0])
             archive.add([winner], [value], len(environments))
             before, after = merit(now[i].theta, now[i].value), merit(winner, value)
@@ -218,7 +218,7 @@ def _gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return robustness `[n]`, infinite without a verdict, and gradients `[n, p]`, zero there."""
     if loop.differentiable:
-        pairs = loop.judge(theta[None], environments, warmth)
+        pairs = loop.evaluate(theta[None], environments, warmth)
         assert pairs.by_parameters is not None
         return np.where(pairs.proper[0], pairs.rho[0], np.inf), pairs.by_parameters[0]
     places = np.flatnonzero(loop.free)
@@ -226,7 +226,7 @@ def _gradients(
     gaps = np.where(theta[places] > 0.5, -1.0, 1.0) * np.clip(gap, 1e-3, 0.02)
     beside = np.repeat(theta[None], len(places), axis=0)
     beside[np.arange(len(places)), places] += gaps
-    pairs = loop.judge(np.concatenate([theta[None], beside]), environments)
+    pairs = loop.evaluate(np.concatenate([theta[None], beside]), environments)
     rho = np.where(pairs.proper & np.isfinite(pairs.rho), pairs.rho, np.nan)
     gradients = np.zeros((len(environments), loop.dim))
     gradients[:, places] = np.nan_to_num((rho[1:] - rho[0]) / gaps[:, None]).T
@@ -255,7 +255,7 @@ def cross_entropy(
     if affordable < LEAST_BATCH:
         return
     points = np.array(thetas, np.float64)[: max(1, affordable // 3)]
-    pairs = loop.judge(points, environments)
+    pairs = loop.evaluate(points, environments)
     values = worst_case(pairs)
     archive.add(points, values, len(environments))
     # What is hard for the best is hard for most: with these first, few are simulated in all.

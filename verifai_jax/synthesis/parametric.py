@@ -2,8 +2,8 @@
 
     loop = FeatureParameters(problem, ["k_x", "k_theta"])          # parameters are features
     loop = ArrayParameters(problem, weights, system_of)            # parameters are arrays
-    loop.judge(thetas, environments)                               # [k, p] x [n, d] -> [k, n]
-    loop.judge(thetas, environments, temperature=0.1)              # and d rho / d theta [k, n, p]
+    loop.evaluate(thetas, environments)  # [k, p] x [n, d] -> [k, n]
+    loop.evaluate(thetas, environments, temperature=0.1)  # and d rho / d theta [k, n, p]
 
 Parameters are inputs of the compiled program, never constants in it, so that nothing compiles again
 from one candidate to the next. A pair that the constraint of the space refuses cannot happen: it
@@ -131,7 +131,7 @@ class FeatureParameters:
         """Simulations so far; one with its gradient counts once."""
         return self._values.simulations + (self._slopes.simulations if self._slopes else 0)
 
-    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
+    def evaluate(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
         """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
         k, n, d = len(thetas), len(environments), self.problem.space.dim
         rows = self._rows(thetas, environments)
@@ -247,19 +247,19 @@ class ArrayParameters:
             )
         theta = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
 
-        def judged(theta: Array, features: PyTree, key: Array) -> PyTree:
+        def simulated(theta: Array, features: PyTree, key: Array) -> PyTree:
             system = self.system_of(self._restore(theta))
             return trace_verdict(self.problem, system(features, key))
 
         try:
-            jax.eval_shape(judged, theta, features, key)
+            jax.eval_shape(simulated, theta, features, key)
         except Exception as error:
             raise ValueError(
                 "system_of(parameters) must make a system that JAX can trace in the parameters "
                 f"(no float(), no NumPy on them); it raised {type(error).__name__}: {error}"
             ) from error
 
-    def judge(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
+    def evaluate(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
         """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
         with in_precision(self.precision):
             parts = [
