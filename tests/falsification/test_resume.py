@@ -62,6 +62,17 @@ def test_in_memory(problem, name):
     assert len(part.table) == first
 
 
+def test_with_more_counterexamples_than_are_replayed():
+    problem = vj.Problem("ramp", space=SPACE, system=ramp, spec="always[0, 1] x <= 0.3")
+    whole = vj.falsify(problem, "uniform", 8192, batch=1024)
+    assert whole.verdict_counts["unexamined"] > 0
+    half = vj.falsify(problem, "uniform", 4096, batch=1024)
+    resumed = vj.resume(half, budget=8192)
+    assert same(resumed, whole)
+    assert resumed.verdict_counts == whole.verdict_counts
+    assert resumed.summary().splitlines()[2] == whole.summary().splitlines()[2]
+
+
 def test_passive_searches_go_on_within_a_batch(problem):
     whole = vj.falsify(problem, "halton", 64, batch=16)
     part = vj.falsify(problem, "halton", 25, batch=16)
