@@ -47,19 +47,23 @@ install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
 
 LONG_FILES = (
-    "test_sweep_driver.py",
-    "test_falsify.py",
-    "test_confirm.py",
     "test_shrink.py",
-    "test_repair.py",
-    "test_synthesize.py",
-    "test_cli.py",
-    "test_mujoco.py",
-    "test_certify.py",
-    "test_train.py",
-    "test_gymnax.py",
+    "test_learning_curves.py",
+    "test_estimate_methods.py",
     "test_brax.py",
-    "test_explain_counterexample.py",
+    "test_bayes.py",
+    "test_quality.py",
+    "test_against_oracle.py",
+    "test_conformance.py",
+    "test_repeat.py",
+    "test_repair.py",
+    "test_mujoco.py",
+    "test_contract.py",
+    "test_confirm.py",
+    "test_falsify.py",
+    "test_sweep_driver.py",
+    "test_summary.py",
+    "test_certify.py",
 )
 """Test files that take longest, the longest first: what begins last must be short."""
 
