@@ -1,6 +1,11 @@
 """The command line, as a person uses it from the root of the checkout."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -257,6 +262,62 @@ def test_exit_codes(call, tmp_path, monkeypatch):
 
 def _interrupted(*_, **__):
     raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_ends_a_command_as_ctrl_c_does(call, monkeypatch, name, code):
+    number = getattr(signal, name)
+    before = signal.getsignal(number)
+    monkeypatch.setattr("verifai_jax.falsification.falsify", lambda *_, **__: _signalled(number))
+    assert call("falsify", "specs/ramp.py:ramp", code=code) == "Error: interrupted\n"
+    assert signal.getsignal(number) == before
+
+
+def _signalled(number):
+    os.kill(os.getpid(), number)
+    time.sleep(5)
+
+
+def test_a_reader_that_closes_the_pipe_is_no_error(call, monkeypatch):
+    def closed(*_, **__):
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr("verifai_jax.cli.list.click.echo", closed)
+    assert call("list", code=141) == ""
+
+
+def test_the_help_may_be_cut_off_too():
+    # As before `| true`: nobody has the other end of the pipe.
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-c", "from verifai_jax.cli.main import main; main()", "--help"]
+    try:
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=60)
+    finally:
+        os.close(writing)
+    assert done.returncode == 141
+    assert done.stderr == b""
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("def f(:", "is not Python: invalid syntax (bad.py, line 1)"),
+        ("d = {}\nd['x']", "bad.py, line 2"),
+        ("raise RuntimeError('no road')", "line 1 (`raise RuntimeError('no road')`): RuntimeError"),
+        ("from json import nothing", "ImportError: cannot import name 'nothing'"),
+        ("import sys\nsys.exit(3)", "SystemExit: 3"),
+        ("class Odd(BaseException): pass\nraise Odd('x')", "bad.py, line 2"),
+    ],
+)
+def test_a_file_that_raises_is_told_with_its_line(call, tmp_path, text, match):
+    (tmp_path / "specs" / "bad.py").write_text(text)
+    output = call("list", "specs/bad.py", code=2)
+    assert match in output
+    assert "Traceback" not in output
+    output = call("list", code=2)
+    assert match in output
+    assert "specs/ramp.py:ramp" in output
 
 
 def test_a_target_by_its_variable(call, tmp_path):

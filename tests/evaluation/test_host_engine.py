@@ -114,6 +114,15 @@ def test_what_goes_wrong_is_a_row(system, message):
     assert table["message"].str.contains(message, regex=False).all()
 
 
+def test_a_simulator_that_exits_is_a_row():
+    def simulate(f):
+        raise SystemExit(3)
+
+    table = vj.falsify(problem_of(vj.blackbox(simulate)), "uniform", 4, batch=4).table.all
+    assert (table["status"] == "error").all()
+    assert table["message"].str.contains("SystemExit: 3", regex=False).all()
+
+
 def test_a_batch_of_the_wrong_form_is_rows_too():
     class Short(LockStep):
         def simulate_batch(self, features, keys):
@@ -141,12 +150,13 @@ def test_finished_rows_of_a_batch_survive_a_kill(tmp_path, traced):
     run = vj.falsify(problem_of(first), "uniform", 64, batch=64, folder=folder)
     assert run.stopped == "interrupted"
     assert len(run.table) == 0
+    assert "40 finished simulations of a batch in flight are kept" in run.summary()
     second = OneByOne()
     resumed = vj.resume(folder, problem_of(second))
     assert resumed.table.all.equals(whole.table.all)
-    finished = first.simulated[:32]  # RowVerdict in blocks of 32 at most; failed ones at once.
-    assert len(set(second.simulated) & set(finished)) < len(finished)
-    assert len(second.simulated) < 64
+    # An interrupted run has judged all that were simulated: only the others are, now.
+    assert not set(second.simulated) & set(first.simulated[:40])
+    assert len(second.simulated) == 24
     assert not (folder / JOURNAL).exists()
 
 

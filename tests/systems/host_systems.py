@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -42,6 +43,9 @@ def troublesome(features):
             return Trace({"x": np.array([os.getpid(), os.getsid(0)])}, dt=1.0)
         case 10:
             die_once(features["file"])
+        case 12:
+            child = subprocess.Popen(["sleep", "300"])
+            return Trace({"x": np.array([child.pid, 0.0])}, dt=1.0)
         case 11:
             wind = features["wind"]
             assert (wind.hold, wind.duration) == ("linear", 2.0)

@@ -6,7 +6,9 @@
 | 1 | a gate that was asked for by `--fail-on` failed |
 | 2 | wrong usage: an option, a name, a file or a package that is not as it should be |
 | 3 | the tool or the simulator broke, or no simulation had a verdict |
+| 129, 143 | ended by SIGHUP or SIGTERM, after what was finished is saved |
 | 130 | interrupted before there was a result |
+| 141 | whoever read the output has closed the pipe, as `head` does |
 """
 
 import sys
@@ -20,6 +22,7 @@ GATE_FAILED = 1
 WRONG_USAGE = 2
 BROKEN = 3
 INTERRUPTED = 130
+CLOSED_PIPE = 141
 
 EPILOG = """\b
 Exit codes:
@@ -57,7 +60,7 @@ def fail_gate() -> click.exceptions.Exit:
     return click.exceptions.Exit(GATE_FAILED)
 
 
-def command_error(error: Exception, show_traceback: bool = False) -> CommandError:
+def command_error(error: BaseException, show_traceback: bool = False) -> CommandError:
     """Turn an error of the Python API into one that the command line tells in a line.
 
     A traceback is printed where it is asked for, and where the error is a bug of this package:
@@ -74,7 +77,7 @@ def command_error(error: Exception, show_traceback: bool = False) -> CommandErro
     return CommandError(message, code)
 
 
-def _told(error: Exception) -> tuple[str, int]:
+def _told(error: BaseException) -> tuple[str, int]:
     """Return the message and the exit code of an error; no message for a bug."""
     if isinstance(error, USAGE_ERRORS):
         return str(error), WRONG_USAGE

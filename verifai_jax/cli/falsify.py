@@ -22,7 +22,7 @@ from verifai_jax.cli.arguments import (
     recorded_target,
     refuse_with_resume,
 )
-from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError, fail_gate
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
@@ -149,6 +149,8 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
 def _print(run: "Run", pictures: bool) -> None:
     click.echo(run.summary())
     assert run.folder is not None
+    if run.stopped == "interrupted":
+        click.echo(f"  resume       verifai-jax falsify --resume {run.folder}")
     click.echo(f"  table        {run.folder / 'table.parquet'}")
     if pictures and run.simulations:
         from verifai_jax.plotting import write_run_pictures
@@ -159,6 +161,8 @@ def _print(run: "Run", pictures: bool) -> None:
     if len(failed) < run.simulations:
         click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
         return
+    if not run.simulations and run.stopped == "interrupted":
+        raise CommandError("interrupted before the first batch was finished", INTERRUPTED)
     if not run.simulations:
         raise CommandError("no simulation was finished, so nothing is known of it", BROKEN)
     counts = ", ".join(f"{n:,} {status}" for status, n in failed["status"].value_counts().items())

@@ -5,6 +5,12 @@ verifai-jax replay runs/balance-1 417
 verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
 """
 
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -14,7 +20,13 @@ from verifai_jax.cli.analyze import analyze
 from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.doctor import doctor
 from verifai_jax.cli.estimate import estimate
-from verifai_jax.cli.exit_codes import EPILOG, INTERRUPTED, CommandError, command_error
+from verifai_jax.cli.exit_codes import (
+    CLOSED_PIPE,
+    EPILOG,
+    INTERRUPTED,
+    CommandError,
+    command_error,
+)
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.list import list_targets
@@ -44,19 +56,70 @@ COMMANDS = (
 """The sub-commands. Their files import nothing heavy until a command runs."""
 
 
+@contextlib.contextmanager
+def _signals_interrupt() -> Iterator[list[int]]:
+    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does, so that a command saves what it has.
+
+    A second one of a kind ends the process at once. Those that are ignored (`nohup`) stay ignored.
+
+    **Returns:** the signals that have come.
+    """
+    received: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        received.append(number)
+        raise KeyboardInterrupt
+
+    here = threading.current_thread() is threading.main_thread()
+    numbers = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)] if here else []
+    taken = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield received
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _closed_pipe() -> click.exceptions.Exit:
+    """Return what ends a command whose output nobody reads any more; that is no mistake."""
+    # Python's own last flush must not fail either.
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return click.exceptions.Exit(CLOSED_PIPE)
+
+
 class _Group(click.Group):
     """Command group that tells an error in one line, with the exit code of its kind."""
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def make_context(self, *args: Any, **options: Any) -> click.Context:
         try:
-            return super().invoke(ctx)
-        except (click.exceptions.Exit, click.Abort, click.ClickException, BrokenPipeError):
-            # Click's own: nothing to translate. A reader that closed its pipe is no mistake.
-            raise
-        except KeyboardInterrupt:
-            raise CommandError("interrupted", INTERRUPTED) from None
-        except Exception as error:
-            raise command_error(error, bool(ctx.params.get("traceback"))) from error
+            return super().make_context(*args, **options)
+        except BrokenPipeError:  # Of what --help and --version print.
+            raise _closed_pipe() from None
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with _signals_interrupt() as received:
+            try:
+                result = super().invoke(ctx)
+            except BrokenPipeError:
+                raise _closed_pipe() from None
+            except CommandError as error:
+                if received:
+                    error.exit_code = 128 + received[0]  # pyright: ignore[reportAttributeAccessIssue]
+                raise
+            except (click.exceptions.Exit, click.Abort, click.ClickException):
+                raise  # Click's own: nothing to translate.
+            except KeyboardInterrupt:
+                code = 128 + received[0] if received else INTERRUPTED
+                raise CommandError("interrupted", code) from None
+            except BaseException as error:
+                raise command_error(error, bool(ctx.params.get("traceback"))) from error
+        if received:
+            raise click.exceptions.Exit(128 + received[0])
+        return result
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -170,7 +170,9 @@ def _import(place: str) -> ModuleType:
         raise
     except SyntaxError as error:
         raise TargetError(f"{place} is not Python: {error}") from error
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise TargetError(f"{place} cannot be run: {explain_user_error(error)}") from error
     return module
 

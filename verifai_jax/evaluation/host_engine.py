@@ -144,7 +144,7 @@ class HostEngine:
         try:
             trace = _checked(self.system.simulate_batch(features, keys), count)
             rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             rows.messages[:] = [format_user_error(error)] * count
 
     def _one_by_one(
@@ -168,13 +168,16 @@ class HostEngine:
         todo = [i for i in range(len(seeds)) if i not in known]
         each = [plain_leaves(jax.tree.map(lambda leaf, i=i: leaf[i], features)) for i in todo]
         waiting = _Waiting(self._block_verdicts, keep)
-        for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
-            trace, without = _trace(outcome)
-            if trace is None:
-                keep(todo[place], without)
-            else:
-                waiting.add(todo[place], trace)
-        waiting.settle_all()
+        try:
+            for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
+                trace, without = _trace(outcome)
+                if trace is None:
+                    keep(todo[place], without)
+                else:
+                    waiting.add(todo[place], trace)
+        finally:
+            # Also when interrupted: what has been simulated goes into the journal.
+            waiting.settle_all()
 
     def _outcomes(self, features: list[Any], seeds: list[int]) -> Iterator[tuple[int, Outcome]]:
         if self.system.can_simulate_each:
@@ -184,7 +187,7 @@ class HostEngine:
         for i, (each, seed) in enumerate(zip(features, seeds, strict=True)):
             try:
                 yield i, Outcome(self.system(each, seed))
-            except Exception as error:
+            except (Exception, SystemExit) as error:  # sys.exit() in a simulator is its failure.
                 yield i, Outcome(None, Status.ERROR, format_user_error(error))
 
     def _block_verdicts(self, traces: Sequence[Trace]) -> list[RowVerdict]:

@@ -72,6 +72,11 @@ class Journal:
             self.path.unlink(missing_ok=True)
 
 
+def count_unfinished(folder: Path, rows: int) -> int:
+    """Count the finished simulations in `folder` behind the first `rows`, those of the table."""
+    return sum(row >= rows for row in _read(folder / JOURNAL))
+
+
 def _fingerprint(point: Float[np.ndarray, " d"]) -> str:
     return hashlib.sha256(np.ascontiguousarray(point, np.float32).tobytes()).hexdigest()[:16]
 

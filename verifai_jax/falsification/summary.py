@@ -10,6 +10,7 @@ import numpy as np
 
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.evaluation.confirmation import UNDECIDED
+from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.run import Run
 
 
@@ -44,6 +45,12 @@ def summarize(run: Run) -> str:
         if lost:
             lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
     lines.extend(f"  note         {note}" for note in run.notes)
+    kept = 0 if run.folder is None else count_unfinished(run.folder, run.simulations)
+    if kept:
+        lines.append(
+            f"  unfinished   {kept} finished simulations of a batch in flight are kept; resuming "
+            "the run does not repeat them"
+        )
     if run.acceptance is not None:
         lines.append(
             f"  constraint   let through {format_percent(run.acceptance)} of all proposals"

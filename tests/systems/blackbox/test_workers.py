@@ -1,5 +1,6 @@
 import gc
 import os
+import queue
 import re
 import signal
 import subprocess
@@ -42,7 +43,7 @@ def outcomes(system, features, seeds=None):
 def test_each_trouble_is_a_row_and_stops_no_other(troublesome):
     found = outcomes(troublesome, [{"a": a} for a in (0, 1, 3, 4, 5, 6, 7, 8, 9.5)])
     messages = [(o.status.name, re.sub(HERE, "", o.message)) for o in found]
-    assert "host_systems.py, line 28, in troublesome)" in found[1].message
+    assert "host_systems.py, line 29, in troublesome)" in found[1].message
     assert messages == [
         ("OK", ""),
         ("ERROR", "KeyError: 'no such road'"),
@@ -117,6 +118,42 @@ def test_a_caller_that_stops_ends_what_runs(troublesome):
     running.close()
     assert time.monotonic() - begun < 0.9
     assert outcomes(troublesome, [{"a": 0}])[0].status == Status.OK
+
+
+def test_what_a_simulator_has_started_ends_with_the_pool():
+    with_children = blackbox(host_systems.troublesome, workers=1)
+    (outcome,) = outcomes(with_children, [{"a": 12}])
+    child = int(outcome.trace["x"][0])
+    assert alive(child)
+    with_children.close()
+    until(lambda: not alive(child), 5)
+
+
+def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
+    """Outcomes of several workers lie in the queue when Ctrl-C comes."""
+    system = blackbox(host_systems.troublesome, workers=2)
+    outcomes(system, [{"a": 0}, {"a": 0}])  # Both are ready.
+    real, calls = workers._Batch, []
+
+    class Interrupted(queue.SimpleQueue):
+        def get(self, *args):
+            if not calls:
+                calls.append(1)
+                until(lambda: self.qsize() == 2)
+                raise KeyboardInterrupt
+            return super().get(*args)
+
+    def batch(*args):
+        made = real(*args)
+        made.results = Interrupted()
+        return made
+
+    monkeypatch.setattr(workers, "_Batch", batch)
+    rest = system.simulate_each([{"a": 0}, {"a": 0}, {"a": 4}, {"a": 4}], [0] * 4)
+    assert sorted(next(rest)[0] for _ in range(2)) == [0, 1]
+    with pytest.raises(KeyboardInterrupt):
+        next(rest)
+    system.close()
 
 
 def test_refuses_what_a_new_process_cannot_import():
@@ -278,7 +315,8 @@ def test_ctrl_c_ends_the_workers(sleeping):
 def test_a_worker_does_not_outlive_a_killed_parent(sleeping):
     process, worker = sleeping
     process.kill()
-    process.wait()
+    _, error = process.communicate()
+    assert error == ""
     until(lambda: not alive(worker))
 
 

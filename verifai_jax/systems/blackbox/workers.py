@@ -5,6 +5,7 @@ into it, and in a session of its own: Ctrl-C reaches this process only, and a wo
 takes along what it has started.
 """
 
+import contextlib
 import importlib
 import importlib.util
 import logging
@@ -115,6 +116,16 @@ class Pool:
                     raise result
                 finished = left == 0
                 yield result
+        except KeyboardInterrupt:
+            # What has ended by now is not lost: the caller has it before the interruption goes on.
+            batch.stop()
+            for thread in threads:
+                thread.join()
+            while not batch.results.empty():
+                result = batch.results.get()
+                if not isinstance(result, BaseException):
+                    yield result
+            raise
         finally:
             if not finished:
                 batch.stop()
@@ -301,7 +312,7 @@ class _Worker:
                 self.process.kill()
 
     def end(self) -> str:
-        """End the process, and return how it ended."""
+        """End the process and those that it has started; return how it ended."""
         # One whose pipe is closed, here or there, is about to end by itself.
         ending = self.pipe.closed or self.pipe.poll(0)
         try:
@@ -309,6 +320,9 @@ class _Worker:
         except subprocess.TimeoutExpired:
             self.kill()
             code = self.process.wait()
+        # Its number is not given to another process while its group has members.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.pipe.close()
         return f"the worker process {_manner(code)}"
 
@@ -395,14 +409,20 @@ def work(fd: int) -> None:
         if _guard() in str(error):
             problem = _guard()
     _preparing = False
-    pipe.send(problem)
-    if simulation is None:
-        return
+    # A run that is gone needs no answer.
+    with contextlib.suppress(EOFError, OSError):
+        pipe.send(problem)
+        if simulation is not None:
+            _answer(pipe, simulation)
+
+
+def _answer(pipe: Connection, simulation: Callable[[Features, int], Trace]) -> None:
+    """Simulate task after task.
+
+    **Raises:** `EOFError` or `OSError` when the pipe is closed.
+    """
     while True:
-        try:
-            features, seed = pipe.recv()
-        except (EOFError, OSError):
-            return
+        features, seed = pipe.recv()
         try:
             reply = pickle.dumps(Outcome(simulation(features, seed)))
         except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
@@ -425,7 +445,7 @@ def _import(module: str, file: str | None) -> None:
 
 
 def _outlive_no_parent(parent: int) -> None:
-    """End this process if its parent is gone, even in the middle of a simulation."""
+    """End this process, and those it has started, if its parent is gone."""
     while os.getppid() == parent:
         time.sleep(1.0)
-    os._exit(1)
+    os.killpg(os.getpid(), signal.SIGKILL)  # It leads a session, and so a group, of its own.

@@ -97,6 +97,13 @@ class Remote(System):
         try:
             for _ in texts:
                 yield _next(batch, server)
+        except KeyboardInterrupt:
+            # What has come by now is not lost: the caller has it before the interruption goes on.
+            while not batch.outcomes.empty():
+                outcome = batch.outcomes.get()
+                if not isinstance(outcome, BaseException):
+                    yield outcome
+            raise
         finally:
             batch.cancelled = True
 
