@@ -2,8 +2,10 @@
 
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.precision import in_precision, truncate_silently
@@ -41,3 +43,29 @@ def test_all_other_warnings_go_on():
     # Python shows each line's warning once, as if nothing had been filtered.
     assert [str(each.message)[:20] for each in told] == ["mine", "Explicitly requested"]
     assert list(warnings.filters) == before
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("jax_threefry_partitionable", False),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_enable_x64", True),
+    ],
+)
+def test_a_persons_own_jax_settings_change_nothing(setting, value):
+    def simulate(features, key):
+        noise = jax.random.normal(key, (3,))
+        return vj.Trace({"x": features["a"] + 0.1 * noise}, dt=0.1)
+
+    def table():
+        problem = vj.Problem("noisy", {"a": vj.Box(0, 1)}, simulate, "always x <= 2")
+        return vj.falsify(problem, "uniform", budget=4, batch=4, seed=1).table.all
+
+    expected, before = table(), getattr(jax.config, setting)
+    jax.config.update(setting, value)
+    try:
+        found = table()
+    finally:
+        jax.config.update(setting, before)
+    assert found.equals(expected)

@@ -5,6 +5,7 @@ import pytest
 from checked_types import unchecked
 
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.mtl import robustness
 
 
 def test_hold_repeats_the_last_valid_sample():
@@ -93,3 +94,26 @@ def test_text_is_short_and_never_an_array():
     for other in (batch, forms):
         assert len(str(other)) < 300
     jax.jit(lambda t: (str(t), repr(t), t.hold())[-1])(trace)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "said"),
+    [
+        ({"dt": np.inf}, ValueError, "finite number of seconds"),
+        ({"dt": 1e-320}, ValueError, "finite number of seconds"),
+        ({"valid": 0}, ValueError, "from 1 to 3"),
+        ({"valid": 4}, ValueError, "from 1 to 3"),
+        ({"valid": np.float64(1.5)}, ValueError, "how many samples"),
+        ({"status": 7}, ValueError, "status must be one of 0 \\(OK\\)"),
+        ({"signals": {"x": np.ones(3) * 1j}}, TypeError, "must hold real numbers; got complex128"),
+    ],
+)
+def test_what_can_be_no_trace_is_refused_when_it_is_made(wrong, error, said):
+    with unchecked(), pytest.raises(error, match=said):
+        Trace(**{"signals": {"x": np.ones(3)}, "dt": 0.1, **wrong})
+
+
+def test_wide_integers_of_the_host_do_not_wrap():
+    x = np.full(4, 2**40 + 5)
+    assert robustness("always x > 6", Trace({"x": x}, dt=0.1, valid=3)) == np.float32(2.0**40)
+    assert robustness("x > 6", Trace({"x": x.astype(np.uint64)}, dt=0.1)) > 0

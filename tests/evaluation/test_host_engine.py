@@ -200,3 +200,72 @@ def test_zero_is_decided_by_the_comparator_without_another_simulation():
     rounds.advance(4)
     assert rounds.found == 4
     assert len(system.simulated) == 4
+
+
+def one_row(function, spec="always x > 0", vectorised=False):
+    problem = vj.Problem(
+        "edge", {"a": vj.Box(0, 1)}, vj.blackbox(function, vectorised=vectorised), spec
+    )
+    return vj.falsify(problem, "uniform", budget=4, batch=4, confirm=False).table.all
+
+
+@pytest.mark.parametrize("vectorised", [False, True])
+def test_wide_integers_do_not_wrap(vectorised):
+    def simulate(features):
+        n = len(features["a"]) if vectorised else 1
+        rows = np.full((n, 5), 2**40 + 5, np.int64)
+        rows[:, 0] = 2**31
+        stacked = vj.stack_traces({"x": rows}, dt=0.1)
+        return stacked if vectorised else Trace({"x": rows[0]}, dt=0.1)
+
+    rows = one_row(simulate, "always x > 6", vectorised)
+    assert (rows.status == "ok").all()
+    assert not rows.violated.any()
+    assert (rows.rho == np.float32(2.0**31 - 6)).all()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"valid": 0}, "valid must be"),
+        ({"valid": -1}, "valid must be"),
+        ({"valid": 5}, "valid must be"),
+        ({"status": 7}, "status must be"),
+        ({"dt": None, "times": np.array([0.0, 1.0, 3.0, 4.0])}, "not evenly sampled"),
+        ({"dt": None, "times": np.array([0.0, 1.0, 2.0, np.inf])}, "must be finite"),
+    ],
+)
+def test_a_trace_with_wrong_codes_is_an_error_row(wrong, said):
+    x = np.array([-1.0, 1.0, 1.0, 1.0])
+    rows = one_row(lambda features: Trace({"x": x}, **{"dt": 0.1, **wrong}))
+    assert (rows.status == "error").all()
+    assert rows.message.str.contains(said).all()
+
+
+def test_a_wrong_code_costs_its_own_row_of_a_batch_alone():
+    def simulate(features):
+        n = len(features["a"])
+        x = np.tile([-1.0, 1.0, 1.0, 1.0], (n, 1))
+        valid, status = np.full(n, 4), np.zeros(n, int)
+        valid[0], status[1] = 0, 9
+        times = np.tile(np.arange(4) * 0.5, (n, 1))
+        return vj.stack_traces({"x": x}, times=times, valid=valid, status=status)
+
+    rows = one_row(simulate, vectorised=True)
+    assert list(rows.status) == ["error", "error", "ok", "ok"]
+    assert list(rows.violated) == [False, False, True, True]
+    assert rows.message[0].endswith("got 0")
+    assert rows.message[1].endswith("got 9")
+
+
+def test_even_sample_times_are_a_period():
+    def simulate(features):
+        return Trace({"x": np.array([1.0, 1.0, -1.0, 1.0])}, times=np.arange(4) * 0.5)
+
+    problem = vj.Problem(
+        "times", {"a": vj.Box(0, 1)}, vj.blackbox(simulate), "always[0, 0.5] x > 0"
+    )
+    run = vj.falsify(problem, "uniform", budget=2, batch=2)
+    assert list(run.table.all.status) == ["ok", "ok"]
+    assert not run.table.all.violated.any()
+    assert run.replay(0).rho == {"spec": 1.0}

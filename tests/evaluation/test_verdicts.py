@@ -1,11 +1,14 @@
 """The law that says which simulations violate the property, and the result that carries it."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import verifai_jax as vj
 from verifai_jax.core.programs import ProgramCache, Slot
-from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.core.trace import Status, Trace
+from verifai_jax.evaluation.verdicts import Verdicts, trace_verdict, violations
 
 OK, LOST = int(Status.OK), int(Status.NONFINITE)
 
@@ -75,3 +78,14 @@ def test_nothing_is_kept_of_a_program_that_fails():
     with pytest.raises(ZeroDivisionError):
         cache.get(slot, "a", lambda: 1 // 0)
     assert cache.get(slot, "a", lambda: 2) == 2
+
+
+def test_codes_that_can_be_none_are_no_verdict_of_a_traced_system():
+    x = jnp.array([-1.0, -1.0, 5.0])
+
+    def verdict(valid, status):
+        problem = vj.Problem("codes", {"a": vj.Box(0, 1)}, lambda f, k: None, "always x > 0")
+        return trace_verdict(problem, Trace({"x": x}, dt=0.1, valid=valid, status=status))[1]
+
+    codes = jax.jit(jax.vmap(verdict))(jnp.array([3, 0, -1, 4, 3]), jnp.array([0, 0, 0, 0, 7]))
+    assert [Status(int(c)).name for c in codes] == ["OK", "ERROR", "ERROR", "ERROR", "ERROR"]

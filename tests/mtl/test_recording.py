@@ -108,3 +108,9 @@ def test_bad_recordings(tmp_path, flight):
         resample(trace, 0.1, "cubic")
     with unchecked(), pytest.raises(ValueError, match="dt must be positive; got 0"):
         resample(trace, 0, "hold")
+
+
+@pytest.mark.parametrize("dt", [1e-12, 1e-300, float("inf"), float("nan")])
+def test_absurd_periods_are_refused_in_words(dt):
+    with pytest.raises(ValueError, match=r"more than 100000000|sampling period dt"):
+        resample(Trace({"x": np.arange(3.0)}, dt=1.0), dt, "hold")

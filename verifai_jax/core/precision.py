@@ -11,6 +11,8 @@ from functools import cache
 import jax
 import numpy as np
 
+from verifai_jax.core.keys import IMPLEMENTATION
+
 PRECISIONS = ("float32", "float64")
 _TRUNCATION = re.compile("Explicitly requested dtype .* is not available")
 
@@ -33,7 +35,26 @@ def in_precision(precision: str) -> AbstractContextManager[None]:
 
 @contextmanager
 def _computing_in(precision: str) -> Iterator[None]:
-    with truncate_silently(), jax.enable_x64(precision == "float64"):
+    x64 = jax.enable_x64(precision == "float64")
+    with truncate_silently(), x64, reproducible_random():
+        yield
+
+
+@contextmanager
+def reproducible_settings() -> Iterator[None]:
+    """Return a context, or a decorator, in which a person's own JAX settings change no result.
+
+    Random numbers depend on the generator and on how it splits, the types of everything on x64: a
+    run computes with those that its seed means, whatever the configuration says outside.
+    """
+    with jax.enable_x64(False), reproducible_random():
+        yield
+
+
+@contextmanager
+def reproducible_random() -> Iterator[None]:
+    """Return a context, or a decorator, in which random numbers are those that a seed means."""
+    with jax.threefry_partitionable(True), jax.default_prng_impl(IMPLEMENTATION):
         yield
 
 

@@ -8,6 +8,7 @@ A trace is a pytree, so `jax.vmap` over a system gives a batch of traces.
 """
 
 import enum
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -56,8 +57,12 @@ class Trace:
     - `finite`: names of signals that the producer vouches for: they are finite where the status
       is OK, which saves another.
 
-    **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, or a
-    clock that is missing, given twice or not positive.
+    Whatever is known when the trace is made is checked then; what JAX traces shows in the status
+    of its row (`ERROR`).
+
+    **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, a clock
+    that is missing, given twice, not positive or not finite, `valid` below 1 or beyond the samples,
+    or a status that is none; `TypeError` for complex signals.
     """
 
     signals: Mapping[str, Samples]
@@ -92,13 +97,29 @@ class Trace:
                 "the sampling period dt must be a plain number, the same in all simulations; got a "
                 "value that JAX traces"
             )
-        if self.dt is not None and not self.dt > 0:
-            raise ValueError(f"the sampling period dt must be positive; got {self.dt}")
+        if self.dt is not None:
+            check_period(self.dt)
         if self.times is not None and np.shape(self.times) != (length,):
             raise ValueError(
                 f"times must have shape [{length}], like the signals; "
                 f"got {list(np.shape(self.times))}"
             )
+        self._check_codes(length)
+
+    def _check_codes(self, length: int) -> None:
+        """Refuse a count of valid samples, or a status, that is known and can be none."""
+        if _is_known(self.valid):
+            valid = np.asarray(self.valid)
+            whole = valid.dtype.kind in "iu"
+            if valid.ndim == 0 and not (whole and 1 <= int(valid) <= length):
+                raise ValueError(
+                    f"valid must be how many samples count, from 1 to {length}; got {valid}"
+                )
+        if _is_known(self.status):
+            status = np.asarray(self.status)
+            if status.ndim == 0 and int(status) not in list(Status):
+                known = ", ".join(f"{code.value} ({code.name})" for code in Status)
+                raise ValueError(f"status must be one of {known}; got {status}")
 
     @property
     def length(self) -> int:
@@ -117,7 +138,7 @@ class Trace:
         if self.valid is None or self.held:
             return self
         index = jnp.minimum(jnp.arange(self.length), jnp.asarray(self.valid) - 1)
-        signals = {name: jnp.asarray(signal)[index] for name, signal in self.signals.items()}
+        signals = {name: as_array(signal)[index] for name, signal in self.signals.items()}
         return replace(self, signals=signals, held=True)
 
     def trim(self) -> "Trace":
@@ -162,6 +183,36 @@ class Trace:
         return text
 
 
+def check_period(dt: float) -> None:
+    """Raise `ValueError` unless `dt` is a sampling period that JAX can compute with."""
+    if not dt > 0:
+        raise ValueError(f"the sampling period dt must be positive; got {dt}")
+    least = float(np.finfo(np.float32).tiny)
+    if not least <= dt < math.inf:
+        raise ValueError(
+            f"the sampling period dt must be a finite number of seconds, at least {least:.3g}, the "
+            f"least in single precision; got {dt}"
+        )
+
+
+def without_wrapping(signal: Samples) -> Samples:
+    """Return a signal whose numbers JAX keeps: 64-bit integers of the host become floats.
+
+    JAX would keep the lower 32 bits of an integer of NumPy where it computes in single precision;
+    a float of the precision in force is what the monitor makes of it anyway.
+    """
+    if isinstance(signal, jax.Array | jax.ShapeDtypeStruct):
+        return signal
+    numbers = np.asarray(signal)
+    wide = numbers.dtype.kind in "iu" and numbers.dtype.itemsize > 4
+    return numbers.astype(jnp.result_type(float)) if wide else numbers
+
+
+def as_array(signal: Samples) -> Array:
+    """Return a signal as an array of JAX, its integers not cut to 32 bits."""
+    return jnp.asarray(without_wrapping(signal))
+
+
 def _shape(name: str, signal: Samples) -> tuple[int, ...]:
     if callable(signal):
         raise ValueError(
@@ -169,6 +220,9 @@ def _shape(name: str, signal: Samples) -> tuple[int, ...]:
             "with the sample times"
         )
     try:
+        dtype = getattr(signal, "dtype", None)
+        if getattr(dtype, "kind", "") == "c":
+            raise TypeError(f"signal {name!r} must hold real numbers; got {dtype}")
         return np.shape(signal)
     except TracerArrayConversionError:
         raise ValueError(

@@ -9,6 +9,7 @@ message; the others go on. Traces are judged in blocks of one shape, so that few
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import (
@@ -28,6 +29,7 @@ from verifai_jax.evaluation.verdicts import (
     trace_verdict,
     violations,
 )
+from verifai_jax.mtl.setting import period
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Outcome, System
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
@@ -49,7 +51,8 @@ class HostMonitor:
         self, traces: Trace, count: int
     ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, " n"], Bool[np.ndarray, "n k"]]:
         """Return robustness, status and Boolean semantics, in one shape for many `count`."""
-        padded = jax.tree.map(_power_of_two, traces)
+        signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
+        padded = jax.tree.map(_power_of_two, _with_signals(traces, signals))
         rho, status = (np.asarray(leaf)[:count] for leaf in self._decide(padded))
         holds = np.ones(rho.shape, bool)
         if np.any(rho == 0):
@@ -143,9 +146,18 @@ class HostEngine:
         count = len(rows.messages)
         try:
             trace = _checked(self.system.simulate_batch(features, keys), count)
-            rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
+            if _is_plain(trace):
+                rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
+                return
         except (Exception, SystemExit) as error:
             rows.messages[:] = [format_user_error(error)] * count
+            return
+        # Row by row, so that one with a wrong code, or a clock of its own, costs no other.
+        waiting = _Waiting(self._block_verdicts, rows.put)
+        for i in range(count):
+            row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
+            self._judge(i, Outcome(row), waiting)
+        waiting.settle_all()
 
     def _one_by_one(
         self,
@@ -170,14 +182,18 @@ class HostEngine:
         waiting = _Waiting(self._block_verdicts, keep)
         try:
             for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
-                trace, without = _trace(outcome)
-                if trace is None:
-                    keep(todo[place], without)
-                else:
-                    waiting.add(todo[place], trace)
+                self._judge(todo[place], outcome, waiting)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
             waiting.settle_all()
+
+    @staticmethod
+    def _judge(row: int, outcome: Outcome, waiting: "_Waiting") -> None:
+        trace, without = _trace(outcome)
+        if trace is None:
+            waiting.keep(row, without)
+        else:
+            waiting.add(row, trace)
 
     def _outcomes(self, features: list[Any], seeds: list[int]) -> Iterator[tuple[int, Outcome]]:
         if self.system.can_simulate_each:
@@ -209,7 +225,7 @@ class _Waiting:
         decide: Callable[[Sequence[Trace]], list[RowVerdict]],
         keep: Callable[[int, RowVerdict], None],
     ) -> None:
-        self._decide, self._keep = decide, keep
+        self._decide, self.keep = decide, keep
         self._blocks: dict[Any, list[tuple[int, Trace]]] = {}
         self._since = time.monotonic()
 
@@ -230,7 +246,7 @@ class _Waiting:
         block = self._blocks.pop(form)
         verdicts = self._decide([trace for _, trace in block])
         for (row, _), verdict in zip(block, verdicts, strict=True):
-            self._keep(row, verdict)
+            self.keep(row, verdict)
 
 
 class _Rows:
@@ -275,6 +291,23 @@ def _checked(trace: object, count: int) -> Trace:
     return trace
 
 
+def _is_plain(trace: Trace) -> bool:
+    """Return whether all rows of a batch have one period, and codes that can be."""
+    if trace.times is not None:
+        return False
+    length = np.shape(next(iter(trace.signals.values())))[1]
+    valid = np.asarray(length if trace.valid is None else trace.valid)
+    status = np.asarray(Status.OK if trace.status is None else trace.status)
+    return bool(np.all((valid >= 1) & (valid <= length)) and np.all(np.isin(status, list(Status))))
+
+
+def _with_signals(trace: Trace, signals: dict[str, Any]) -> Trace:
+    """Return a batch of traces with other signals, which a `Trace` would check as one."""
+    batch = jax.tree.map(lambda leaf: leaf, trace)
+    object.__setattr__(batch, "signals", signals)
+    return batch
+
+
 def _form(trace: Trace) -> Any:
     shapes = tuple((np.shape(leaf), np.result_type(leaf).str) for leaf in jax.tree.leaves(trace))
     return jax.tree.structure(trace), shapes
@@ -287,20 +320,31 @@ def _power_of_two(leaf: Any) -> np.ndarray:
     return np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)]) if missing else leaf
 
 
+def on_host_clock(trace: Trace) -> Trace:
+    """Return a host system's trace as the compiled monitors need it, checked.
+
+    Its integers are not cut to 32 bits, and evenly spaced sample times are a period.
+
+    **Raises:** what `Trace` does for a `valid` or a status that can be none, and `period` for
+    sample times that are not evenly spaced.
+    """
+    # Made anew, a row of a batch is checked as a trace of its own.
+    signals = {name: without_wrapping(signal) for name, signal in trace.signals.items()}
+    return replace(trace, signals=signals, dt=period(trace), times=None)
+
+
 def pad_trace(trace: Trace) -> Trace:
     """Hold a trace to a length that is a power of two.
 
     Holding the last sample changes no verdict, and traces of all lengths share a few compiled
     monitors.
+
+    **Raises:** as `on_host_clock`.
     """
+    trace = on_host_clock(trace)
     valid = trace.length if trace.valid is None else int(trace.valid)
     length = 1 << (trace.length - 1).bit_length()
     index = np.minimum(np.arange(length), valid - 1)
     signals = {name: np.asarray(signal)[index] for name, signal in trace.signals.items()}
-    times = trace.times
-    if times is not None:
-        times, extra = np.asarray(times), length - trace.length
-        step = times[-1] - times[-2] if len(times) > 1 else 1.0
-        times = np.concatenate([times, times[-1] + step * np.arange(1, extra + 1)])
     status = int(Status.OK if trace.status is None else trace.status)
-    return Trace(signals, trace.dt, times, valid, status, held=True)
+    return Trace(signals, trace.dt, valid=valid, status=status, held=True)

@@ -18,6 +18,7 @@ from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.evaluation.host_engine import on_host_clock
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import Explanation, explain
 from verifai_jax.problem.problem import Problem
@@ -116,10 +117,11 @@ def replay(
         features = problem.space.from_row(row)
         if problem.black_box:
             trace = problem.system(features, key)
+            judged = on_host_clock(trace)
         else:
             precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
-            trace = jax.jit(problem.system)(precise, key)
-        rho, status = jax.jit(trace_verdict, static_argnums=0)(problem, trace)
+            trace = judged = jax.jit(problem.system)(precise, key)
+        rho, status = jax.jit(trace_verdict, static_argnums=0)(problem, judged)
         return Replay(
             problem=problem,
             row=number,

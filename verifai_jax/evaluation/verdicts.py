@@ -120,8 +120,10 @@ def trace_verdict(
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
     """Return the hard robustness of each formula on one trace, and the status; traced by JAX.
 
-    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN.
+    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN;
+    one whose `valid` is no number of its samples, or whose status is none, has status `ERROR`.
     """
+    counted = _counted(trace)
     trace = trace.hold()
     rho = jnp.stack(
         [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
@@ -132,7 +134,17 @@ def trace_verdict(
         if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
             finite &= jnp.all(jnp.isfinite(signal))
     status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)
+    if counted is not None:
+        status = jnp.where((status == Status.OK) & ~counted, jnp.int32(Status.ERROR), status)
     return with_status(rho, status, finite)
+
+
+def _counted(trace: Trace) -> Bool[Array, ""] | None:
+    """Return whether `valid` is a number of the trace's samples; None where it is left out."""
+    if trace.valid is None:
+        return None
+    valid = jnp.asarray(trace.valid)
+    return (valid >= 1) & (valid <= trace.length)
 
 
 def boolean_semantics(problem: Problem, trace: Trace) -> Bool[Array, " formulas"]:
@@ -145,6 +157,11 @@ def boolean_semantics(problem: Problem, trace: Trace) -> Bool[Array, " formulas"
 def with_status(
     rho: Float[Array, " formulas"], status: Int[Array, ""], finite: Bool[Array, ""]
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
-    """Return robustness and status given whether all signals are finite; NaN unless it is OK."""
+    """Return robustness and status given whether all signals are finite; NaN unless it is OK.
+
+    A status that is no code of `Status` is an error.
+    """
+    known = (status >= min(Status)) & (status <= max(Status))
+    status = jnp.where(known, status, jnp.int32(Status.ERROR))
     status = jnp.where((status == Status.OK) & ~finite, jnp.int32(Status.NONFINITE), status)
     return jnp.where(status == Status.OK, rho, jnp.nan), status

@@ -16,7 +16,7 @@ import numpy as np
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
 from verifai_jax.core.errors import check_names, suggests_options
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
@@ -60,6 +60,7 @@ class RunError(RuntimeError):
 
 
 @suggests_options
+@reproducible_settings()
 def falsify(
     problem: Problem,
     search: str | Search = "portfolio",
@@ -156,6 +157,7 @@ def falsify(
 
 
 @suggests_options
+@reproducible_settings()
 def simulate(
     problem: Problem,
     rows: "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]",
@@ -195,6 +197,7 @@ def simulate(
 
 
 @suggests_options
+@reproducible_settings()
 def resume(
     run: Run | str | Path,
     problem: Problem | None = None,

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
-from verifai_jax.core.precision import in_precision
+from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
@@ -128,6 +128,7 @@ class Trials:
 
 
 @suggests_options
+@reproducible_settings()
 def repeat(
     problem: Problem,
     search: str | Search = "portfolio",

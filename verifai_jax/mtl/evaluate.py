@@ -31,6 +31,10 @@ def samples(time: float, dt: float, interval: Interval) -> float:
     if math.isinf(time):
         return math.inf
     n = time / dt
+    if math.isinf(n):
+        raise IntervalError(
+            f"the interval {interval} has more samples of {dt:g} s than can be counted"
+        )
     if abs(n - round(n)) > 1e-6 * max(1.0, abs(n)):
         low, high = math.floor(n), math.ceil(n)
         raise IntervalError(

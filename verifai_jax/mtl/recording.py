@@ -14,10 +14,13 @@ from typing import Any, Literal
 import numpy as np
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.trace import Trace, check_period
 from verifai_jax.mtl.setting import seconds
 
 Method = Literal["hold", "linear"]
+
+MOST_SAMPLES = 100_000_000
+"""Samples that a resampled trace may have."""
 
 
 class TimeColumnError(ValueError):
@@ -43,17 +46,23 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     - `dt`: the new sampling period in seconds.
     - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
 
-    **Raises:** `ValueError` for a period that is not positive, an unknown method, or sample times
-    that do not increase.
+    **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
+    samples, an unknown method, or sample times that do not increase or are not finite.
     """
     if method not in ("hold", "linear"):
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
-    if not dt > 0:
-        raise ValueError(f"the sampling period dt must be positive; got {dt}")
+    check_period(dt)
     trace = trace.trim()
     times = seconds(trace)
     _check_increasing(times)
-    count = int(np.floor((times[-1] - times[0]) / dt * (1 + 1e-9) + 1e-9)) + 1
+    with np.errstate(over="ignore"):
+        steps = np.floor((times[-1] - times[0]) / dt * (1 + 1e-9) + 1e-9)
+    if not steps < MOST_SAMPLES:
+        raise ValueError(
+            f"resampling {times[-1] - times[0]:g} s every {dt:g} s makes {steps + 1:.3g} samples, "
+            f"more than {MOST_SAMPLES}: take a longer period"
+        )
+    count = int(steps) + 1
     clock = times[0] + dt * np.arange(count)
     # A sample due at `t` counts from `t` on, whatever the last digit of the clock says.
     index = np.searchsorted(times, clock + 1e-6 * dt, side="right") - 1
@@ -122,6 +131,9 @@ def read(
 
 
 def _check_increasing(times: np.ndarray) -> None:
+    if not np.all(np.isfinite(times)):
+        k = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"sample times must be finite; row {k + 1} has {times[k]:g} s")
     steps = np.diff(times)
     if not np.all(steps > 0):
         k = int(np.argmin(np.where(np.isnan(steps), -np.inf, steps)))

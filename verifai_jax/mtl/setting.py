@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Samples, Trace
+from verifai_jax.core.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula
@@ -99,7 +99,7 @@ def prepare(
 
 def _numbers(signals: dict[str, Samples]) -> dict[str, Array]:
     """Return the signals as arrays of one floating type; true counts as +1 and false as -1."""
-    arrays = {name: jnp.asarray(value) for name, value in signals.items()}
+    arrays = {name: as_array(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
     return {
@@ -120,6 +120,9 @@ def period(trace: Trace) -> float:
             "the sample times of a trace must be known before compiling; give it a period dt"
         )
     times = np.asarray(trace.times, float)
+    if not np.all(np.isfinite(times)):
+        k = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"sample times must be finite; sample {k} is at {times[k]:g} s")
     if len(times) == 1:
         return 1.0
     steps = np.diff(times)
@@ -138,6 +141,7 @@ def period(trace: Trace) -> float:
             f"as at {times[k]:g} s",
             float(np.median(steps)),
         )
+    check_period(dt)
     return float(f"{dt:.9g}")
 
 

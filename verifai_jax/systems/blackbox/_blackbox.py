@@ -290,7 +290,9 @@ class VectorisedBlackBox(System):
             whole[name] = np.broadcast_to(np.asarray(value), shape)
         signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
         trace = stack_traces(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
-        self.declared.accept(jax.tree.map(lambda leaf: leaf[0], trace))
+        # Its signals and clock alone: a wrong `valid` or status is an error of its own row.
+        times = None if trace.times is None else trace.times[0]
+        self.declared.accept(Trace({n: s[0] for n, s in signals.items()}, trace.dt, times))
         return trace
 
 
