@@ -7,7 +7,7 @@ from failing_table import failing_table
 from PIL import Image
 
 import verifai_jax as vj
-from verifai_jax.analysis.overview import TITLES, analyze
+from verifai_jax.analysis.overview import TITLES, Analysis, Part, analyze
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +42,16 @@ def test_features_in_one_table(found):
     assert features.loc["x", "most_failing"] == pytest.approx(0.3, abs=0.02)
     assert features.loc["colour", "occupied"] == 1
     assert np.isnan(features.loc["colour", "most_failing"])
+
+
+def test_names_of_others_do_not_write_the_report(tmp_path):
+    words = "```\n<script>alert(1)</script>\x1b[2J"
+    text = Analysis("a\n# <b>", (Part("failures", words),), None).save(tmp_path).read_text()
+    assert text.splitlines()[0] == "# a # &lt;b&gt;"
+    # Whatever the words hold stays within their block.
+    assert text.count("````") == 2
+    assert text.index("````text") < text.index("<script>") < text.rindex("````")
+    assert "\x1b" not in text
 
 
 def test_report_on_disk(found, tmp_path):

@@ -2,9 +2,11 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -173,12 +175,83 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
     record = json.loads((tmp_path / "r" / "run.json").read_text())
     evil = tmp_path / "r" / "evil.py"
     evil.write_text("raise SystemExit('ran')")
-    for target in ("r/evil.py:ramp", "/etc/evil.py:ramp", "../evil.py:x", "os:path", None):
+    # Beside it, in folders of other results, and named as modules.
+    for name in ("r/evil.pyx/evil.py", "runs/two/evil.py", "lib/sweeps/evil.py", "old/in/evil.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("raise SystemExit('ran')")
+    (tmp_path / "old" / "run.json").write_text("{}")
+    (tmp_path / "link.py").symlink_to(evil)
+    for target in (
+        "r/evil.py:ramp", "r/evil.py", "./r/../r/evil.py:ramp", "link.py:ramp", "/etc/evil.py:ramp",
+        "../evil.py:x", "os:path", "os", "r.evil", "r.evil.pyx:ramp", "r.evil.py:x", "r/evil:x",
+        "runs/two/evil.py:ramp", "lib/sweeps/evil.py:ramp", "old/in/evil.py:ramp", "",
+        "specs/none.py:x", "specs/ramp.py\0:x", "specs:ramp", "runs.two.evil:x", ":", 3,
+        ["specs/ramp.py"], None,
+    ):  # fmt: skip
         (tmp_path / "r" / "run.json").write_text(json.dumps(record | {"target": target}))
         result = CliRunner().invoke(main, ["replay", "r", "0"])
-        assert "does not say which problem of this project" in result.output
+        assert "does not say which problem of this project" in result.output, target
+        assert result.exit_code == 2
+        assert "ran" not in result.output.split()
+    # A pack of folders from elsewhere: the code of one is not for the other.
+    (tmp_path / "pack" / "two").mkdir(parents=True)
+    (tmp_path / "pack" / "two" / "evil.py").write_text("raise SystemExit('ran')")
+    shutil.copytree(tmp_path / "r", tmp_path / "pack" / "one")
+    evil_target = json.dumps(record | {"target": "pack/two/evil.py:ramp"})
+    (tmp_path / "pack" / "one" / "run.json").write_text(evil_target)
+    assert "does not say which" in call("replay", "pack/one", 0, code=2)
     output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")
     assert "robustness" in output
+
+
+def test_the_name_of_a_problem_stays_in_the_folder(call, tmp_path):
+    file = tmp_path / "specs" / "ramp.py"
+    evil = (
+        '\nevil = vj.Problem("../../evil\\n\\x1b[2J name", ramp.space, ramp.system, "always x < 9")'
+    )
+    file.write_text(file.read_text() + evil)
+    start = ["falsify", "specs/ramp.py:evil", "--search", "uniform", "--no-pictures"]
+    output = call(*start, "--budget", 8)
+    assert "\x1b" not in output
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["evil___2J name-1"]
+    assert {path.name for path in tmp_path.iterdir()} == {"specs", "runs"}
+    # A command that ends before it has a row leaves no folder.
+    call(*start, "--budget", 0, code=2)
+    assert len(list((tmp_path / "runs").iterdir())) == 1
+
+
+def test_commands_that_start_together_take_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    taken, ready = [], threading.Barrier(8)
+
+    def take():
+        ready.wait()
+        with arguments.next_folder("runs", "tiny") as folder:
+            (folder / "mine").write_text("")
+            taken.append(folder.name)
+
+    threads = [threading.Thread(target=take) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(taken) == [f"tiny-{number}" for number in range(1, 9)]
+
+
+def test_messages_do_not_steer_the_terminal(call, tmp_path):
+    (tmp_path / "specs" / "rude.py").write_text(
+        "import verifai_jax as vj\n"
+        "def simulate(features):\n"
+        "    raise RuntimeError('\\x1b[2J' + 'x' * 100_000)\n"
+        "system = vj.blackbox(simulate)\n"
+        "rude = vj.Problem('rude', {'a': vj.Box(0, 1)}, system, 'always x > 0')\n"
+    )
+    start = ("falsify", "specs/rude.py:rude", "--search", "uniform", "--no-pictures", "--budget", 2)
+    output = call(*start, code=3)
+    assert "RuntimeError" in output
+    assert "x1b[2J" in output
+    assert "\x1b" not in output
+    assert len(output) < 5000
 
 
 def test_precision_of_a_run(call, tmp_path):

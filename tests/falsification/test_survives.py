@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.core.locks import LOCK, FolderInUse, write_lock
 from verifai_jax.falsification.checkpoint import STATE
 from verifai_jax.falsification.run import RECORD
 from verifai_jax.falsification.table import STREAM
@@ -125,6 +126,33 @@ def test_a_kill_before_the_first_rows_is_resumed(problem, whole, tmp_path):
 def test_a_kill_before_the_first_record_does_not_block_the_folder(problem, tmp_path):
     (tmp_path / f"{RECORD}.part").write_text("{")
     assert len(vj.falsify(problem, "uniform", 32, folder=tmp_path).table) == 32
+
+
+def test_a_folder_has_one_writer(problem, whole, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with write_lock(folder):
+        for _ in range(2):
+            with pytest.raises(FolderInUse, match=r"run' is being written by this process"):
+                vj.falsify(problem, "uniform", 32, folder=folder)
+    run = vj.falsify(problem, "cross_entropy", 64, batch=16, folder=folder)
+    assert LOCK not in {path.name for path in folder.iterdir()}
+    with write_lock(folder):
+        # Reading needs no lock.
+        assert len(vj.load(folder, problem).table) == 64
+        for writes in (
+            lambda: vj.resume(folder, problem, budget=160),
+            lambda: vj.resume(run, budget=160),
+            lambda: run.save(folder),
+        ):
+            with pytest.raises(FolderInUse, match="is being written by"):
+                writes()
+    # What a killed process leaves does not lock.
+    (folder / LOCK).write_text("1 elsewhere")
+    assert vj.resume(folder, problem, budget=160).table.all.equals(whole)
+    with pytest.raises(FileNotFoundError, match=r"no run in .+: run.json is missing"):
+        vj.resume(tmp_path / "none", problem)
+    assert not (tmp_path / "none").exists()
 
 
 KILLED = """

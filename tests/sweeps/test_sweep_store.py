@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies
 
-from verifai_jax.sweeps.cache import Cache, CacheError
+from verifai_jax.core.locks import FolderInUse
+from verifai_jax.sweeps.cache import Cache, CacheError, locked_cache
 
 ABOUT = {"study": "s", "space": {"a": "Box(0, 1)"}, "seeds": [0, 1]}
 
@@ -160,3 +161,20 @@ def test_a_cache_that_cannot_be_written(tmp_path):
         cache._base.execute("PRAGMA query_only=1")
         with pytest.raises(CacheError, match=r"cannot be used: attempt to write a readonly"):
             cache.put({"a": {"x": np.ones(1)}})
+
+
+@pytest.mark.parametrize("name", ["kept", "kept/some.sqlite"])
+def test_a_cache_has_one_writer(tmp_path, name):
+    with locked_cache(tmp_path / name):
+        with Cache(tmp_path / name) as cache:
+            cache.put({"x": {"a": np.arange(3)}})
+        told = f"{name}' is being written by this process"
+        with pytest.raises(FolderInUse, match=told), locked_cache(str(tmp_path / name)):
+            pass
+        with Cache(tmp_path / name) as cache:  # Reading needs no lock.
+            assert cache.names() == ["x"]
+    with locked_cache(tmp_path / name), locked_cache(None):
+        pass
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CacheError, match="cannot be written"), locked_cache(tmp_path / "file/in"):
+        pass

@@ -8,6 +8,7 @@ found.save("report")                report.md and a picture of each
 """
 
 import html
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +28,7 @@ from verifai_jax.analysis.data.verdicts import unconfirmed
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
-from verifai_jax.core.text import format_features
+from verifai_jax.core.text import format_features, one_line, printable
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 
@@ -116,12 +117,15 @@ class Analysis:
         """
         place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
-        lines = [f"# {self.name}", ""]
+        lines = [f"# {html.escape(one_line(self.name))}", ""]
         if self.samples is not None:
             self.plot(place / "overview.png")
             lines += ["![overview](overview.png)", ""]
         for part in self.parts:
-            lines += [f"## {part.title}", "", "```text", part.words, "```", ""]
+            # Names of features and values are text of others: nothing in it ends the block.
+            words = printable(part.words)
+            fence = "`" * max(3, 1 + max(map(len, re.findall("`+", words)), default=0))
+            lines += [f"## {part.title}", "", f"{fence}text", words, fence, ""]
             if hasattr(part.result, "plot"):
                 part.result.plot(place / f"{part.name}.png")
                 lines += [f"![{part.title.lower()}]({part.name}.png)", ""]
@@ -136,7 +140,7 @@ class Analysis:
         lines = [self.name]
         for part in self.parts:
             lines += ["", part.title, *(f"  {line}" for line in part.words.splitlines())]
-        return "\n".join(lines)
+        return printable("\n".join(lines))
 
     def _repr_html_(self) -> str:
         parts = [f"<h3>{html.escape(self.name)}</h3>"]

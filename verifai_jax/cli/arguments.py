@@ -1,7 +1,8 @@
 """Arguments and options that several commands share, and how their text is read."""
 
+import contextlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -258,9 +259,31 @@ def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
             raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
 
 
-def next_folder(parent: str, name: str) -> Path:
-    """Return the first of parent/NAME-1, parent/NAME-2, ... that does not exist."""
-    number = 1
-    while (folder := Path(parent) / f"{name}-{number}").exists():
-        number += 1
-    return folder
+@contextlib.contextmanager
+def next_folder(parent: str, name: str) -> Iterator[Path]:
+    """Make the first of parent/NAME-1, parent/NAME-2, ... that is missing, for this process alone.
+
+    A command that ends without a file in it removes it.
+    """
+    from verifai_jax.core.text import folder_name
+    from verifai_jax.falsification.validation import writing
+
+    name, number, first = folder_name(name), 1, not Path(parent).exists()
+    while True:
+        folder = Path(parent) / f"{name}-{number}"
+        try:
+            with writing(folder):
+                folder.mkdir(parents=True)
+            break
+        except ValueError as error:
+            # Another command may have made it since one looked; making it decides.
+            if not isinstance(error.__cause__, FileExistsError) or not folder.parent.is_dir():
+                raise
+            number += 1
+    try:
+        yield folder
+    finally:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+            if first:
+                folder.parent.rmdir()

@@ -23,10 +23,11 @@ def confirm(
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
     from verifai_jax import counterexamples
+    from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
     result = counterexamples.confirm(run, row, simulator=simulator)
-    click.echo(str(result))
+    click.echo(printable(str(result)))
     if isinstance(result, counterexamples.Confirmation):
         all_confirmed = result.confirmed
     else:

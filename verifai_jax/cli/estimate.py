@@ -53,6 +53,7 @@ def estimate(
     fail_on: str | None,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
+    from verifai_jax.core.text import printable
     from verifai_jax.estimation import estimate as run
 
     if fail_on is not None and p0 is None:
@@ -69,7 +70,7 @@ def estimate(
         backend=backend,
         max_seconds=max_seconds,
     )
-    click.echo(str(found))
+    click.echo(printable(str(found)))
     if plot is not None:
         found.plot(plot)
         click.echo(f"  picture      {plot}")

@@ -33,6 +33,9 @@ Exit codes:
 """
 """What `--help` says of them."""
 
+_MOST_OF_AN_ERROR = 4000
+"""Characters of an error that are printed: it may quote a file, or the message of a system."""
+
 USAGE_ERRORS = (
     ValueError,
     TypeError,
@@ -74,7 +77,9 @@ def command_error(error: BaseException, show_traceback: bool = False) -> Command
             f"{type(error).__name__}: {error}\nThis is a bug of verifai_jax; please report it "
             "with the lines above"
         )
-    return CommandError(message, code)
+    from verifai_jax.core.text import printable
+
+    return CommandError(printable(message, _MOST_OF_AN_ERROR), code)
 
 
 def _told(error: BaseException) -> tuple[str, int]:

@@ -20,10 +20,11 @@ def explain(
     import textwrap
 
     from verifai_jax import counterexamples
+    from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
     why = counterexamples.explain(run, row)
-    click.echo(textwrap.fill(str(why), 88, break_on_hyphens=False))
+    click.echo(textwrap.fill(printable(str(why)), 88, break_on_hyphens=False))
     if pictures:
         path = (into or folder) / f"why-{why.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,6 @@
 """`verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000`."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -106,24 +107,26 @@ def falsify(
     else:
         chosen = named(search or "portfolio", **plain_values("--set", options))
         problem = load_problem(target, only)
-        run = falsification.falsify(
-            problem,
-            chosen,
-            10_000 if budget is None else budget,
-            batch=batch,
-            seed=0 if seed is None else seed,
-            max_seconds=max_seconds,
-            stop_after=stop_after,
-            stop_when=stop_when,
-            warm_start=None if warm_start is None else read_run(warm_start),
-            folder=folder or next_folder("runs", problem.name),
-            precision=precision or "float32",
-            backend=backend,
-            confirm=confirm,
-            diverse=diverse,
-            progress=progress,
-            target=target,
-        )
+        earlier = None if warm_start is None else read_run(warm_start)
+        with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+            run = falsification.falsify(
+                problem,
+                chosen,
+                10_000 if budget is None else budget,
+                batch=batch,
+                seed=0 if seed is None else seed,
+                max_seconds=max_seconds,
+                stop_after=stop_after,
+                stop_when=stop_when,
+                warm_start=earlier,
+                folder=place,
+                precision=precision or "float32",
+                backend=backend,
+                confirm=confirm,
+                diverse=diverse,
+                progress=progress,
+                target=target,
+            )
     _print(run, pictures)
     if fail_on is not None and len(run.table.counterexamples):
         raise fail_gate()
@@ -165,10 +168,12 @@ def _print(run: "Run", pictures: bool) -> None:
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)
     if not run.simulations:
         raise CommandError("no simulation was finished, so nothing is known of it", BROKEN)
+    from verifai_jax.core.text import one_line
+
     counts = ", ".join(f"{n:,} {status}" for status, n in failed["status"].value_counts().items())
     messages = [text for text in failed["message"] if text] if "message" in failed else []
     raise CommandError(
         f"no simulation had a verdict, so nothing is known of the property: {counts}"
-        + (f". The first says: {messages[0]}" if messages else ""),
+        + (f". The first says: {one_line(str(messages[0]))}" if messages else ""),
         BROKEN,
     )

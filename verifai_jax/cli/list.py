@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 @click.command(name="list")
 @click.argument("place", required=False)
 def list_targets(place: str | None) -> None:
-    """List the problems and studies of a file or folder (PLACE, by default specs/)."""
+    """List the problems and studies of a file or folder (PLACE, by default specs/).
+
+    Its Python files are run for that, those of inner folders are not.
+    """
     from verifai_jax.core.errors import MissingExtra
     from verifai_jax.core.targets import NothingDefined, TargetError, definitions
     from verifai_jax.problem import Problem

@@ -41,6 +41,7 @@ def repair(
     **keywords: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
+    from verifai_jax.core.text import printable
     from verifai_jax.synthesis import repair as run_repair
 
     problem = load_problem(target)
@@ -51,7 +52,7 @@ def repair(
         nominal=plain_values("--nominal", nominal) or None,
         **keywords,
     )
-    click.echo(str(result))
+    click.echo(printable(str(result)))
     if plot is not None:
         result.plot(plot)
         click.echo(f"  picture      {plot}")

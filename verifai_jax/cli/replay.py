@@ -27,6 +27,7 @@ def replay(
     pictures: bool,
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
+    from verifai_jax.core.text import one_line, printable
     from verifai_jax.plotting import write_replay_pictures
 
     run = (load_judged_run if row is None else load_run)(folder, target)
@@ -36,13 +37,14 @@ def replay(
         precision = run.precision if run.problem.draws() else "float64"
     again = run.replay(number, precision)
     stored = run.table.all.iloc[number]
-    click.echo(f"{run.name}, row {number}, {precision}")
+    click.echo(printable(f"{run.name}, row {number}, {precision}"))
     for name in run.table.features:
         value = stored[name]
         number_like = isinstance(value, (int, float)) or hasattr(value, "dtype")
-        click.echo(f"  {name:<12} {value:.6g}" if number_like else f"  {name:<12} {value}")
+        text = f"{value:.6g}" if number_like else one_line(str(value))
+        click.echo(f"  {printable(name):<12} {text}")
     for name, rho in again.rho.items():
-        click.echo(f"  {run.formulas[name]}")
+        click.echo(f"  {printable(run.formulas[name])}")
         click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")
     verdict = "violated" if again.violated else "satisfied"
     click.echo(f"  status {again.status.name.lower()}; {verdict}")

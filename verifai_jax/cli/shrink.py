@@ -42,10 +42,11 @@ def shrink(
 ) -> None:
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
     from verifai_jax import counterexamples
+    from verifai_jax.core.text import printable
 
     run = load_judged_run(folder, target)
     small = counterexamples.shrink(run, row, by=by, budget=budget, seed=seed, others=others)
-    click.echo(str(small))
+    click.echo(printable(str(small)))
     if pictures:
         path = (into or folder) / f"shrunk-{small.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """`verifai-jax sweep specs/mountain_car.py:safe_training --configurations 32`."""
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,8 @@ _FIXED = (
     "only",
 )
 """Options that a resumed sweep takes from its cache."""
+_NOTED = ("target", "configurations", "given", "options", "nominal")
+"""Entries of the command in the cache."""
 _MOST_ROWS = 12
 """Rows of the table that are printed."""
 
@@ -88,6 +91,7 @@ def sweep(
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax.core.targets import load_target, target_of_project
+    from verifai_jax.core.text import printable
     from verifai_jax.sweeps._sweep import sweep as run_sweep
     from verifai_jax.sweeps.study import Study
 
@@ -113,7 +117,6 @@ def sweep(
     study = load_target(target, Study)
     if given["only"] is not None:
         study = study.only(*split_names(given["only"]), nominal=plain_values("--nominal", nominal))
-    folder = folder or next_folder("sweeps", study.name)
     # Read by a later --resume.
     note = {
         "target": target,
@@ -122,20 +125,23 @@ def sweep(
         "options": list(options),
         "nominal": list(nominal),
     }
-    result = run_sweep(
-        study,
-        configurations=configurations,
-        folder=folder if cache is None else cache,
-        max_seconds=max_seconds,
-        note=note,
-        **_keywords(given, options),
-    )
-    record = replace(result.record, options={**result.record.options, "target": target})
-    result = replace(result, record=record)
-    click.echo(str(result))
-    if len(result.table):
-        click.echo(_format_table(result))
-    result.save(folder)
+    keywords = _keywords(given, options)
+    with next_folder("sweeps", study.name) if folder is None else nullcontext(folder) as place:
+        folder = place
+        result = run_sweep(
+            study,
+            configurations=configurations,
+            folder=folder if cache is None else cache,
+            max_seconds=max_seconds,
+            note=note,
+            **keywords,
+        )
+        record = replace(result.record, options={**result.record.options, "target": target})
+        result = replace(result, record=record)
+        click.echo(printable(str(result)))
+        if len(result.table):
+            click.echo(_format_table(result))
+        result.save(folder)
     click.echo(f"  table        {folder / 'table.parquet'}")
     if pictures and record.certified:
         picture = folder / "sweep.png"
@@ -184,6 +190,12 @@ def _read_command(place: Path) -> dict[str, Any]:
             f"the sweep in {place} was begun in Python, and Python has to go on with it: call "
             f"vj.sweep(study, ..., folder={str(place)!r}) again"
         )
+    if (
+        not isinstance(note, dict)
+        or not {*_NOTED} <= note.keys()
+        or not isinstance(note["given"], dict)
+    ):
+        raise CacheError(f"the sweep in {place} is damaged in its note 'command'")
     return note
 
 
@@ -200,6 +212,7 @@ def _describe_place(place: Path) -> str:
 
 def _format_table(result: "Sweep") -> str:
     """Write the most preferable rows of the table."""
+    from verifai_jax.core.text import printable
     from verifai_jax.sweeps.ranking import preference_order
 
     table = result.table
@@ -213,4 +226,5 @@ def _format_table(result: "Sweep") -> str:
         some = some.drop(columns="status")
     text = some.to_string(float_format=lambda value: f"{value:.4g}", max_colwidth=40)
     left = len(table) - len(some)
+    text = printable(text)
     return text if not left else f"{text}\n  and {left} more in the table"

@@ -29,6 +29,7 @@ def synthesize(
     **keywords: Any,
 ) -> None:
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
+    from verifai_jax.core.text import printable
     from verifai_jax.synthesis import synthesize as run_synthesize
 
     result = run_synthesize(
@@ -37,7 +38,7 @@ def synthesize(
         budget,
         **keywords,
     )
-    click.echo(str(result))
+    click.echo(printable(str(result)))
     if table is not None:
         result.candidates.to_csv(table, index=False)
         click.echo(f"  candidates   {table}")

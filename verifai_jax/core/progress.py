@@ -11,6 +11,8 @@ import importlib.util
 import sys
 from typing import TYPE_CHECKING
 
+from verifai_jax.core.text import printable
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -73,7 +75,7 @@ class ProgressBar:
     def note(self, text: str) -> None:
         """Write a line above the bar, which stays."""
         if self._display is not None:
-            self._display.console.print(f"note: {text}", markup=False, highlight=False)
+            self._display.console.print(f"note: {printable(text)}", markup=False, highlight=False)
 
     @property
     def speed(self) -> float:

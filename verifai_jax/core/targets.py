@@ -116,7 +116,9 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
     """Return a recorded target if it names a file of the user's own project.
 
     Loading a target runs its file, so a folder that came from elsewhere must not choose one: the
-    file has to lie below the current folder and outside the folder that names it.
+    target is the path of a Python file that exists, below the current folder, and outside of
+    whatever holds results: the folder that names it, those beside and above it, any that is called
+    `runs` or `sweeps`, and any with the files of a run or a sweep.
 
     **Arguments:**
 
@@ -129,14 +131,38 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
 
     **Raises:** `TargetError` for any other target.
     """
-    here = Path.cwd().resolve()
-    if isinstance(target, str) and ".py" in target:
-        file = (here / target.rpartition(":")[0]).resolve()
-        if file.is_relative_to(here) and not file.is_relative_to(folder.resolve()):
+    if isinstance(target, str):
+        place, colon, _ = target.rpartition(":")
+        if _is_of_project(place if colon else target, folder.resolve()):
             return target
     raise TargetError(
         f"{folder} does not say which {kind} of this project it is of; give it: {remedy}"
     )
+
+
+RESULTS = ("runs", "sweeps")
+"""Names of the folders in which the command line keeps results."""
+_OF_RESULTS = ("run.json", "sweep.json", "sweep.sqlite")
+
+
+def _is_of_project(place: str, folder: Path) -> bool:
+    """Return whether a place is a Python file of the project, and of no folder of results."""
+    here = Path.cwd().resolve()
+    # Anything else than an existing file would be imported as a module, from wherever it lies.
+    if not place.endswith(".py") or "\0" in place or not Path(place).is_file():
+        return False
+    file = Path(place).resolve()
+    if not file.is_relative_to(here) or file.is_relative_to(folder):
+        return False
+    folders = file.relative_to(here).parts[:-1]
+    if any(name in RESULTS for name in folders):
+        return False
+    # What came with the folder, as from one archive, lies beside it.
+    beside = folder.relative_to(here).parts[:1] if folder.is_relative_to(here) else ()
+    if beside and beside == folders[:1]:
+        return False
+    inner = file.parents[: len(folders)]
+    return not any((each / name).exists() for each in inner for name in _OF_RESULTS)
 
 
 def _import(place: str) -> ModuleType:

@@ -1,6 +1,7 @@
 """Text for people: numbers, shares, features and errors in one line."""
 
 import math
+import unicodedata
 from collections.abc import Mapping
 
 import numpy as np
@@ -73,3 +74,49 @@ def shorten(text: str, most: int = 60) -> str:
     The end of a name says more than its middle.
     """
     return text if len(text) <= most else f"{text[: most // 3]}...{text[len(text) - most // 2 :]}"
+
+
+MOST_OF_A_MESSAGE = 500
+"""Characters of a message of somebody's system that are printed; the table has all of it."""
+
+
+def printable(text: str, most: int | None = None) -> str:
+    r"""Write characters that steer a terminal as escapes: `\x1b[2J`, `\u202e`.
+
+    Texts of systems, tables and files could otherwise clear the screen, or reorder what is on it.
+    Line breaks and tabs stay.
+
+    **Arguments:**
+
+    - `text`: the text.
+    - `most`: characters that are kept, of its begin and its end; all when left out.
+    """
+    text = text if most is None else shorten(text, most)
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(_escaped(each) if _steers(each) else each for each in text)
+
+
+def _steers(character: str) -> bool:
+    # Controls, formats (such as the direction of writing), surrogates, and separators of lines.
+    return character not in "\n\t" and (
+        unicodedata.category(character) in ("Cc", "Cf", "Cs", "Zl", "Zp")
+    )
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def one_line(text: str, most: int = MOST_OF_A_MESSAGE) -> str:
+    """Write a text in one line of at most so many characters, safe for a terminal."""
+    return printable(" ".join(shorten(text, most).split()))
+
+
+def folder_name(text: str) -> str:
+    """Return a name for a folder, from a text that may hold anything: `a_b` of `../a/b`.
+
+    Letters, digits and a few signs stay; other characters become `_`, and at most 100 are kept.
+    """
+    kept = "".join(c if c.isalnum() or c in " ._-+=,()" else "_" for c in shorten(text, 100))
+    return kept.strip(" ._") or "unnamed"

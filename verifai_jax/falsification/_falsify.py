@@ -21,7 +21,7 @@ from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
-from verifai_jax.falsification.run import Run, load, write_record
+from verifai_jax.falsification.run import RECORD, Run, load, write_record
 from verifai_jax.falsification.silent_mistakes import (
     NOMINAL_FAILS,
     nominal_note,
@@ -37,6 +37,7 @@ from verifai_jax.falsification.validation import (
     check_same_space,
     check_search,
     earlier_rows,
+    locked,
     needs_gradient,
     new_folder,
     space_as_data,
@@ -118,8 +119,8 @@ def falsify(
 
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
-    work on the space, a folder that cannot be written; `RunError` with the finished part of the run
-    when the loop breaks down.
+    work on the space, a folder that cannot be written or that another process writes; `RunError`
+    with the finished part of the run when the loop breaks down.
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
@@ -143,17 +144,17 @@ def falsify(
     notes += notes_before(problem, search)
     if diverse:
         search = searches.Diverse(search, capacity=max(256, stop_after or 0))
-    place = new_folder(folder)
-    table = ErrorTable(tuple(problem.space.columns), place)
-    rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)
-
-    def prepare() -> None:
-        if earlier is not None:
-            rounds.warm(earlier)
-
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
     warm = earlier is not None
-    return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes, warm=warm)
+    with new_folder(folder) as place:
+        table = ErrorTable(tuple(problem.space.columns), place)
+        rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)
+
+        def prepare() -> None:
+            if earlier is not None:
+                rounds.warm(earlier)
+
+        return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes, warm=warm)
 
 
 @suggests_options
@@ -224,12 +225,28 @@ def resume(
 
     **Returns:** the run with the earlier rows and the new ones.
 
-    **Raises:** `ValueError` for a run without its problem or its state, or a budget that is spent;
-    as `falsify` otherwise.
+    **Raises:** `ValueError` for a run without its problem or its state, a budget that is spent, or
+    a folder that another process writes; as `falsify` otherwise.
     """
-    started = time.perf_counter()
-    if isinstance(run, str | Path):
-        run = load(run, problem)
+    ends = _Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
+    folder = Path(run) if isinstance(run, str | Path) else run.folder
+    if not isinstance(run, Run) and not (Path(run) / RECORD).exists():
+        load(run)  # Says what is missing; a lock would be written to what is no run.
+    # The rows are read under the lock, so that nobody adds to them meanwhile.
+    with locked(folder):
+        run = load(run, problem) if isinstance(run, str | Path) else run
+        return _resume(run, problem, search, budget, ends, progress)
+
+
+def _resume(
+    run: Run,
+    problem: Problem | None,
+    search: Search | None,
+    budget: int | None,
+    ends: "_Ending",
+    progress: bool | None,
+) -> Run:
+    """Go on with a run whose folder is locked; `ends` is completed from the run."""
     problem = problem or run.problem
     if problem is None:
         raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
@@ -241,9 +258,9 @@ def resume(
         search = searches.from_json(run.search_data)
     search = check_search(problem, search)
     check_same_space(run, problem)
-    check_rule(search, stop_when)
+    check_rule(search, ends.stop_when)
     budget = run.budget if budget is None else budget
-    check_options(budget, run.batch, run.seed, max_seconds, stop_after)
+    check_options(budget, run.batch, run.seed, ends.max_seconds, ends.stop_after)
     checkpoint = run.checkpoint or {}
     rows = int(checkpoint.get("rows", 0))
     if budget <= rows:
@@ -274,7 +291,7 @@ def resume(
         if checkpoint:
             rounds.resume(checkpoint)
 
-    ends = _Ending(started, budget, max_seconds, stop_after, stop_when, earlier=run.run_seconds)
+    ends = ends._replace(budget=budget, earlier=run.run_seconds)
     notes = [note for note in run.notes if note.startswith(("portfolio ", NOMINAL_FAILS))]
     notes += notes_before(problem, search)
     return _run_rounds(

@@ -16,6 +16,7 @@ import numpy as np
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.locks import write_lock
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import read_checkpoint, write_checkpoint
 from verifai_jax.falsification.table import ErrorTable
@@ -213,12 +214,17 @@ class Run:
         return late("verifai_jax.plotting.scatter", "plot_features")(self, path)
 
     def save(self, path: str | Path) -> Path:
-        """Write the run to a folder: its record, table and state; returns the folder."""
+        """Write the run to a folder: its record, table and state; returns the folder.
+
+        **Raises:** `FolderInUse` where another process writes there.
+        """
         folder = Path(path)
-        self.table.save(folder)
-        write_record(self, folder)
-        if self.checkpoint:
-            write_checkpoint(self.checkpoint, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with write_lock(folder):
+            self.table.save(folder)
+            write_record(self, folder)
+            if self.checkpoint:
+                write_checkpoint(self.checkpoint, folder)
         return folder
 
     def __repr__(self) -> str:

@@ -8,7 +8,7 @@ failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 
 import numpy as np
 
-from verifai_jax.core.text import format_features, format_percent
+from verifai_jax.core.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmation import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.run import Run
@@ -39,7 +39,7 @@ def summarize(run: Run) -> str:
         lines.append(f"  no verdict   {counts}")
         if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
             number, message = raised.index[0], raised["message"].iloc[0]
-            lines.append(f"               first in row {number}: {message}")
+            lines.append(f"               first in row {number}: {one_line(str(message))}")
     if "gradient_finite" in run.table.all:
         lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
         if lost:
@@ -62,7 +62,8 @@ def summarize(run: Run) -> str:
         f"simulate ({speed:,.0f} simulations/s){confirming}; stopped by {run.stopped}"
     )
     lines.append(f"  search       {run.search}, seed {run.seed}")
-    return "\n".join(lines)
+    # Names, values and notes come from files and systems, which a terminal must not obey.
+    return printable("\n".join(lines))
 
 
 def _headline(run: Run, violating: int) -> str:

@@ -1,7 +1,7 @@
 """Checks of the options of `falsify` and `resume`, before anything compiles."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -10,6 +10,7 @@ import numpy as np
 from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import has_gradient
@@ -209,18 +210,39 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
     return cast("pd.DataFrame", frame)
 
 
-def new_folder(folder: str | Path | None) -> Path | None:
-    """Make the folder for a new run.
+@contextmanager
+def locked(folder: Path | None) -> Iterator[None]:
+    """Be the only one who writes to the folder of a run.
 
-    **Raises:** `ValueError` for one that is not empty or cannot be made.
+    **Raises:** `FolderInUse` where another process does, `ValueError` where it cannot be written.
+    """
+    with ExitStack() as held:
+        with writing(folder):
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+            held.enter_context(write_lock(folder))
+        yield
+
+
+@contextmanager
+def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
+    """Make the folder for a new run, and be the only one who writes to it.
+
+    **Raises:** `ValueError` for one that is not empty, cannot be made, or is another one's.
     """
     if folder is None:
-        return None
+        yield None
+        return
     place = Path(folder)
+    if not (place / LOCK).exists():  # Whoever writes there is told by the lock.
+        _check_empty(place)
+    with locked(place):
+        _check_empty(place)  # Another run may have begun in it, and ended, since.
+        yield place
+
+
+def _check_empty(place: Path) -> None:
     # A process that dies before its first record leaves a part of one.
-    leftover = {f"{RECORD}.part"}
+    leftover = {f"{RECORD}.part", LOCK}
     if place.exists() and (not place.is_dir() or {p.name for p in place.iterdir()} - leftover):
         raise ValueError(f"folder {str(place)!r} exists and is not empty; a run needs a new one")
-    with writing(place):
-        place.mkdir(parents=True, exist_ok=True)
-    return place

@@ -22,7 +22,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.cache import Arrays, Cache
+from verifai_jax.sweeps.cache import Arrays, Cache, locked_cache
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest, fingerprint
 from verifai_jax.sweeps.halving import SAFETY, Halving
@@ -134,7 +134,11 @@ def sweep(
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
-    with Cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
+    with (
+        locked_cache(folder),
+        Cache(folder) as cache,
+        Clock(study.name, max_seconds, progress) as clock,
+    ):
         cache.claim(fingerprint(study, options))
         if note is not None:
             cache.note("command", dict(note))

@@ -20,6 +20,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from verifai_jax.core.locks import write_lock
+
 Arrays: TypeAlias = dict[str, np.ndarray]
 """The result of one computation: arrays of numbers or texts, by name."""
 
@@ -222,6 +224,25 @@ def cache_file(path: Path) -> Path:
     if path.is_file():
         raise CacheError(f"{path} is a file of another kind; give a folder, or a .sqlite file")
     return path / _FILE
+
+
+@contextlib.contextmanager
+def locked_cache(place: str | Path | None) -> Iterator[None]:
+    """Be the only one who writes to a cache; None is none on disk.
+
+    **Raises:** `FolderInUse`, which names the process that writes to it; `CacheError` where it
+    cannot be written.
+    """
+    with contextlib.ExitStack() as held:
+        if place is not None:
+            path = Path(place)
+            file = cache_file(path)
+            try:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                held.enter_context(write_lock(file if file == path else path))
+            except OSError as error:
+                raise CacheError(f"{place} cannot be written: {error}") from error
+        yield
 
 
 def _encode(arrays: Mapping[str, np.ndarray]) -> tuple[str, int, bytes]:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.core.locks import write_lock
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.sweeps.record import Curve, SweepRecord
@@ -68,9 +69,17 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     - `folder`: the folder; it is created.
 
     **Returns:** the folder.
+
+    **Raises:** `FolderInUse` where another process writes it.
     """
-    record = stored.record
     (folder / POLICIES).mkdir(parents=True, exist_ok=True)
+    with write_lock(folder):
+        _write_files(stored, table, folder)
+    return folder
+
+
+def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> None:
+    record = stored.record
     # The record is written last: a folder without it holds no sweep.
     (folder / RECORD).unlink(missing_ok=True)
     for old in (folder / POLICIES).glob("*.npz"):
@@ -101,7 +110,6 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(data, indent=2) + "\n")
     partial.replace(folder / RECORD)
-    return folder
 
 
 def read_description(folder: Path) -> dict[str, Any]:

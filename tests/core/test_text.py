@@ -1,0 +1,30 @@
+"""Texts of others, on a terminal and as names of folders."""
+
+import pytest
+
+from verifai_jax.core.text import folder_name, one_line, printable
+
+
+def test_what_steers_a_terminal_is_written_out():
+    assert printable("a\x1b[2Jb\x07\r") == "a\\x1b[2Jb\\x07\\r"
+    assert printable("\u202eevil\u2028\udcff") == "\\u202eevil\\u2028\\udcff"
+    assert printable("two\nlines\tand ä, 中, 🙂") == "two\nlines\tand ä, 中, 🙂"
+    assert one_line("a\nb\x1b") == "a b\\x1b"
+    assert len(one_line("x" * 5_000_000)) < 510
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [
+        ("balance", "balance"),
+        ("a-b_c 1.5", "a-b_c 1.5"),
+        ("../../evil name\n", "evil name"),
+        ("/etc/passwd", "etc_passwd"),
+        ("..", "unnamed"),
+        ("a\x00b\\c", "a_b_c"),
+        ("größe", "größe"),
+    ],
+)
+def test_a_name_stays_in_its_folder(name, folder):
+    assert folder_name(name) == folder
+    assert len(folder_name(name * 500)) < 110
