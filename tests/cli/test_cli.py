@@ -428,7 +428,7 @@ def test_folders_of_something_else(call, tmp_path):
         assert told in call("replay", place, code=2)
     (tmp_path / "runs" / "calm-1" / "table.parquet").write_text("PAR1")
     output = call("replay", "runs/calm-1", code=2)
-    assert "the table of the run in runs/calm-1 is damaged" in output
+    assert "Error: runs/calm-1/table.parquet is damaged: ArrowInvalid: " in output
     told = "it is the folder of a run; verifai-jax falsify --resume runs/calm-1 goes on with it"
     assert told in call("sweep", "--resume", "runs/calm-1", code=2)
 

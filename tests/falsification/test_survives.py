@@ -3,6 +3,8 @@
 import json
 import os
 import random
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +113,88 @@ def test_a_damaged_folder_is_told(problem, tmp_path):
     (run.folder / STREAM).write_bytes(b"")
     with pytest.raises(ValueError, match="its search had seen 64 simulations, of which its table"):
         vj.resume(run.folder, problem, budget=160)
+
+
+@pytest.fixture(scope="module")
+def kept(problem, tmp_path_factory):
+    """The folder of a finished run, not to be written to."""
+    return vj.falsify(
+        problem, "cross_entropy", 64, batch=16, folder=tmp_path_factory.mktemp("kept") / "run"
+    ).folder
+
+
+def snapshot(rows):
+    def write(file):
+        with np.load(file) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        np.savez(file, **{**arrays, "rows": rows})
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda file: file.write_bytes(b""), r"search.npz is damaged: "),
+        (lambda file: file.write_bytes(file.read_bytes()[:300]), r"search.npz is damaged: BadZip"),
+        (lambda file: file.write_text("nonsense"), r"search.npz is damaged: "),
+        (snapshot(np.array(-3)), r"does not say how many rows its search saw"),
+        (snapshot(np.array([1, 2])), r"does not say how many rows its search saw"),
+        (snapshot(np.array(10**12)), r"seen 1000000000000 simulations, of which its table has 64"),
+    ],
+)
+def test_a_damaged_checkpoint_does_not_hide_the_table(problem, whole, kept, tmp_path, damage, told):
+    folder = shutil.copytree(kept, tmp_path / "run")
+    damage(folder / STATE)
+    run = vj.load(folder, problem)
+    assert run.table.all.equals(whole.iloc[:64])
+    assert re.search(told, run.summary())
+    assert run.replay(3).rho
+    with pytest.raises(ValueError, match=rf"the run of 'ramp' cannot go on: .*{told}"):
+        vj.resume(folder, problem, budget=160)
+    # The rows are still there.
+    assert vj.load(folder).table.all.equals(whole.iloc[:64])
+
+
+def test_a_damaged_record_says_where_the_rows_are(kept, tmp_path):
+    folder = shutil.copytree(kept, tmp_path / "run")
+    record = json.loads((folder / RECORD).read_text())
+    wrong = {"seed": "0", "batch": None, "features": "ab", "notes": 3, "prior": 1, "formulas": []}
+    damaged = [(f"has {n!r} of another form", {**record, n: value}) for n, value in wrong.items()]
+    for name in ("name", "seed", "features", "formulas", "stopped", "prior", "version"):
+        damaged += [(f"has no {name!r}", {n: v for n, v in record.items() if n != name})]
+    for told, content in damaged:
+        (folder / RECORD).write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=f"run.json is damaged: it {told}; the rows are in .*"):
+            vj.load(folder)
+    for text in ("", "[" * 100_000, "[1]", "{"):
+        (folder / RECORD).write_text(text)
+        with pytest.raises(ValueError, match=r"its run.json is damaged, .*table.parquet, "):
+            vj.load(folder)
+
+
+def test_a_table_that_is_damaged_is_told_by_name(problem, kept, tmp_path):
+    folder = shutil.copytree(kept, tmp_path / "run")
+    table = folder / "table.parquet"
+    content = table.read_bytes()
+    for damage in (b"", content[:-100], b"nonsense" * 9):
+        table.write_bytes(damage)
+        with pytest.raises(ValueError, match=r"table.parquet is damaged: .+"):
+            vj.load(folder)
+    table.unlink()
+    table.mkdir()
+    with pytest.raises(ValueError, match=r"table.parquet is damaged: it is not a file"):
+        vj.load(folder)
+    table.rmdir()
+    with pytest.raises(FileNotFoundError, match="no error table in"):
+        vj.load(folder)
+    # Without any snapshot: a run that has ended had rows, or said that it had none.
+    (folder / STATE).unlink()
+    for garbage in (b"", b"garbage" * 50):
+        (folder / STREAM).write_bytes(garbage)
+        assert "rows.arrows is damaged: it has no row" in vj.load(folder).summary()
+        with pytest.raises(ValueError, match=r"cannot go on: .*rows.arrows is damaged"):
+            vj.resume(folder, problem, budget=160)
 
 
 def test_a_kill_before_the_first_rows_is_resumed(problem, whole, tmp_path):

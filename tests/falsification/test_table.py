@@ -1,9 +1,10 @@
+import contextlib
 import shutil
 
 import numpy as np
 import pytest
 
-from verifai_jax.falsification.table import FINISHED, STREAM, ErrorTable
+from verifai_jax.falsification.table import FINISHED, STREAM, ErrorTable, TableError
 
 
 def batch(rho, status=None, **features):
@@ -61,6 +62,45 @@ def test_a_process_that_dies_loses_only_the_batch_in_flight(tmp_path):
     (tmp_path / STREAM).write_bytes(whole[:10])
     assert len(ErrorTable.load(tmp_path, ("x",))) == 0
     table.close()
+
+
+def test_damaged_bytes_cost_rows_and_not_the_process(tmp_path):
+    table = ErrorTable(("x", "color"), tmp_path)
+    colors = np.array(["red", "blue", "green"] * 4, object)
+    for i in range(4):
+        table.append(batch([i] * 12, x=[0.5] * 12, color=colors))
+    whole, random = (tmp_path / STREAM).read_bytes(), np.random.default_rng(0)
+    for turn in range(300):
+        damaged = bytearray(whole)
+        at = int(random.integers(len(damaged)))
+        if turn % 2:
+            damaged[at] ^= int(random.integers(1, 256))
+        else:
+            damaged[at:at] = random.bytes(4)
+        (tmp_path / STREAM).write_bytes(damaged)
+        # Offsets of texts that point outside of their buffer ended the process.
+        with contextlib.suppress(TableError):
+            rows = ErrorTable.load(tmp_path, table.features).all
+            assert len(rows) % 12 == 0
+            assert all(isinstance(each, str) for each in rows["color"])
+    (tmp_path / STREAM).write_bytes(whole)
+    assert len(ErrorTable.load(tmp_path, table.features)) == 48
+    table.close()
+
+
+def test_rows_that_are_missing_are_not_numbered_anew(tmp_path):
+    table = ErrorTable(("x",), tmp_path)
+    table.append(batch([1, 2, 3], x=[0.1, 0.2, 0.3]))
+    table.close()
+    resumed = table.resumed(2, tmp_path)
+    resumed.append(batch([7], x=[7.0]))
+    assert len(ErrorTable.load(tmp_path, ("x",))) == 3
+    with pytest.raises(TableError, match="has no column 'y'"):
+        ErrorTable.load(tmp_path, ("x", "y"))
+    (tmp_path / FINISHED).unlink()
+    with pytest.raises(TableError, match=r"where row 0 should be, there is 2; table.parquet is"):
+        ErrorTable.load(tmp_path, ("x",))
+    resumed.close()
 
 
 def test_resuming_drops_what_came_later_and_goes_on(tmp_path):

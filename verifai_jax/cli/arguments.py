@@ -161,15 +161,10 @@ def load_run(folder: Path, target: str | None) -> "Run":
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
     """Read the run in a folder; say what the folder is where it holds none."""
-    import pyarrow
-
     from verifai_jax.falsification.run import load
 
     read_record(folder)
-    try:
-        return load(folder, problem)
-    except pyarrow.ArrowException as error:
-        raise ValueError(f"the table of the run in {folder} is damaged: {error}") from error
+    return load(folder, problem)
 
 
 def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") -> str:
@@ -193,8 +188,10 @@ def read_record(folder: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"no run in {folder}: {_describe_place(folder, RECORD)}")
     try:
         record = json.loads(file.read_text())
-    except ValueError:
+    except (ValueError, RecursionError):
         record = None
+    if isinstance(record, dict) and isinstance(record.get("format"), int):
+        return record
     if not isinstance(record, dict) or not {"format", "name", "features"} <= record.keys():
         raise ValueError(
             f"no run in {folder}: its {RECORD} is damaged, or of another program; give a folder "

@@ -261,6 +261,8 @@ def _resume(
     check_rule(search, ends.stop_when)
     budget = run.budget if budget is None else budget
     check_options(budget, run.batch, run.seed, ends.max_seconds, ends.stop_after)
+    if run.damage:
+        raise ValueError(f"the run of {run.name!r} cannot go on: {run.damage}")
     checkpoint = run.checkpoint or {}
     rows = int(checkpoint.get("rows", 0))
     if budget <= rows:
@@ -270,11 +272,6 @@ def _resume(
         )
     if not checkpoint and len(run.table) and run.stopped != "running":
         raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
-    if rows > len(run.table):
-        raise ValueError(
-            f"the run of {run.name!r} cannot go on: its search had seen {rows} simulations, of "
-            f"which its table has {len(run.table)}; files of {run.folder} are missing or damaged"
-        )
     choice = resolved(problem, wanted=run.backend)
     problem = choice.problem
     check_gradient(problem, search)

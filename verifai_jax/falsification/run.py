@@ -18,8 +18,13 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
 from verifai_jax.evaluation.replay import Replay, replay
-from verifai_jax.falsification.checkpoint import read_checkpoint, write_checkpoint
-from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.falsification.checkpoint import (
+    CheckpointError,
+    read_checkpoint,
+    write_checkpoint,
+)
+from verifai_jax.falsification.record import ADDED, FORMAT, RECORD, RECORDED, read_record
+from verifai_jax.falsification.table import FINISHED, STREAM, ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -27,11 +32,6 @@ from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 if TYPE_CHECKING:
     import pandas as pd
-
-RECORD = "run.json"
-"""Name of the file with everything about a run but its table and its checkpoint."""
-FORMAT = 2
-"""Number of the format of a run's files; others are refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +61,7 @@ class Run:
     - `notes`: decisions that were made without the user.
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
+    - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Run:
     confirm: bool = False
     confirm_seconds: float = 0.0
     checked: str = ""
+    damage: str = ""
 
     @property
     def simulations(self) -> int:
@@ -234,39 +236,11 @@ class Run:
 def write_record(run: Run, folder: Path) -> None:
     """Write everything about a run but its table to `run.json`."""
     record = {"format": FORMAT, "features": list(run.table.features)}
-    for name in (*_RECORDED, *_ADDED):
+    for name in (*RECORDED, *ADDED):
         record[name] = getattr(run, name)
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(record, indent=2) + "\n")
     partial.replace(folder / RECORD)
-
-
-_RECORDED = (
-    "name",
-    "formulas",
-    "search",
-    "seed",
-    "batch",
-    "stopped",
-    "compile_seconds",
-    "run_seconds",
-    "version",
-    "prior",
-    "target",
-)
-# Absent from the records of 0.1.
-_ADDED = (
-    "budget",
-    "search_data",
-    "space_data",
-    "acceptance",
-    "precision",
-    "backend",
-    "notes",
-    "confirm",
-    "confirm_seconds",
-    "checked",
-)
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
@@ -274,25 +248,14 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
     - `problem`: needed to replay rows; a file names no code to run.
 
-    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record that is
-    damaged or of another format, or a problem whose name, formulas or features differ from the
-    recorded ones.
+    Of a run whose checkpoint is damaged the table is there; its `damage` says what is not.
+
+    **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record or a table
+    that is damaged, a record of another format, or a problem whose name, formulas or features
+    differ from the recorded ones.
     """
     folder = Path(path)
-    if not (folder / RECORD).exists():
-        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing")
-    try:
-        record = json.loads((folder / RECORD).read_text())
-    except ValueError:
-        record = None
-    if not isinstance(record, dict):
-        raise ValueError(f"no run in {folder}: its {RECORD} is damaged, or of another program")
-    if record.get("format") != FORMAT:
-        raise ValueError(
-            f"{folder / RECORD} has format {record.get('format')!r}, and this version of "
-            f"verifai_jax reads format {FORMAT}: load it with the version that wrote it, "
-            f"{record.get('version', 'unknown')}"
-        )
+    record = read_record(folder)
     features = tuple(record["features"])
     if problem is not None:
         texts = {name: str(formula) for name, formula in problem.formulas.items()}
@@ -309,12 +272,27 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         if record.get("backend") is not None:
             problem = problem.on_backend(record["backend"])
     begun = ErrorTable.exists(folder) or record["stopped"] != "running"
+    # A run that was cut off before its first batch came to the disk has no rows yet.
+    table = ErrorTable.load(folder, features) if begun else ErrorTable(features)
+    checkpoint, damage = None, ""
+    try:
+        checkpoint = read_checkpoint(folder)
+    except CheckpointError as error:
+        damage = f"{error}; its rows are there all the same"
+    seen = int(checkpoint["rows"]) if checkpoint else 0
+    if seen > len(table):
+        damage = (
+            f"its search had seen {seen} simulations, of which its table has {len(table)}; files "
+            f"of {folder} are missing or damaged"
+        )
+    elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
+        damage = damage or f"{folder / STREAM} is damaged: it has no row that can be read"
     return Run(
-        # A run that was cut off before its first batch came to the disk has no rows yet.
-        table=ErrorTable.load(folder, features) if begun else ErrorTable(features),
+        table=table,
         folder=folder,
         problem=problem,
-        checkpoint=read_checkpoint(folder),
-        **{name: record[name] for name in _RECORDED},
-        **{name: record[name] for name in _ADDED if name in record},
+        checkpoint=checkpoint,
+        damage=damage,
+        **{name: record[name] for name in RECORDED},
+        **{name: record[name] for name in ADDED if name in record},
     )

@@ -45,6 +45,8 @@ def summarize(run: Run) -> str:
         if lost:
             lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
     lines.extend(f"  note         {note}" for note in run.notes)
+    if run.damage:
+        lines.append(f"  damaged      {run.damage}")
     kept = 0 if run.folder is None else count_unfinished(run.folder, run.simulations)
     if kept:
         lines.append(

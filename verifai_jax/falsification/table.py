@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.core.text import format_error
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -147,10 +149,11 @@ class ErrorTable:
     def load(cls, folder: Path, features: tuple[str, ...]) -> "ErrorTable":
         """Read a table back, finished or cut off.
 
-        **Raises:** `FileNotFoundError` where there is none.
+        **Raises:** `FileNotFoundError` where there is none; `TableError` for a damaged one.
         """
-        table = cls(features)
-        table._fill(_read(folder))
+        table, frame = cls(features), _read(folder)
+        _check(frame, folder, table.features)
+        table._fill(frame)
         return table
 
     @staticmethod
@@ -228,13 +231,17 @@ def _write(frame: "pd.DataFrame", folder: Path) -> None:
         raise
 
 
+class TableError(ValueError):
+    """An error for a table on disk that is damaged."""
+
+
 def _read(folder: Path) -> "pd.DataFrame":
     import pandas as pd
 
     finished, stream = folder / FINISHED, folder / STREAM
     if not ErrorTable.exists(folder):
         raise FileNotFoundError(f"no error table in {folder}: neither {FINISHED} nor {STREAM}")
-    parts = [pd.read_parquet(finished)] if finished.exists() else []
+    parts = [_read_finished(finished)] if finished.exists() else []
     if stream.exists():
         parts.append(_read_stream(stream))
     parts = [part for part in parts if len(part)] or parts[:1]
@@ -243,19 +250,58 @@ def _read(folder: Path) -> "pd.DataFrame":
     return frame.loc[~frame.index.duplicated()]
 
 
+def _read_finished(path: Path) -> "pd.DataFrame":
+    import pandas as pd
+
+    if not path.is_file():
+        # Pandas would read a folder as a table of the files in it.
+        raise TableError(f"{path} is damaged: it is not a file")
+    try:
+        return pd.read_parquet(path)
+    except PermissionError:
+        raise
+    except Exception as error:  # Bytes can be wrong in any way.
+        raise TableError(f"{path} is damaged: {format_error(error)}") from error
+
+
 def _read_stream(path: Path) -> "pd.DataFrame":
     import pandas as pd
     import pyarrow as pa
 
+    if not path.is_file():
+        raise TableError(f"{path} is damaged: it is not a file")
     batches = []
     with open(path, "rb") as file:
         try:
             # Reading ends in an error where the process died in the middle of writing a batch;
             # those before it are whole.
             for batch in pa.ipc.open_stream(file):
+                # Offsets of damaged bytes point outside of the buffer, and would be followed.
+                batch.validate(full=True)
                 batches.append(batch)
-        except (pa.ArrowInvalid, OSError):
+        except Exception:
             pass
     if not batches:
         return pd.DataFrame()
-    return pa.Table.from_batches(batches).to_pandas().set_index("row")
+    try:
+        return pa.Table.from_batches(batches).to_pandas().set_index("row")
+    except Exception as error:
+        raise TableError(f"{path} is damaged: {format_error(error)}") from error
+
+
+def _check(frame: "pd.DataFrame", folder: Path, features: tuple[str, ...]) -> None:
+    """Refuse rows that a table cannot have: missing columns, or rows missing between others."""
+    if not len(frame):
+        return
+    needed = (*features, "rho", "violated", "status")
+    missing = [name for name in needed if name not in frame.columns]
+    if missing:
+        raise TableError(f"the table in {folder} is damaged: it has no column {missing[0]!r}")
+    index = frame.index.to_numpy()
+    wrong = np.flatnonzero(index != np.arange(len(index)))
+    if len(wrong):
+        gone = "" if (folder / FINISHED).exists() else f"; {FINISHED} is missing"
+        raise TableError(
+            f"the table in {folder} is damaged: where row {wrong[0]} should be, there is "
+            f"{index[wrong[0]]}{gone}"
+        )

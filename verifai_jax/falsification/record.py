@@ -1,0 +1,135 @@
+"""The record of a run, `run.json`: everything about it but its table and its checkpoint."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.falsification.table import FINISHED, STREAM
+
+RECORD = "run.json"
+"""Name of the file with everything about a run but its table and its checkpoint."""
+FORMAT = 2
+"""Number of the format of a run's files; others are refused."""
+
+
+RECORDED = (
+    "name",
+    "formulas",
+    "search",
+    "seed",
+    "batch",
+    "stopped",
+    "compile_seconds",
+    "run_seconds",
+    "version",
+    "prior",
+    "target",
+)
+"""Entries that every record has."""
+ADDED = (
+    "budget",
+    "search_data",
+    "space_data",
+    "acceptance",
+    "precision",
+    "backend",
+    "notes",
+    "confirm",
+    "confirm_seconds",
+    "checked",
+)
+"""Entries that may be absent, as from the records of 0.1."""
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """Read the record of a run, and check that it has what a run needs.
+
+    **Raises:** `FileNotFoundError` where there is none; `ValueError` for one that is damaged or of
+    another format. Both say where the rows are, which are none the worse for it.
+    """
+    file = folder / RECORD
+    if not file.exists():
+        raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_beside(folder)}")
+    try:
+        record = json.loads(file.read_text())
+    except (ValueError, RecursionError):
+        record = None
+    if not isinstance(record, dict):
+        raise ValueError(
+            f"no run in {folder}: its {RECORD} is damaged, or of another program"
+            f"{_rows_beside(folder)}"
+        )
+    if record.get("format") != FORMAT:
+        raise ValueError(
+            f"{file} has format {record.get('format')!r}, and this version of "
+            f"verifai_jax reads format {FORMAT}: load it with the version that wrote it, "
+            f"{record.get('version', 'unknown')}"
+        )
+    for name, fits in _FORMS.items():
+        if name not in record and name in ADDED:
+            continue
+        if name not in record or not fits(record[name]):
+            what = f"has no {name!r}" if name not in record else f"has {name!r} of another form"
+            raise ValueError(f"{file} is damaged: it {what}{_rows_beside(folder)}")
+    return record
+
+
+def _rows_beside(folder: Path) -> str:
+    """Say how the rows of a folder are read without its record."""
+    if (folder / FINISHED).is_file():
+        return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"
+    if (folder / STREAM).is_file():
+        return f"; the rows are in {folder / STREAM}: vj.ErrorTable.load(folder, features)"
+    return ""
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_texts(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(each, str) for each in value)
+
+
+def _is_mapping(value: object) -> bool:
+    return value is None or isinstance(value, dict)
+
+
+_FORMS: dict[str, Callable[[Any], bool]] = {
+    "features": _is_texts,
+    "name": _is_text,
+    "formulas": lambda value: isinstance(value, dict) and all(map(_is_text, value.values())),
+    "search": _is_text,
+    "seed": _is_count,
+    "batch": _is_count,
+    "stopped": _is_text,
+    "compile_seconds": _is_number,
+    "run_seconds": _is_number,
+    "version": _is_text,
+    "prior": _is_flag,
+    "target": lambda value: True,
+    "budget": _is_count,
+    "search_data": _is_mapping,
+    "space_data": _is_mapping,
+    "acceptance": lambda value: value is None or _is_number(value),
+    "precision": lambda value: value in ("float32", "float64"),
+    "backend": lambda value: value is None or _is_text(value),
+    "notes": _is_texts,
+    "confirm": _is_flag,
+    "confirm_seconds": _is_number,
+    "checked": _is_text,
+}
+"""What each entry of a record must be."""
