@@ -1,8 +1,13 @@
 """The text of formulas: what parses, what it means, and the wording of every refusal."""
 
+import math
+import pickle
+
+import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import (
     FALSE,
     TRUE,
@@ -16,6 +21,7 @@ from verifai_jax.mtl import (
     once,
     parse,
     prev,
+    robustness,
     signal,
     simplify,
     since,
@@ -247,3 +253,68 @@ def test_latex():
         r"\left(\Diamond \left(\frac{\left\lVert\mathit{p}\right\rVert}{2} > \mathit{y} \land "
         r"\left(\lnot \left(\mathit{a}\right)\right)\right)\right)\right)"
     )
+
+
+DEEP = {
+    "parentheses": "(" * 200 + "x > 0" + ")" * 200,
+    "always": "G " * 200 + "x > 0",
+    "not": "!" * 200 + "(x > 0)",
+    "and": "(x > 0 & " * 200 + "x > 1" + ")" * 200,
+    "implies": "(x > 0 -> " * 150 + "x > 1" + ")" * 150,
+    "iff": "(x > 0 <-> " * 40 + "x > 1" + ")" * 40,
+    "sum": " + ".join(["x"] * 600) + " > 0",
+}
+
+
+@pytest.mark.parametrize("name", DEEP)
+def test_deep_texts_are_formulas_like_any_other(name):
+    f = parse(DEEP[name])
+    again = parse(str(f))
+    assert again == f
+    assert hash(again) == hash(f)
+    assert f.signals() == ("x",)
+    assert f.horizon() in (0, math.inf)
+    assert repr(f)
+    assert latex(f)
+    assert nnf(simplify(f)).signals() == ("x",)
+
+
+def test_a_formula_travels_to_other_processes():
+    f = parse("(x > 0 <-> y) -> F[0,1] x + 2 > y")
+    hash(f)
+    copy = pickle.loads(pickle.dumps(f))
+    assert copy == f
+    assert "_hash" not in pickle.loads(pickle.dumps(f)).__dict__
+
+
+@pytest.mark.parametrize("name", ["not", "and", "iff", "sum"])
+def test_deep_texts_have_a_robustness(name):
+    trace = Trace({"x": np.array([2.0, 1.5])}, dt=0.1)
+    assert np.isfinite(robustness(DEEP[name], trace))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("(" * 201 + "x > 0" + ")" * 201, "parentheses stand at most 200 deep"),
+        ("(" * 100_000, "parentheses stand at most 200 deep"),
+        ("G " * 201 + "x > 0", "operators stand at most 200 deep"),
+        ("x > 0 & " * 3000 + "x > 1", "at most 10000 words and symbols"),
+        ("-" * 5000 + "x > 0", "at most 200 minus signs"),
+        ("F[0,1e9999999] x > 0", "a time must be a finite number of seconds"),
+        ("F[0,1e99999999999999999999] x > 0", "a time must be a finite number of seconds"),
+        ("F[0," + "1" * 100_000 + "] x > 0", "a time must be a finite number of seconds"),
+        ("x > 1e999", "a number in a formula must be finite"),
+        ("x / 0 > 1", "a division by zero: x / 0"),
+        ("1 / 0 > x", "a division by zero: 1 / 0"),
+        ("F[0, nan] x > 0", "F"),
+    ],
+)
+def test_a_text_beyond_the_limits_is_refused_at_once(text, said):
+    constants = {"nan": math.nan}
+    with pytest.raises(FormulaSyntaxError) as refused:
+        parse(text, constants)
+    message = str(refused.value)
+    assert said in message
+    assert "^" in message.splitlines()[-1]
+    assert len(message) < 2000

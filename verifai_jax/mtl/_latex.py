@@ -59,11 +59,15 @@ def _expression_latex(e: Term, outer: int = 0) -> str:
             if isinstance(base, Arithmetic) and base.name == "/":
                 text = rf"\left({text}\right)"  # No fraction is a base without them.
             text = f"{text}^{{{_expression_latex(exponent)}}}"
-        case Arithmetic(("+" | "-" | "*") as name, (left, right)):
+        case Arithmetic("+" | "-" | "*" as name):
             level = PRECEDENCE[name]
-            symbol = r"\cdot" if name == "*" else name
-            right = _expression_latex(right, level + 1)
-            text = f"{_expression_latex(left, level)} {symbol} {right}"
+            # In a loop: a sum of many terms leans to the left as deep as it is long.
+            pieces: list[str] = []
+            while isinstance(e, Arithmetic) and e.name != "/" and PRECEDENCE.get(e.name) == level:
+                symbol = r"\cdot" if e.name == "*" else e.name
+                pieces.append(f" {symbol} {_expression_latex(e.arguments[1], level + 1)}")
+                e = e.arguments[0]
+            text = "".join([_expression_latex(e, level), *reversed(pieces)])
         case Arithmetic("abs", (argument,)):
             return rf"\left|{_expression_latex(argument)}\right|"
         case Arithmetic("norm", (argument,)):

@@ -161,6 +161,9 @@ class _Machine:
         self.now = now
         self.cells = cells
         self.fresh: Cells = {}
+        self._delays: dict[Formula, int] = {}
+        self._settlings: dict[Formula, int] = {}
+        self._streams: dict[tuple[Formula, int], Array] = {}
 
     def span(self, interval: ast.Interval) -> tuple[int, float]:
         a = samples(interval.start, self.dt, interval)
@@ -181,6 +184,11 @@ class _Machine:
 
     def delay(self, f: Formula) -> int:
         """Count the samples by which a stream lags behind."""
+        if f not in self._delays:
+            self._delays[f] = self._delay(f)
+        return self._delays[f]
+
+    def _delay(self, f: Formula) -> int:
         below = max((self.delay(p) for p in f.operands()), default=0)
         match f:
             case ast.Always(_, interval) | ast.Eventually(_, interval) | ast.Until(_, _, interval):
@@ -197,6 +205,11 @@ class _Machine:
 
     def settling(self, f: Formula) -> int:
         """Count the samples after which everything below has taken in a constant input."""
+        if f not in self._settlings:
+            self._settlings[f] = self._settling(f)
+        return self._settlings[f]
+
+    def _settling(self, f: Formula) -> int:
         below = max((self.settling(p) for p in f.operands()), default=0)
         match f:
             case ast.Historically(_, i) | ast.Once(_, i) | ast.Since(_, _, i):
@@ -211,7 +224,15 @@ class _Machine:
         return below
 
     def stream(self, path: str, f: Formula, sign: int) -> Array:
-        """Return the value of `f` at the instant `now - delay(f)`; anything before time 0."""
+        """Return the value of `f` at the instant `now - delay(f)`; anything before time 0.
+
+        A part that stands in several places is followed once, in the cells of the first of them.
+        """
+        if (f, sign) not in self._streams:
+            self._streams[f, sign] = self._stream(path, f, sign)
+        return self._streams[f, sign]
+
+    def _stream(self, path: str, f: Formula, sign: int) -> Array:
         self.delay(f)  # Refuses what looks ahead without end.
         match f:
             case ast.Not(p):

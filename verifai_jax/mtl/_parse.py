@@ -7,9 +7,11 @@ with the parentheses that would settle them.
 """
 
 import itertools
+import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from decimal import Decimal
+from decimal import Decimal, DecimalException
 from typing import Any
 
 from verifai_jax.core.errors import unknown_name
@@ -26,6 +28,13 @@ _UNITS = {
     "ns": Decimal("1e-9"),
     "min": Decimal(60),
 }
+MOST_TOKENS = 10_000
+"""Words and symbols that a formula's text may have."""
+
+MOST_DEEP = 200
+"""Operators, or parentheses, that may stand within each other."""
+
+_TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 _CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 _TIMED = ("always", "eventually", "historically", "once", *BINARY)
 
@@ -42,6 +51,9 @@ def parse(
     - `text`: see the grammar in the documentation; times are in seconds unless a unit follows.
     - `constants`: numbers by name, also usable as the ends of intervals.
     - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.
+
+    A text has at most 10 000 words and symbols; parentheses stand at most 200 deep within each
+    other, and so do operators, of which `<->`, `xor`, weak until and release are made of several.
 
     **Raises:** `FormulaSyntaxError`, with a caret under the place and what is expected there.
     """
@@ -63,11 +75,28 @@ def _read(text: str, constants: Mapping[str, float], known: Mapping[str, Formula
         raise TypeError(f"a formula's text is a str; got {type(text).__name__}")
     import lark
 
+    _check_size(text)
     try:
         tree = parser().parse(text)
     except lark.UnexpectedInput as error:
         raise explain_error(error, text) from None
     return _Builder(text, constants, known).formula(tree)
+
+
+def _check_size(text: str) -> None:
+    """Refuse a text with more words and symbols, or parentheses in each other, than are read."""
+    depth = 0
+    for number, token in enumerate(_TOKEN.finditer(text)):
+        depth += (token[0] == "(") - (token[0] == ")")
+        reason = ""
+        if number >= MOST_TOKENS:
+            reason = f"a formula has at most {MOST_TOKENS} words and symbols"
+        elif depth > MOST_DEEP:
+            reason = f"parentheses stand at most {MOST_DEEP} deep within each other"
+        if reason:
+            raise FormulaSyntaxError(
+                f"{reason}: name its parts by definitions", text, token.start()
+            )
 
 
 @dataclass
@@ -80,6 +109,8 @@ class _Part:
     #: In parentheses, so that nothing to the right could be thought to belong to it.
     closed: bool = False
     rule: str = ""
+    #: Minus signs in front of each other.
+    signs: int = 0
 
 
 class _Builder:
@@ -91,6 +122,8 @@ class _Builder:
         self.text = text
         self.constants = constants
         self.known = known
+
+        self.parts: dict[int, _Part] = {}
 
     def formula(self, tree: Tree) -> Formula:
         return self._formula(self._build(tree))
@@ -121,7 +154,33 @@ class _Builder:
         return part.value
 
     def _build(self, tree: Tree) -> _Part:
-        return getattr(self, f"_{tree.data}".rstrip("_"))(tree)
+        """Return the meaning of a tree, building what is below it first and without recursion."""
+        stack: list[tuple[Tree, bool]] = [(tree, False)]
+        while stack:
+            node, ready = stack.pop()
+            if id(node) in self.parts:
+                continue
+            if ready:
+                self.parts[id(node)] = self._built(node)
+                continue
+            if node.data == "iff":
+                self._refuse_powers(node)
+            stack.append((node, True))
+            below = [c for c in node.children if isinstance(c, Tree) and c.data != "interval"]
+            stack.extend((child, False) for child in reversed(below))
+        return self.parts[id(tree)]
+
+    def _built(self, tree: Tree) -> _Part:
+        try:
+            part = getattr(self, f"_{tree.data}".rstrip("_"))(tree)
+        except FormulaSyntaxError:
+            raise
+        except ValueError as error:
+            raise self._fail(str(error), *self._span(tree)) from None
+        if isinstance(part.value, Formula) and part.value.depth > MOST_DEEP:
+            reason = f"operators stand at most {MOST_DEEP} deep within each other"
+            raise self._fail(f"{reason}: name parts by definitions", part.start, part.start + 1)
+        return part
 
     def _span(self, tree: Tree) -> tuple[int, int]:
         return tree.meta.start_pos, tree.meta.end_pos
@@ -132,7 +191,6 @@ class _Builder:
     # Boolean connectives
 
     def _iff(self, tree: Tree) -> _Part:
-        self._refuse_powers(tree)
         parts, words = self._operands(tree)
         if len(words) > 1:
             raise self._chained(parts, words)
@@ -197,10 +255,19 @@ class _Builder:
             case "quoted" | "true" | "false" | "negation" | "temporal":
                 return None
             case "parens":
-                return tree if isinstance(self._build(tree).value, Expression) else None
+                return tree if self._is_arithmetic(tree) else None
             case "name":
                 return tree if str(tree.children[0]) in self.constants else None
         return tree
+
+    def _is_arithmetic(self, tree: Tree) -> bool:
+        """Return whether a tree is an expression, by its rule alone."""
+        while tree.data == "parens":
+            tree = tree.children[0]
+        if tree.data == "name":
+            name = str(tree.children[0])
+            return name in self.constants or name not in self.known
+        return tree.data not in (*_CONNECTIVES, "cmp", "true", "false")
 
     def _bin(self, tree: Tree) -> _Part:
         parts = [self._build(c) for c in tree.children[::3]]
@@ -289,12 +356,22 @@ class _Builder:
             if name in ("inf", "infinity"):
                 return float("inf")
             if name in self.constants:
-                return float(self.constants[name])
+                value = float(self.constants[name])
+                if math.isnan(value):
+                    raise self._fail(
+                        f"the end of an interval is a number; {name} is NaN", *self._span(tree)
+                    )
+                return value
             raise self._fail(
                 str(unknown_name("constant", name, ["inf", *self.constants])), *self._span(tree)
             )
         minus, number, unit = tree.children
-        value = float(Decimal(str(number)) * _UNITS[str(unit or "s")])
+        try:
+            value = float(Decimal(str(number)) * _UNITS[str(unit or "s")])
+        except (DecimalException, ValueError):
+            value = math.inf
+        if math.isinf(value):
+            raise self._fail("a time must be a finite number of seconds, or inf", *self._span(tree))
         return -value if minus else value
 
     # Comparisons and arithmetic
@@ -333,7 +410,11 @@ class _Builder:
 
     def _minus(self, tree: Tree) -> _Part:
         part = self._build(tree.children[1])
-        return _Part(-self._expression(part), *self._span(tree))
+        if part.signs >= MOST_DEEP:
+            reason = f"at most {MOST_DEEP} minus signs stand in front of each other"
+            raise self._fail(reason, part.start, part.start + 1)
+        value = -self._expression(part)
+        return _Part(value, *self._span(tree), signs=part.signs + 1)
 
     def _number(self, tree: Tree) -> _Part:
         return _Part(Number(float(tree.children[0])), *self._span(tree))
@@ -385,7 +466,7 @@ class _Builder:
 
     def _parens(self, tree: Tree) -> _Part:
         part = self._build(tree.children[0])
-        return _Part(part.value, *self._span(tree), closed=True)
+        return _Part(part.value, *self._span(tree), closed=True, signs=part.signs)
 
 
 def _edge(tree: Tree, side: int) -> Tree:

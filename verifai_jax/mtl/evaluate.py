@@ -65,6 +65,7 @@ class Evaluator:
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
+    _settled: dict[Formula, int] = field(default_factory=dict)
 
     @property
     def _last(self) -> int:
@@ -86,6 +87,11 @@ class Evaluator:
         """Return the instant from which `f` is constant under `hold`; the last sample otherwise."""
         if not self._hold:
             return self._last
+        if f not in self._settled:
+            self._settled[f] = self._settles(f)
+        return self._settled[f]
+
+    def _settles(self, f: Formula) -> int:
         below = [self.settles(part) for part in f.operands()]
         match f:
             case ast.Constant():
@@ -201,9 +207,24 @@ class Evaluator:
                 # The gradient of a square root is infinite at 0, where that of the norm is not.
                 safe = jnp.where(square == 0, 1.0, square)
                 return jnp.where(square == 0, square, jnp.sqrt(safe))
-            case Arithmetic(name, arguments):
-                return _apply(name, [self.expression(a, start, stop) for a in arguments])
+            case Arithmetic():
+                return self._arithmetic(e, start, stop)
         raise TypeError(f"not an expression: {e!r}")
+
+    def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:
+        # In a loop: a sum of many terms leans to the left as deep as it is long.
+        values: dict[int, Array | float] = {}
+        stack: list[tuple[Term, bool]] = [(e, False)]
+        while stack:
+            part, ready = stack.pop()
+            if not isinstance(part, Arithmetic) or part.name == "norm":
+                values[id(part)] = self.expression(part, start, stop)
+            elif ready:
+                values[id(part)] = _apply(part.name, [values[id(a)] for a in part.arguments])
+            elif id(part) not in values:
+                stack.append((part, True))
+                stack.extend((a, False) for a in reversed(part.arguments))
+        return values[id(e)]
 
     def _vector(self, name: str, text: str, index: int = 0) -> Array:
         signal = self.signals[name]
@@ -365,6 +386,9 @@ def _apply(name: str, values: list[Array | float]) -> Array | float:
         case "*":
             return first * others[0]
         case "/":
+            if isinstance(first, float) and isinstance(others[0], float):
+                with np.errstate(all="ignore"):  # Python's own raises.
+                    return float(np.divide(first, others[0]))
             return first / others[0]
         case "**":
             return _power(first, others[0])

@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass
 
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
+from verifai_jax.mtl.node import postorder
 from verifai_jax.mtl.words import FUNCTIONS, name_text, number_text
 
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3, "**": 4}
@@ -130,7 +131,7 @@ class Expression(Term):
         return ~formula(self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Number(Expression):
     """A constant."""
 
@@ -150,7 +151,7 @@ class Number(Expression):
         return f"({text})" if self.value < 0 and outer > 0 else text
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Signal(Expression):
     """A signal of the trace, by name. A boolean signal counts as +1 (true) and -1 (false)."""
 
@@ -177,7 +178,7 @@ class Signal(Expression):
         return name_text(self.name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Component(Expression):
     """One component of a vector signal `[time, k]`, counted from 0."""
 
@@ -206,7 +207,7 @@ class Component(Expression):
         return f"{self.vector}[{self.index}]"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Arithmetic(Expression):
     """An operator (`+ - * / ** neg`) or a function (see `FUNCTIONS`) of expressions."""
 
@@ -218,10 +219,13 @@ class Arithmetic(Expression):
         if least is not None and (n != 1 if least == 1 else n < least):
             wanted = "one argument" if least == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
+        if self.name == "/" and self.arguments[1] == Number(0.0):
+            raise ValueError(f"a division by zero: {self}")
 
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals in it, in order of appearance."""
-        return tuple(dict.fromkeys(name for part in self.arguments for name in part.signals()))
+        leaves = (part for part in postorder(self) if isinstance(part, Signal))
+        return tuple(dict.fromkeys(leaf.name for leaf in leaves))
 
     def text(self, outer: int = 0) -> str:
         """Return the text, in parentheses if its operator binds weaker than `outer`."""
@@ -235,8 +239,13 @@ class Arithmetic(Expression):
             base, exponent = (part.text(level + 1) for part in self.arguments)
             text = f"{base}**{exponent}"
         else:
-            left, right = self.arguments
-            text = f"{left.text(level)} {self.name} {right.text(level + 1)}"
+            # In a loop: a sum of many terms leans to the left as deep as it is long.
+            node: Expression = self
+            pieces: list[str] = []
+            while isinstance(node, Arithmetic) and PRECEDENCE.get(node.name) == level:
+                pieces.append(f" {node.name} {node.arguments[1].text(level + 1)}")
+                node = node.arguments[0]
+            text = "".join([node.text(level), *reversed(pieces)])
         return f"({text})" if level < outer else text
 
 

@@ -16,10 +16,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
+from verifai_jax.mtl.node import Node, postorder
 from verifai_jax.mtl.words import Text, number_text, operator_text
 
 
-class Term(abc.ABC):
+class Term(Node, abc.ABC):
     """A number at every instant, which predicates compare; made as an `Expression`."""
 
     @abc.abstractmethod
@@ -72,7 +73,7 @@ EVERYTHING = Interval()
 """The interval of an operator that is written without one."""
 
 
-class Formula:
+class Formula(Node):
     """A property of a trace at every instant, true or false, with a margin (its robustness)."""
 
     children: ClassVar[tuple[str, ...]] = ()
@@ -151,8 +152,7 @@ class Formula:
 
         - `dt`: sampling period in seconds, by which `next` looks ahead.
         """
-        below = max((part.horizon(dt) for part in self.operands()), default=0.0)
-        return below + self._reach(dt)[1]
+        return self._total_reach(dt, 1)
 
     def history(self, dt: float = 0.0) -> float:
         """Return the seconds of trace before an instant on which its truth there depends.
@@ -161,8 +161,24 @@ class Formula:
 
         - `dt`: sampling period in seconds, by which `prev` looks back.
         """
-        below = max((part.history(dt) for part in self.operands()), default=0.0)
-        return below + self._reach(dt)[0]
+        return self._total_reach(dt, 0)
+
+    def _total_reach(self, dt: float, side: int) -> float:
+        reach: dict[int, float] = {}
+        for part in postorder(self):
+            if isinstance(part, Formula):
+                below = max((reach[id(p)] for p in part.operands()), default=0.0)
+                reach[id(part)] = below + part._reach(dt)[side]
+        return reach[id(self)]
+
+    @property
+    def depth(self) -> int:
+        """Operators that stand within each other; 0 for a leaf."""
+        for part in postorder(self, "_depth"):
+            if isinstance(part, Formula):
+                below = [p.__dict__["_depth"] + 1 for p in part.operands()]
+                object.__setattr__(part, "_depth", max(below, default=0))
+        return self.__dict__["_depth"]
 
     def _reach(self, dt: float) -> tuple[float, float]:
         """Return how many seconds the operator itself looks back and ahead."""
@@ -177,10 +193,15 @@ class Formula:
         return tuple(parts)
 
     def subformulas(self) -> Iterator["Formula"]:
-        """Yield itself and everything below, parents first, left to right, with repetitions."""
-        yield self
-        for part in self.operands():
-            yield from part.subformulas()
+        """Yield itself and everything below, parents first, left to right, each part once."""
+        seen: set[int] = set()
+        stack: list[Formula] = [self]
+        while stack:
+            part = stack.pop()
+            if id(part) not in seen:
+                seen.add(id(part))
+                yield part
+                stack.extend(reversed(part.operands()))
 
     def __bool__(self) -> bool:
         raise TypeError(
@@ -198,7 +219,7 @@ class Formula:
         return self.text().text
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Constant(Formula):
     """`TRUE` (robustness +inf) or `FALSE` (-inf)."""
 
@@ -209,7 +230,7 @@ class Constant(Formula):
         return Text("TRUE" if self.value else "FALSE", "name")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Predicate(Formula):
     """A comparison; its robustness is the margin by which it holds."""
 
@@ -233,7 +254,7 @@ class Predicate(Formula):
         return Text(f"{self.left} {self.comparison} {self.right}", "leaf")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Atom(Formula):
     """A bare expression that is its own robustness; it holds where it is positive."""
 
@@ -257,7 +278,7 @@ class Atom(Formula):
         return Text(text, "name" if self.expression.is_signal else "leaf")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Not(Formula):
     """`!f`."""
 
@@ -265,7 +286,7 @@ class Not(Formula):
     children: ClassVar[tuple[str, ...]] = ("operand",)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class And(Formula):
     """`f & g & ...`, two operands or more."""
 
@@ -273,7 +294,7 @@ class And(Formula):
     children: ClassVar[tuple[str, ...]] = ("parts",)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Or(Formula):
     """`f | g | ...`, two operands or more."""
 
@@ -281,7 +302,7 @@ class Or(Formula):
     children: ClassVar[tuple[str, ...]] = ("parts",)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Always(Formula):
     """`f` at every instant of the interval ahead."""
 
@@ -293,7 +314,7 @@ class Always(Formula):
         return 0.0, self.interval.end
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Eventually(Formula):
     """`f` at some instant of the interval ahead."""
 
@@ -305,7 +326,7 @@ class Eventually(Formula):
         return 0.0, self.interval.end
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Historically(Formula):
     """`f` at every instant of the interval behind."""
 
@@ -317,7 +338,7 @@ class Historically(Formula):
         return self.interval.end, 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Once(Formula):
     """`f` at some instant of the interval behind."""
 
@@ -329,7 +350,7 @@ class Once(Formula):
         return self.interval.end, 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Next(Formula):
     """`f` at the next sample; at the last one, `f` there, whatever the end of trace."""
 
@@ -340,7 +361,7 @@ class Next(Formula):
         return 0.0, dt
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prev(Formula):
     """`f` at the previous sample; where there is none, false (or true, if `weak`)."""
 
@@ -352,7 +373,7 @@ class Prev(Formula):
         return dt, 0.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Until(Formula):
     """`right` at some instant of the interval ahead, and `left` at every one before it."""
 
@@ -365,7 +386,7 @@ class Until(Formula):
         return 0.0, self.interval.end
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Since(Formula):
     """`right` at some instant of the interval behind, and `left` at every one after it."""
 

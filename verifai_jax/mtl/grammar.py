@@ -12,6 +12,10 @@ BINARY = ("until", "weak_until", "release", "since")
 """Operators between two operands."""
 
 
+_SHOWN = 400
+"""Characters of a text that an error shows at most."""
+
+
 class FormulaSyntaxError(ValueError):
     """A text that is not a formula; the message shows the place and what to write instead.
 
@@ -24,6 +28,10 @@ class FormulaSyntaxError(ValueError):
         line = before.count("\n")
         shown = text.split("\n")[line]
         column = position - (before.rfind("\n") + 1)
+        if len(shown) > _SHOWN:
+            # Around the place alone: a text may be as long as a book.
+            cut = max(0, column - _SHOWN // 2)
+            shown, column = shown[cut : cut + _SHOWN], column - cut
         carets = "^" * max(1, min(width, len(shown) - column))
         super().__init__(f"{reason}\n  {shown}\n  {' ' * column}{carets}")
 

@@ -18,7 +18,7 @@ def nnf(f: Formula) -> Formula:
     its own, so that one case stays `!(f until g)` with `f` and `g` in normal form; the same for
     since.
     """
-    return _nnf(f, positive=True)
+    return _nnf(f, True, {})
 
 
 _OPPOSITE = {">": "<=", ">=": "<", "<": ">=", "<=": ">", "==": "!=", "!=": "=="}
@@ -30,7 +30,14 @@ _DUAL: dict[type, type] = {
 }
 
 
-def _nnf(f: Formula, positive: bool) -> Formula:
+def _nnf(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Formula]) -> Formula:
+    # Each part once, wherever it stands: `f <-> g` holds both sides twice.
+    if (f, positive) not in known:
+        known[f, positive] = _nnf_node(f, positive, known)
+    return known[f, positive]
+
+
+def _nnf_node(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Formula]) -> Formula:
     match f:
         case ast.Constant(value):
             return TRUE if value == positive else FALSE
@@ -39,16 +46,16 @@ def _nnf(f: Formula, positive: bool) -> Formula:
         case ast.Atom():
             return f if positive else ast.Not(f)
         case ast.Not(operand):
-            return _nnf(operand, not positive)
+            return _nnf(operand, not positive, known)
         case ast.And(parts) | ast.Or(parts):
             kind = ast.And if isinstance(f, ast.And) == positive else ast.Or
-            return kind(tuple(_nnf(part, positive) for part in parts))
+            return kind(tuple(_nnf(part, positive, known) for part in parts))
         case ast.Next(operand):
-            return ast.Next(_nnf(operand, positive))
+            return ast.Next(_nnf(operand, positive, known))
         case ast.Prev(operand, weak):
-            return ast.Prev(_nnf(operand, positive), weak == positive)
+            return ast.Prev(_nnf(operand, positive, known), weak == positive)
         case ast.Until(left, right, interval) | ast.Since(left, right, interval):
-            kept = type(f)(_nnf(left, True), _nnf(right, True), interval)
+            kept = type(f)(_nnf(left, True, known), _nnf(right, True, known), interval)
             return kept if positive else ast.Not(kept)
         case (
             ast.Always(operand, interval)
@@ -57,7 +64,7 @@ def _nnf(f: Formula, positive: bool) -> Formula:
             | ast.Once(operand, interval)
         ):
             kind = type(f) if positive else _DUAL[type(f)]
-            return kind(_nnf(operand, positive), interval)
+            return kind(_nnf(operand, positive, known), interval)
     raise TypeError(f"not a formula: {f!r}")
 
 
@@ -68,7 +75,18 @@ def simplify(f: Formula) -> Formula:
     `eventually eventually`, and operators over `[0,0]`. Windows cut at the end of a trace
     (`end="truncate"`) may tell the nested windows apart where one is empty.
     """
-    f = rebuild(f, tuple(simplify(part) for part in f.operands()))
+    return _simplified(f, {})
+
+
+def _simplified(f: Formula, known: dict[Formula, Formula]) -> Formula:
+    # Each part once, wherever it stands: `f <-> g` holds both sides twice.
+    if f not in known:
+        operands = tuple(_simplified(part, known) for part in f.operands())
+        known[f] = _simplified_node(rebuild(f, operands))
+    return known[f]
+
+
+def _simplified_node(f: Formula) -> Formula:
     match f:
         case ast.Not(ast.Not(inner)):
             return inner
