@@ -45,12 +45,22 @@ FLUSH_BYTES = 1 << 18
 """Size from which waiting results are sent at once."""
 SHORTEST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
 """Seconds between two attempts to connect."""
+GREETING_SECONDS = 10.0
+"""Seconds within which a server must say hello."""
+GREETING_BYTES, MOST_BYTES = 1 << 16, 16 << 20
+"""Bytes of a server's hello, and of any later message, beyond which it is none."""
+MOST_LOGGED = 20
+"""Errors of one server that are logged."""
 RESERVED = ("dt", "times", "valid")
 """Names in a result that are no signals."""
 
 
 class Refused(ConnectionError):
     """An error of a server that does not want this client, and will not another time."""
+
+
+class Full(ConnectionError):
+    """An error of a server that has no room for this client now, but may have another time."""
 
 
 class Waveform:
@@ -110,7 +120,8 @@ def serve(
       to try before giving up; or False.
     - `name`: what the server's log calls this client.
 
-    **Raises:** `Refused` for a wrong token or another protocol; `ConnectionError` when no run could
+    **Raises:** `Refused` for a wrong token, another protocol, or something that is no run of
+    verifai_jax; `ConnectionError` when no run could
     be reached at all and `reconnect` allows no more tries.
     """
     token = os.environ.get("VERIFAI_JAX_TOKEN") if token is None else token
@@ -155,6 +166,8 @@ class _Connection:
         self.welcome = False  # Whether the server has handed out a point.
         self.capacity = capacity
         self._received = bytearray()
+        self._most = GREETING_BYTES
+        self._told = 0
         self._points: deque[dict[str, Any]] = deque()
         self._unsent: list[bytes] = []
         try:
@@ -166,12 +179,14 @@ class _Connection:
                     self.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
             self._greet(token, name)
             self.socket.settimeout(None)
+            self._most = MOST_BYTES
         except BaseException:
             self.socket.close()
             raise
 
     def work(self, simulate: Callable[[dict[str, Any], int], Any]) -> None:
         """Simulate until the server closes the connection."""
+        self._take_up()  # What came along with its hello.
         flushed = time.monotonic()
         while True:
             while not self._points:
@@ -189,13 +204,15 @@ class _Connection:
                     self._receive()
 
     def _greet(self, token: str | None, name: str | None) -> None:
-        while not (hello := self._frame()):
+        deadline = time.monotonic() + GREETING_SECONDS
+        while (hello := self._frame()) is None:
+            self.socket.settimeout(max(deadline - time.monotonic(), 1e-3))
             self._read()
         if hello.get("type") == "error":
-            raise Refused(f"the server refuses: {hello.get('message')}")
+            raise _refusal(hello)
         if hello.get("type") != "hello" or hello.get("protocol") != PROTOCOL:
-            spoken = hello.get("protocol")
-            raise Refused(f"this client speaks protocol {PROTOCOL}, the server {spoken!r}")
+            spoken = plain(hello.get("protocol"))
+            raise Refused(f"this client speaks protocol {PROTOCOL}, the server {spoken}")
         greeting: dict[str, Any] = {
             "type": "hello",
             "protocol": PROTOCOL,
@@ -217,17 +234,24 @@ class _Connection:
     def _receive(self) -> None:
         """Wait for messages, and take up those that have come."""
         self._read()
-        while message := self._frame():
+        self._take_up()
+
+    def _take_up(self) -> None:
+        while (message := self._frame()) is not None:
             match message.get("type"):
                 case "work":
                     self.welcome = True
-                    self._points.extend(message["points"])
+                    self._points.extend(_points_of(message))
+                    if len(self._points) > self.capacity:
+                        raise _no_run(f"it hands out more than {self.capacity} points")
                 case "bye":
                     raise EOFError("the run has ended")
                 case "error":
-                    log.warning("the server says: %s", message.get("message"))
+                    self._told += 1
+                    if self._told <= MOST_LOGGED:
+                        log.warning("the server says: %s", plain(message.get("message")))
                     if message.get("fatal") and not self.welcome:
-                        raise Refused(f"the server refuses: {message.get('message')}")
+                        raise _refusal(message)
 
     def _read(self) -> None:
         data = self.socket.recv(1 << 18)
@@ -238,12 +262,55 @@ class _Connection:
     def _frame(self) -> dict[str, Any] | None:
         if len(self._received) < 4:
             return None
-        end = 4 + struct.unpack_from(">I", self._received)[0]
+        length = struct.unpack_from(">I", self._received)[0]
+        if length > self._most:
+            raise _no_run(f"it announces {length} bytes, more than {self._most}")
+        end = 4 + length
         if len(self._received) < end:
             return None
         text = bytes(self._received[4:end])
         del self._received[:end]
-        return json.loads(text)
+        try:
+            message = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise _no_run(f"it sends no JSON ({error})") from None
+        if not isinstance(message, dict):
+            raise _no_run(f"it sends {plain(message)}, no object")
+        return message
+
+
+def _points_of(message: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the points of a `work` message.
+
+    **Raises:** `Refused` where they are not as they should be.
+    """
+    points = message.get("points")
+    if not isinstance(points, list):
+        raise _no_run("it sends work without points")
+    for point in points:
+        if not isinstance(point, dict) or not isinstance(point.get("features"), dict):
+            raise _no_run("it sends a point without features")
+        if not (isinstance(point.get("id"), int) and isinstance(point.get("seed"), int)):
+            raise _no_run("it sends a point without an integer id and seed")
+    return points
+
+
+def _refusal(message: dict[str, Any]) -> ConnectionError:
+    kind = Full if message.get("retry") is True else Refused
+    return kind(f"the server refuses: {plain(message.get('message'))}")
+
+
+def _no_run(why: str) -> Refused:
+    return Refused(f"what answers there is no run of verifai_jax: {why}")
+
+
+def plain(text: object) -> str:
+    """Write a server's text in one line that cannot garble a log or a terminal."""
+    if not isinstance(text, str):
+        short = text is None or isinstance(text, bool | int | float)
+        text = repr(text) if short else f"a {type(text).__name__}"
+    line = "".join(c if c.isprintable() else " " for c in text[:301])
+    return line if len(line) <= 300 else f"{line[:297]}..."
 
 
 def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], Any]) -> bytes:

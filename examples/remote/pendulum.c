@@ -18,6 +18,7 @@
 
 #define SAMPLES 200
 #define DT 0.02
+#define MOST (1 << 20) /* Bytes of a message. */
 
 static int dial(const char *host, const char *port) {
     struct addrinfo hints = {.ai_socktype = SOCK_STREAM}, *found, *a;
@@ -31,29 +32,34 @@ static int dial(const char *host, const char *port) {
     return s;
 }
 
-static void whole(int s, char *data, size_t n, int sending) {
+/* Whether all of it was sent or received. */
+static int whole(int s, char *data, size_t n, int sending) {
     while (n > 0) {
         ssize_t k = sending ? send(s, data, n, MSG_NOSIGNAL) : recv(s, data, n, 0);
-        if (k <= 0) { fprintf(stderr, "the run has ended\n"); exit(0); }
+        if (k <= 0) return 0;
         data += k, n -= (size_t)k;
     }
+    return 1;
 }
 
 /* A frame: its length in 4 bytes, big-endian, and its JSON. */
 static void put(int s, char *text) {
     size_t n = strlen(text);
     unsigned char head[4] = {n >> 24, n >> 16, n >> 8, n};
-    whole(s, (char *)head, 4, 1);
-    whole(s, text, n, 1);
+    if (whole(s, (char *)head, 4, 1)) whole(s, text, n, 1);
 }
 
+/* The next message, until the one after it; NULL where the connection has ended. */
 static char *get(int s) {
+    static char text[MOST + 1];
     unsigned char head[4];
-    whole(s, (char *)head, 4, 0);
+    if (!whole(s, (char *)head, 4, 0)) return NULL;
     size_t n = (size_t)head[0] << 24 | head[1] << 16 | head[2] << 8 | head[3];
-    char *text = malloc(n + 1);
-    if (!text) exit(1);
-    whole(s, text, n, 0);
+    if (n > MOST) {
+        fprintf(stderr, "no run of verifai_jax: it announces %zu bytes\n", n);
+        exit(1);
+    }
+    if (!whole(s, text, n, 0)) return NULL;
     text[n] = 0;
     return text;
 }
@@ -69,6 +75,10 @@ static void simulate(int s, const char *point) {
     static char text[SAMPLES * 60 + 200];
     double theta[SAMPLES], omega[SAMPLES];
     double angle = number(point, "theta0"), rate = 0, length = number(point, "length");
+    if (!(number(point, "id") >= 0 && number(point, "id") < 1e15)) {
+        fprintf(stderr, "no run of verifai_jax: it sends a point without an id\n");
+        exit(1);
+    }
     if (isnan(angle) || !(length > 0)) {
         snprintf(text, sizeof text, "{\"type\":\"result\",\"id\":%.0f,"
                  "\"error\":\"the pendulum needs theta0 and length\"}", number(point, "id"));
@@ -89,19 +99,36 @@ static void simulate(int s, const char *point) {
     put(s, text);
 }
 
-int main(int argc, char **argv) {
-    char hello[512];
-    if (argc < 3) { fprintf(stderr, "usage: %s HOST PORT [TOKEN]\n", argv[0]); return 2; }
-    int s = dial(argv[1], argv[2]);
-    if (s < 0) { fprintf(stderr, "nothing listens at %s port %s\n", argv[1], argv[2]); return 1; }
-    free(get(s)); /* the server's hello */
+/* Simulate until the connection ends; whether it is worth trying again, as the run had no room. */
+static int serve(int s, const char *token) {
+    char hello[512], *message = get(s);
     snprintf(hello, sizeof hello, "{\"type\":\"hello\",\"protocol\":1,\"name\":\"pendulum.c\"%s%s%s}",
-             argc > 3 ? ",\"token\":\"" : "", argc > 3 ? argv[3] : "", argc > 3 ? "\"" : "");
-    put(s, hello);
-    for (;;) {
-        char *message = get(s);
-        if (strstr(message, "\"type\":\"work\"")) simulate(s, message);
-        else if (strstr(message, "\"type\":\"error\"")) fprintf(stderr, "%s\n", message);
-        free(message);
+             token ? ",\"token\":\"" : "", token ? token : "", token ? "\"" : "");
+    if (!message) return 1; /* Dropped before it could say hello. */
+    if (strstr(message, "\"type\":\"hello\"")) {
+        put(s, hello);
+        message = get(s);
     }
+    for (; message; message = get(s)) {
+        if (strstr(message, "\"type\":\"work\"")) simulate(s, message);
+        else if (strstr(message, "\"type\":\"error\"")) {
+            for (char *c = message; *c; c++) if (*c < 32 || *c > 126) *c = ' ';
+            fprintf(stderr, "%.300s\n", message);
+            if (strstr(message, "\"retry\":true")) return 1;
+        }
+    }
+    return 0;
+}
+
+int main(int argc, char **argv) {
+    if (argc < 3) { fprintf(stderr, "usage: %s HOST PORT [TOKEN]\n", argv[0]); return 2; }
+    for (int again = 1, tries = 0; again; sleep(again), tries++) {
+        int s = dial(argv[1], argv[2]);
+        if (s < 0 && tries > 0) break;
+        if (s < 0) { fprintf(stderr, "nothing listens at %s port %s\n", argv[1], argv[2]); return 1; }
+        again = serve(s, argc > 3 ? argv[3] : NULL);
+        close(s);
+    }
+    fprintf(stderr, "the run has ended\n");
+    return 0;
 }

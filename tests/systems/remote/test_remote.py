@@ -788,12 +788,22 @@ def test_four_clients_one_killed_one_that_sends_garbage(tmp_path):
         np.testing.assert_array_equal(table[column], same[column])
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
-def test_the_client_in_c(tmp_path):
-    program = tmp_path / "pendulum"
+@pytest.fixture(scope="module")
+def program(tmp_path_factory):
+    """The client in C, with the compiler's checks of memory where there are some."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc")
+    program = tmp_path_factory.mktemp("c") / "pendulum"
     source = ROOT / "examples" / "remote" / "pendulum.c"
     options = ["-O1", "-Wall", "-Wextra", "-Werror", "-o", program, source, "-lm"]
-    subprocess.run(["gcc", *options], check=True, timeout=60)
+    checks = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    if subprocess.run(["gcc", *checks, *options], capture_output=True, timeout=60).returncode:
+        subprocess.run(["gcc", *options], check=True, timeout=60)
+    return program
+
+
+def test_the_client_in_c(program):
+    source = ROOT / "examples" / "remote" / "pendulum.c"
     sys.path.insert(0, str(source.parent))
     try:
         from pendulum import simulate
@@ -850,3 +860,163 @@ def test_a_client_gives_up_where_there_is_no_run():
         port = free.getsockname()[1]
     with pytest.raises(ConnectionError, match=f"no run at 127.0.0.1:{port} to simulate for"):
         remote_client.serve(constant, port=port, reconnect=0.2)
+
+
+# Attacks
+
+
+def test_connections_that_say_nothing_shut_nobody_out(system, monkeypatch):
+    monkeypatch.setattr(server, "MOST_CLIENTS", 4)
+    silent = [socket.create_connection(system.address, timeout=10) for _ in range(20)]
+    with answering(system):
+        outcomes = Asked(system, 3).all()
+    assert [outcome.message for outcome in outcomes] == [""] * 3
+    assert len(system._open().clients) <= 5
+    for each in silent:
+        each.close()
+
+
+def test_a_full_server_is_tried_again(system, monkeypatch, program):
+    monkeypatch.setattr(server, "MOST_CLIENTS", 2)
+    peers = [Peer(system.address) for _ in range(2)]
+    until(lambda: len(system.clients) == 2)
+    refused = Peer(system.address, greet=False)
+    assert refused.hello == {
+        "type": "error",
+        "message": "there are 2 clients already",
+        "id": None,
+        "fatal": True,
+        "retry": True,
+    }
+    with pytest.raises(ConnectionError, match="to simulate for: the server refuses: there are 2"):
+        remote_client.serve(constant, *system.address, reconnect=0.1)
+    client = subprocess.Popen(
+        [program, "127.0.0.1", str(system.address[1])], stderr=subprocess.PIPE, text=True
+    )
+    assert "there are 2 clients already" in client.stderr.readline()
+    peers[0].close()
+    until(lambda: any("pendulum.c" in name for name in system.clients))
+    system.close()
+    assert client.wait(timeout=10) == 0
+    client.stderr.close()
+
+
+def test_the_memory_of_all_clients_is_bounded(caplog):
+    options = {"most_bytes": 1 << 20, "most_memory": 2 << 20}
+    with remote(signals=("x",), dt=0.1, length=3, retries=0, **options) as system:
+        hogs = [Peer(system.address) for _ in range(6)]
+        until(lambda: len(system.clients) == 6)
+        asked = Asked(system, 6)
+        for hog in hogs:
+            hog.points(1)
+            with contextlib.suppress(OSError):
+                hog.socket.sendall(struct.pack(">I", 1 << 20) + b"x" * 900_000)
+        until(lambda: len(system.clients) == 2)
+        assert sum(client.held for client in list(system._open().clients)) <= 2 << 20
+        message = hogs[0].get()
+        assert message["retry"]
+        assert "messages of all clients hold more than 2097152 bytes" in message["message"]
+        # The honest one has all points that theirs had; the last two lose them when they end.
+        with answering(system):
+            until(lambda: len(asked.outcomes) == 4)
+            for hog in hogs:
+                hog.close()
+            outcomes = asked.all()
+    assert sorted(outcome.message for outcome in outcomes)[:4] == [""] * 4
+
+
+def test_a_header_that_waits_for_its_raw_bytes_is_not_kept_parsed():
+    frames = wire.Frames(1 << 20)
+    header = b'{"type":"result","bytes":8,"a":[' + b"[]," * 10_000 + b"0]}"
+    data = struct.pack(">I", len(header)) + header + bytes(8)
+    assert list(frames.feed(data[:-1])) == []
+    assert len(frames) == len(data) - 1
+    (message,) = frames.feed(data[-1:])
+    assert message.raw == bytes(8)
+    assert len(frames) == 0
+
+
+def framed(text):
+    return struct.pack(">I", len(text)) + text
+
+
+HELLO = framed(b'{"type":"hello","protocol":1,"challenge":null}')
+HOSTILE = {
+    "HTTP": (b"HTTP/1.1 400 Bad Request\r\n\r\n", "announces 1213486160 bytes"),
+    "no JSON": (framed(b"what?"), "it sends no JSON"),
+    "no UTF-8": (framed(b"\xff\xfe\xfd"), "it sends no JSON"),
+    "a list": (framed(b"[1, 2]"), "it sends a list, no object"),
+    "deep": (framed(b"[" * 60_000), "it sends no JSON"),
+    "huge": (struct.pack(">I", 2**32 - 1) + b"x" * 100_000, "announces 4294967295 bytes"),
+    "protocol": (framed(b'{"type":"hello","protocol":[[3]]}'), "the server a list"),
+    "escape": (framed(rb'{"type":"error","message":"\u001b[2J\nno"}'), "refuses:  [2J no"),
+    "long": (framed(b'{"type":"error","message":"' + b"a" * 60_000 + b'"}'), "aaa\\.\\.\\.$"),
+    "no points": (HELLO + framed(b'{"type":"work"}'), "it sends work without points"),
+    "texts": (HELLO + framed(b'{"type":"work","points":["a"]}'), "a point without features"),
+    "no id": (
+        HELLO + framed(b'{"type":"work","points":[{"features":{},"seed":1}]}'),
+        "a point without an integer id and seed",
+    ),
+    "many": (
+        HELLO
+        + framed(
+            b'{"type":"work","points":['
+            + b",".join([b'{"id":1,"seed":1,"features":{}}'] * 40)
+            + b"]}"
+        ),
+        "hands out more than 32 points",
+    ),
+    "later": (HELLO + struct.pack(">I", 1 << 30), "announces 1073741824 bytes"),
+}
+
+
+@contextlib.contextmanager
+def pretending(data):
+    """A server that is none: it sends `data` to whoever connects, and closes."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    peer, _ = listening.accept()
+                    with peer, contextlib.suppress(OSError):
+                        peer.settimeout(5)
+                        peer.sendall(data)
+                        peer.shutdown(socket.SHUT_WR)
+                        while peer.recv(4096):
+                            pass
+
+        threading.Thread(target=serve, daemon=True).start()
+        yield listening.getsockname()
+        listening.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_server_that_is_none_ends_the_client_with_a_line(name):
+    data, match = HOSTILE[name]
+    match = match if match.endswith("$") else re.escape(match)
+    with pretending(data) as address, pytest.raises(remote_client.Refused, match=match) as refused:
+        remote_client.serve(constant, *address, reconnect=5)
+    assert "\n" not in str(refused.value)
+    assert "\x1b" not in str(refused.value)
+    assert len(str(refused.value)) < 400
+
+
+def test_a_server_that_is_slow_to_say_hello_is_given_up(monkeypatch):
+    monkeypatch.setattr(remote_client, "GREETING_SECONDS", 0.2)
+    timed_out = pytest.raises(ConnectionError, match=r"no run at .* timed out")
+    with socket.create_server(("127.0.0.1", 0)) as listening, timed_out:
+        remote_client.serve(constant, *listening.getsockname(), reconnect=False)
+
+
+@pytest.mark.parametrize("name", ["HTTP", "no JSON", "deep", "huge", "no id", "later", "escape"])
+def test_a_server_that_is_none_cannot_crash_the_client_in_c(program, name):
+    data, _ = HOSTILE[name]
+    with pretending(data) as (_, port):
+        done = subprocess.run(
+            [program, "127.0.0.1", str(port)], capture_output=True, text=True, timeout=10
+        )
+    assert done.returncode in (0, 1)
+    assert len(done.stderr.splitlines()) <= 2
+    assert "Sanitizer" not in done.stderr
+    assert "\x1b" not in done.stderr

@@ -37,6 +37,8 @@ log = logging.getLogger("verifai_jax.remote")
 
 MOST_BYTES = 16 << 20
 """Bytes of one message of a client, unless `remote` is given another limit."""
+MOST_MEMORY = 256 << 20
+"""Bytes of unfinished messages of all clients together, unless `remote` is given another limit."""
 LOOPBACKS = ("127.0.0.1", "::1")
 """Addresses of this machine, by IPv4 and IPv6."""
 
@@ -149,6 +151,7 @@ def remote(
     dt: float | None = None,
     length: int | None = None,
     most_bytes: int = MOST_BYTES,
+    most_memory: int = MOST_MEMORY,
 ) -> Remote:
     """Make a system that programs simulate which connect to this one.
 
@@ -167,6 +170,8 @@ def remote(
     - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
       sends another gets an error, and the row has status `error`.
     - `most_bytes`: of one message from a client.
+    - `most_memory`: bytes of unfinished messages of all clients together, at least `most_bytes`;
+      beyond it the client whose message began first is sent away, and may come back.
 
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
 
@@ -185,13 +190,18 @@ def remote(
     check_count("retries", retries, 0)
     if not isinstance(most_bytes, int) or not 1024 <= most_bytes < 2**31:
         raise ValueError(f"most_bytes must be an integer from 1024 to 2**31 - 1; got {most_bytes}")
+    if not isinstance(most_memory, int) or most_memory < most_bytes:
+        raise ValueError(
+            f"most_memory must be an integer of at least most_bytes={most_bytes}; got {most_memory}"
+        )
     if token is None and not all(_is_loopback(place[4][0]) for place in _places(host, port)):
         raise ValueError(
             f"host {host!r} is open to other machines, and whoever connects answers for the "
             "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
         )
     declared = TraceForm(signals, dt, length)
-    return Remote(host, port, Rules(token, timeout, retries, patience, most_bytes, declared))
+    rules = Rules(token, timeout, retries, patience, most_bytes, declared, most_memory)
+    return Remote(host, port, rules)
 
 
 def _text(features: Features, seed: int) -> bytes:

@@ -27,6 +27,8 @@ SWIFT, SLOW = 0.05, 0.2
 """Seconds from a point to its result below which a client's window grows, and above which it
 shrinks: enough points wait at a fast client to keep it busy, and none at a slow one while others
 are idle."""
+WORK_BYTES = 1 << 18
+"""Bytes of a message of points from which the others go into another one."""
 REMEMBERED = 4096
 """Answered points that a client may answer again without an error."""
 
@@ -41,6 +43,7 @@ class Rules:
     patience: float | None
     most_bytes: int
     declared: TraceForm
+    most_memory: int
 
 
 @dataclass(eq=False)
@@ -86,6 +89,12 @@ class Client:
         self.answered: dict[int, None] = {}
         self.progress = 0.0  # When it last showed that it works.
         self.faults = 0
+        self.began = math.inf  # When its unfinished message began.
+
+    @property
+    def held(self) -> int:
+        """The bytes that are kept for it: of an unfinished message, and of what it has not read."""
+        return len(self.frames) + len(self.out)
 
     @property
     def here(self) -> bool:
@@ -159,8 +168,12 @@ class Client:
                 self.progress = now
             point.handed, point.ahead = now, len(self.has)
             self.has[point.id] = point
-        texts = b",".join(point.text for point in points)
-        self.out += wire.frame(b'{"type":"work","points":[' + texts + b"]}")
+        texts: list[bytes] = []
+        for last, point in enumerate(points, 1 - len(points)):
+            texts.append(point.text)
+            if last == 0 or sum(map(len, texts)) > WORK_BYTES:
+                self.out += wire.frame(b'{"type":"work","points":[' + b",".join(texts) + b"]}")
+                texts = []
 
     def done(self, point: Point, now: float) -> None:
         """Take back a point that the client has answered."""
@@ -187,9 +200,13 @@ class Client:
             if now - point.handed > timeout * (1 + point.ahead // self.parallel)
         ]
 
-    def tell(self, message: str, number: int | None = None, fatal: bool = False) -> None:
-        """Send the client an error."""
+    def tell(
+        self, message: str, number: int | None = None, fatal: bool = False, retry: bool = False
+    ) -> None:
+        """Send the client an error; with `retry` one that will not be there another time."""
         about = {"type": "error", "message": message, "id": number, "fatal": fatal}
+        if retry:
+            about["retry"] = True
         self.out += wire.frame(about)
 
     def flush(self) -> None:

@@ -8,6 +8,7 @@ inbox and takes outcomes from a queue. What goes over the wire is `wire`'s.
 import contextlib
 import itertools
 import logging
+import math
 import queue
 import selectors
 import socket
@@ -30,6 +31,8 @@ MOST_LOGGED = 20
 """Faults of one client that are logged."""
 MOST_UNREAD = 1 << 20
 """Bytes that a client may leave unread while it gives cause for more."""
+UNCOUNTED = 1 << 16
+"""Bytes that a client may hold without that those of all are counted."""
 MOST_CLIENTS = 256
 """Clients that may be connected at a time."""
 REMINDER = 10.0
@@ -155,14 +158,41 @@ class Server(threading.Thread):
         except OSError:  # It is gone already.
             sock.close()
             return
+        if len(self.clients) >= MOST_CLIENTS:
+            self._make_room()
+        full = len(self.clients) >= MOST_CLIENTS
         client = Client(sock, address)
         self.clients.add(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
-        if len(self.clients) > MOST_CLIENTS:
-            self._send_away(client, f"there are {MOST_CLIENTS} clients already")
+        if full:
+            self._send_away(client, f"there are {MOST_CLIENTS} clients already", retry=True)
         else:
             client.hello(self.rules)
         self._flush(client)
+
+    def _make_room(self) -> None:
+        """Drop the oldest connection that is no client, if there is one.
+
+        Connections that say nothing must not shut out those that do.
+        """
+        others = [client for client in self.clients if not client.here]
+        if others:
+            oldest = min(others, key=lambda client: client.since)
+            self._drop(oldest, "was dropped for another, as it had not said hello")
+
+    def _bound_memory(self) -> None:
+        """Send away whoever keeps a message unfinished longest while all hold too much."""
+        while sum(client.held for client in self.clients) > self.rules.most_memory:
+            client = min(self.clients, key=lambda client: (client.began, -client.held))
+            # It may be as honest as the others, so its points have lost nothing but time.
+            self.waiting.extendleft(reversed(client.has.values()))
+            client.has.clear()
+            why = f"messages of all clients hold more than {self.rules.most_memory} bytes"
+            if client.leaving or len(client.out) > MOST_UNREAD:
+                self._drop(client, f"was dropped: {why}")
+            else:
+                self._send_away(client, why, retry=True)
+                self._flush(client)
 
     def _attend(self, client: Client, events: int) -> None:
         try:
@@ -173,6 +203,8 @@ class Server(threading.Thread):
                     return
                 if not client.leaving:
                     self._read(client, data)
+                    if client.held > UNCOUNTED:
+                        self._bound_memory()
         except (BlockingIOError, InterruptedError):
             pass
         except wire.WireError as error:
@@ -202,15 +234,21 @@ class Server(threading.Thread):
             wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.out else 0)
             self._selector.modify(client.socket, wanted, client)
 
-    def _send_away(self, client: Client, why: str) -> None:
-        """Tell a client why, and close the connection when it has had time to read it."""
+    def _send_away(self, client: Client, why: str, retry: bool = False) -> None:
+        """Tell a client why, and close the connection when it has had time to read it.
+
+        **Arguments:**
+
+        - `retry`: whether it may come back.
+        """
         if client.leaving:
             return
         why = wire.printable(why, 1000)
         log.warning("simulator %s is sent away: %s", client.name, why)
-        client.tell(why, fatal=True)
+        client.tell(why, fatal=True, retry=retry)
         self._release(client, "was sent away")
         client.leaving = True
+        client.frames, client.began = wire.Frames(0), math.inf
         client.deadline = time.monotonic() + connection.LINGER_SECONDS
 
     def _drop(self, client: Client, how: str) -> None:
@@ -247,6 +285,7 @@ class Server(threading.Thread):
 
     def _read(self, client: Client, data: bytes) -> None:
         for message in client.frames.feed(data):
+            client.began = math.inf
             match message.header["type"]:
                 case "hello" if not client.greeted:
                     client.greet(message.header, self.rules)
@@ -259,6 +298,8 @@ class Server(threading.Thread):
                     raise wire.unknown_type(kind, ["result"])
             if client.leaving:
                 return
+        if len(client.frames):
+            client.began = min(client.began, time.monotonic())
 
     def _take_back(self, client: Client, message: wire.Message) -> None:
         now, number = time.monotonic(), message.header.get("id")

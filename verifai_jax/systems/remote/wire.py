@@ -62,7 +62,7 @@ class Frames:
     def __init__(self, most: int) -> None:
         self.most = most
         self._bytes = bytearray()
-        self._header: tuple[Message, int, int] | None = None  # One whose raw bytes are to come.
+        self._needed = _LENGTH.size  # Bytes without which nothing more can be read.
         self._alien: list[str] = []
         self._decoder = json.JSONDecoder(parse_constant=self._note)
 
@@ -74,31 +74,30 @@ class Frames:
         self._bytes += data
         at = 0
         try:
-            while (next_message := self._header or self._text(at)) is not None:
-                message, length, extra = next_message
-                end = at + 4 + length
-                if len(self._bytes) < end + extra:
-                    self._header = next_message
+            while len(self._bytes) - at >= self._needed:
+                (length,) = _LENGTH.unpack_from(self._bytes, at)
+                self._check_size(length)
+                end = at + _LENGTH.size + length
+                if len(self._bytes) < end:
+                    self._needed = end - at
                     break
-                self._header, at = None, end + extra
+                message = self._parse(bytes(self._bytes[at + _LENGTH.size : end]))
+                extra = message.header.get("bytes", 0)
+                if not _is_integer(extra) or extra < 0:
+                    raise WireError(f"'bytes' must be a number of bytes; got {brief(extra)}")
+                self._check_size(length + extra)
+                if len(self._bytes) < end + extra:
+                    # It is parsed again then: what it holds may be many times its text.
+                    self._needed = end + extra - at
+                    break
+                self._needed, at = _LENGTH.size, end + extra
                 yield message._replace(raw=bytes(self._bytes[end:at])) if extra else message
         finally:
             del self._bytes[:at]
 
-    def _text(self, at: int) -> tuple[Message, int, int] | None:
-        """Return the message that begins `at`, the length of its JSON, and of its raw bytes."""
-        if len(self._bytes) < at + 4:
-            return None
-        (length,) = _LENGTH.unpack_from(self._bytes, at)
-        self._check_size(length)
-        if len(self._bytes) < at + 4 + length:
-            return None
-        message = self._parse(bytes(self._bytes[at + 4 : at + 4 + length]))
-        extra = message.header.get("bytes", 0)
-        if not _is_integer(extra) or extra < 0:
-            raise WireError(f"'bytes' must be a number of bytes; got {brief(extra)}")
-        self._check_size(length + extra)
-        return message, length, extra
+    def __len__(self) -> int:
+        """Return how many bytes of an unfinished message are kept."""
+        return len(self._bytes)
 
     def _check_size(self, size: int) -> None:
         if size > self.most:
