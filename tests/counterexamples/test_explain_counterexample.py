@@ -79,6 +79,7 @@ def test_single_control_points_and_slopes(explained):
     assert mass.gradient[0] == pytest.approx(1250 / 0.9**2, rel=0.02)
 
 
+@pytest.mark.thorough
 def test_the_paragraph(explained):
     text = str(explained)
     assert "Row 0 of drive breaks  always[0,18] (speed < 1200)" in text

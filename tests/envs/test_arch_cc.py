@@ -122,6 +122,7 @@ def test_transitions_at_the_end_of_steps_come_late(located):
     assert np.max(np.abs(located(throttle, brake)[-1] - late["y5"])) > 0.01
 
 
+@pytest.mark.thorough
 def test_located_transitions_do_not_depend_on_the_step(located):
     finer = cc.chasing_cars(25.0).refined(2)
     inputs = ([1.0, 0.2, 0.9, 0.6, 0.0], [0.0, 0.7, 0.1, 0.3, 0.9])

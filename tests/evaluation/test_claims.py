@@ -53,6 +53,7 @@ def test_artefacts_of_the_step_are_not_claimed(artefact):
     assert "verdict" not in trusting.table.all
 
 
+@pytest.mark.thorough
 def test_a_search_goes_on_where_nothing_is_confirmed(artefact):
     run = vj.falsify(artefact, "mutation", 48, batch=8, stop_after=1)
     assert (run.simulations, run.stopped) == (48, "budget")

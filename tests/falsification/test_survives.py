@@ -86,6 +86,7 @@ def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, m
     assert vj.resume(folder, problem).table.all.equals(whole)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [f"{STATE}.part", f"{RECORD}.part", "table.parquet.part"])
 def test_a_disk_that_is_full_at_the_end(problem, whole, tmp_path, name):
     folder = tmp_path / "run"

@@ -177,6 +177,7 @@ def test_integers_round_trip(low, count, data):
 scalars = st.one_of(st.integers(-1000, 1000), st.floats(-1e3, 1e3, width=32), st.text(max_size=3))
 
 
+@pytest.mark.thorough
 @given(st.lists(scalars, min_size=1, max_size=6, unique_by=str), st.data())
 @settings(max_examples=60, deadline=None)
 def test_choices_round_trip(choices, data):

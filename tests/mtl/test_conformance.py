@@ -14,7 +14,7 @@ from verifai_jax.mtl import boolean, parse, robustness, robustness_signal, satis
 CASES = json.loads((Path(__file__).parent / "conformance.json").read_text())["cases"]
 
 
-@pytest.fixture(params=["float64", "float32"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.thorough)])
 def precision(request):
     with jax.enable_x64(request.param == "float64"):
         yield request.param

@@ -117,6 +117,7 @@ def test_the_picture_shows_the_ball_where_it_was(motion, gl):
         scene.frames(motion, [0], SIZE, camera="sid")
 
 
+@pytest.mark.thorough
 def test_film_and_strip(motion, gl, tmp_path):
     with Image.open(scene.film(motion, tmp_path / "new" / "it.gif", SIZE)) as image:
         shown, edges = [], []

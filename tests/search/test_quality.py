@@ -99,6 +99,7 @@ def test_goes_on_to_other_failures(search):
     assert np.mean(value[:, value.shape[1] // 2 :] < 0) > 0.06
 
 
+@pytest.mark.thorough
 @EACH
 def test_never_stops_exploring(search):
     # A tenth of the last 480 points: over every seed's and coordinate's whole range.
