@@ -97,6 +97,7 @@ def test_the_attack_meets_what_samples_miss(certificates):
     assert found["rho"].is_monotonic_increasing
 
 
+@pytest.mark.thorough
 def test_a_memo_holds_all_that_is_needed(certificates, memo):
     def recalled(key, compute):
         return memo[key]

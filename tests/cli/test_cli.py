@@ -294,6 +294,7 @@ raising = vj.Problem("raising", space, vj.blackbox(crash, signals=("x",)), "x < 
 """
 
 
+@pytest.mark.thorough
 def test_exit_codes(call, tmp_path, monkeypatch):
     (tmp_path / "specs" / "broken.py").write_text(BROKEN)
     few = ("--search", "uniform", "--budget", 32, "--no-pictures")

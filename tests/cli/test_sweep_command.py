@@ -147,6 +147,7 @@ def test_only_some_vary(call):
     call("--resume", "some", "--no-pictures")
 
 
+@pytest.mark.thorough
 def test_another_sweep_in_the_same_folder_is_refused(call):
     call("specs/drift.py:safe", *SMALL, "--folder", "kept")
     output = call("specs/drift.py:safe", *SMALL, "--seed", 9, "--folder", "kept", code=2)

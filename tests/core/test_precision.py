@@ -45,6 +45,7 @@ def test_all_other_warnings_go_on():
     assert list(warnings.filters) == before
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("setting", "value"),
     [

@@ -30,6 +30,7 @@ def test_requirements_are_complete():
     assert all(name == problem.name for name, problem in PROBLEMS.items())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_problem_fits_its_system_and_looks_no_further(name):
     problem = PROBLEMS[name]

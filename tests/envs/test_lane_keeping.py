@@ -200,6 +200,7 @@ def test_the_task_steps_like_the_system():
     np.testing.assert_allclose(got, rows, atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_controllers_refuse_what_they_cannot_use():
     with pytest.raises(ValueError, match=r"LQR needs 3 gains; got \[1.0\]"):
         lk.lqr([1.0])

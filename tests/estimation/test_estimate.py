@@ -39,6 +39,7 @@ def test_one_in_a_million(rare):
     assert rare.failures > 1000
 
 
+@pytest.mark.thorough
 def test_says_what_is_guaranteed_and_what_is_not(rare):
     text = str(rare)
     assert "rare: fails with probability" in text

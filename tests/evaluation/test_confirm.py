@@ -552,6 +552,7 @@ def weighted(features, key):
     return Trace({"x": jnp.sum(features["a"] * WEIGHTS) * jnp.ones(11)}, dt=0.1)
 
 
+@pytest.mark.thorough
 def test_numpy_constants_work_in_both_precisions():
     problem = vj.Problem("weighted", {"a": vj.Box(0.0, 1.0)}, weighted, "always x < 0.2")
     single = vj.falsify(problem, "uniform", 16, batch=16, progress=False)

@@ -66,6 +66,7 @@ def test_same_seed_same_table(problem):
     assert not one.equals(other)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("search", ["uniform", "halton"])
 def test_passive_searches_do_not_depend_on_the_batch(problem, search):
     one = vj.falsify(problem, search, 200, batch=64, seed=1).table.all

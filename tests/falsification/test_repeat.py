@@ -102,6 +102,7 @@ def artefact():
     return vj.Problem("bump", {"x": vj.Box(0, 1)}, bump, "always x <= 0.96")
 
 
+@pytest.mark.thorough
 def test_a_failure_is_what_falsify_claims(artefact):
     trials = vj.repeat(artefact, "uniform", 48, batch=16, seeds=8, stop_early=False)
     early = vj.repeat(artefact, "uniform", 48, batch=16, seeds=8)

@@ -106,6 +106,7 @@ def test_before_any_state_was_saved(problem, tmp_path):
     assert same(vj.resume(tmp_path / "run", problem), whole)
 
 
+@pytest.mark.thorough
 def test_a_saved_run_can_be_resumed(problem, tmp_path):
     part = vj.falsify(problem, "cross_entropy", 32, batch=16)
     part.save(tmp_path)

@@ -144,6 +144,7 @@ def test_the_specifications_of_this_project_get_no_false_note():
 
 
 class TestRuns:
+    @pytest.mark.thorough
     def test_the_nominal_features_fail(self, capsys):
         def run(limit, system=both, **options):
             spec = f"always (x < {limit} & y < 2)"
@@ -174,6 +175,7 @@ class TestRuns:
         problem = vj.Problem("p", SPACE, both, "always x + y < 0.9", nominal=nominal)
         assert vj.falsify(problem, "uniform", 40, batch=40).notes == ()
 
+    @pytest.mark.thorough
     def test_the_table_is_the_same(self):
         problem = vj.Problem("p", SPACE, both, "always x < 0.2")
         told = vj.Problem("p", SPACE, both, "always x < 0.2", nominal={"a": 0.5, "b": 0.5})

@@ -147,6 +147,7 @@ class TestTable:
 
 
 class TestWritten:
+    @pytest.mark.thorough
     def test_lists_of_as_many_items_as_there_are(self):
         car = {"x": 25, "color": "b", "gear": 1, "lights": False}
         features = SPACE.coerce({"cars": [car], "n": [0.25, 1]})

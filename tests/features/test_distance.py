@@ -55,6 +55,7 @@ def test_known_values(changes, wanted):
     assert float(SPACE.distance(one, other)) == pytest.approx(wanted, abs=1e-6)
 
 
+@pytest.mark.thorough
 def test_values_as_a_person_writes_them():
     cars = {"n": Array(Struct({"lane": Categorical("left", "right"), "v": Box(0, 10)}), 2)}
     space = FeatureSpace(

@@ -51,6 +51,7 @@ def inside(rows):
         assert np.all((values >= low) & (values <= high)), (name, values)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_no_value_is_outside_in_either_precision(precision):
     with in_precision(precision):
@@ -121,6 +122,7 @@ def test_a_run_and_its_table_stay_inside():
         assert float(table["rho"][0]) >= 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
     ("closed", "has_low", "has_high"),
@@ -169,6 +171,7 @@ def test_subnormal_ends_are_zero_or_normal_numbers():
     np.testing.assert_array_equal(last, [0.0, 1.0])
 
 
+@pytest.mark.thorough
 def test_a_line_between_two_knots_stays_between_them():
     high = np.float32(61.199997)
     times = np.linspace(0, 1, 301, dtype=np.float32)

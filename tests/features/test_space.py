@@ -146,6 +146,7 @@ WRITTEN = {
 
 
 class TestFeatures:
+    @pytest.mark.thorough
     def test_as_a_person_writes_them(self):
         SPACE.check(WRITTEN)
         u = SPACE.flatten(WRITTEN)

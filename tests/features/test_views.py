@@ -131,6 +131,7 @@ class TestViews:
         assert jax.tree.map(jax.typeof, features) == jax.tree.map(jax.typeof, full)
         np.testing.assert_allclose(view.flatten(full), [0.25, 0, 0.5, 1])
 
+    @pytest.mark.thorough
     def test_the_table_keeps_its_columns(self):
         view = FULL.fixed(**{k: v for k, v in NOMINAL.items() if k != "x"})
         features = jax.vmap(view.unflatten)(jnp.array([[0.25], [0.75]]))

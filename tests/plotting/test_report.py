@@ -48,6 +48,7 @@ def test_the_feature_that_decides_comes_first():
         assert distinguishing_features(run) == ["a", "b"]
 
 
+@pytest.mark.thorough
 def test_the_decisive_instant_is_marked():
     problem = vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1")
     replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)

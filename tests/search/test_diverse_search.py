@@ -247,6 +247,7 @@ def test_the_radius_shrinks_when_nothing_new_comes():
     assert min(radii) >= search.least_radius
 
 
+@pytest.mark.thorough
 def test_distances_count_places_and_choices():
     cube = Cube((0, 3, 4), ordered=(True, True, False))
     one, other = jnp.array([[0.2, 0.1, 0.1]]), jnp.array([[0.5, 0.9, 0.9]])

@@ -64,6 +64,7 @@ def test_agrees_with_scikit_learn(wide, tolerance):
 CODES = GaussianProcess((False, True, True))
 
 
+@pytest.mark.thorough
 def test_codes_count_by_whether_they_are_the_same():
     a = np.array([[0.1, 0, 3], [0.5, 1, 3], [0.9, 1, 2]])
     with jax.enable_x64(True):

@@ -60,6 +60,7 @@ def test_every_search(name):
     np.testing.assert_array_equal(points, again)
 
 
+@pytest.mark.thorough
 def test_a_search_goes_on_from_its_checkpoint_under_a_constraint():
     for name in ("halton", "cross_entropy"):
         one = Proposals(named(name), SPACE.cube, 16, KEY, SPACE.constraint)

@@ -73,6 +73,7 @@ def test_one_row_a_policy(whole):
     assert {"training", "certifying"} <= set(whole.record.seconds)
 
 
+@pytest.mark.thorough
 def test_rows_are_what_a_training_of_their_own_gives(whole):
     for row in (0, 1, 11, 20):
         cell = {name: column[row] for name, column in whole.record.columns.items()}

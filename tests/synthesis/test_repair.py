@@ -54,6 +54,7 @@ def test_rates_before_and_after(mended):
     assert (after.simulations, after.failures, after.passed) == (2000, 0, True)
 
 
+@pytest.mark.thorough
 def test_rounds_and_what_it_says(mended):
     assert mended.rounds[0].counterexamples > 0
     assert mended.rounds[-1].counterexamples == 0

@@ -65,6 +65,7 @@ def test_the_tables(found):
     assert found.environments["rho"].min() == pytest.approx(found.robustness, abs=1e-3)
 
 
+@pytest.mark.thorough
 def test_the_chosen_problem_is_ready(found):
     assert found.chosen.nominal["k"] == found.parameters["k"]
     assert found.chosen.space.dim == 2

@@ -139,6 +139,7 @@ def test_samples_behind_the_end_repeat_it(traces):
         np.testing.assert_array_equal(trace.signals["t"][-1], 0)
 
 
+@pytest.mark.thorough
 def test_one_simulation_is_its_row_of_the_batch(traces):
     row = jax.tree.map(lambda leaf: leaf[2], rows())
     one = loop(backend="native")(row, KEYS[2])
