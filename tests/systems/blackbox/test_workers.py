@@ -277,9 +277,13 @@ def test_a_module_that_only_its_file_finds(tmp_path, monkeypatch):
 def sleeping(tmp_path):
     """A process whose worker simulates for a minute, and the worker's number."""
     text = """
-        import os, time
+        import os, signal, time
         from pathlib import Path
         from verifai_jax.systems.blackbox import blackbox
+
+        # A shell that runs the tests in its background lets them ignore Ctrl-C.
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
         def simulate(features):
             Path(features["file"]).write_text(str(os.getpid()))
@@ -294,8 +298,6 @@ def sleeping(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
-        # A shell that runs the tests in its background lets them ignore Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     until(lambda: mark.exists() and mark.read_text())
     with process:
