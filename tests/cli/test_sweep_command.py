@@ -1,5 +1,6 @@
 """`verifai-jax sweep`, as a person uses it."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from verifai_jax.cli.main import main
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
+from verifai_jax.sweeps.cache import Cache
 
 STUDY = """
 import verifai_jax as vj
@@ -159,12 +161,9 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     shutil.move(tmp_path / "specs", tmp_path / "kept" / "specs")
-    import sqlite3
-
-    base = sqlite3.connect(tmp_path / "kept" / "sweep.sqlite")
-    base.execute("UPDATE about SET value = replace(value, 'specs/', 'kept/specs/')")
-    base.commit()
-    base.close()
+    with Cache(tmp_path / "kept") as cache:
+        note = json.dumps(cache.note("command")).replace("specs/", "kept/specs/")
+        cache.note("command", json.loads(note))
     output = call("--resume", "kept", code=2)
     assert "kept does not say which study of this project it is of" in output
 

@@ -115,13 +115,13 @@ def test_files_of_another_kind(tmp_path):
         Cache(tmp_path / "folder.db")
 
 
-@pytest.mark.parametrize("form", [1, 9])
+@pytest.mark.parametrize("form", [2, 9])
 def test_another_format_is_refused(form, tmp_path):
     Cache(tmp_path).close()
     base = sqlite3.connect(tmp_path / "sweep.sqlite")
     base.execute(f"PRAGMA user_version={form}")
     base.close()
-    with pytest.raises(CacheError, match=rf"has format {form}, .* reads format 2; resume"):
+    with pytest.raises(CacheError, match=rf"has format {form}, .* reads format 3; resume"):
         Cache(tmp_path)
 
 
@@ -136,6 +136,26 @@ def test_changed_bytes_are_noticed(tmp_path):
         assert cache.get("whole") is not None
         with pytest.raises(CacheError, match="is damaged in 'piece': its bytes have changed"):
             cache.get("piece")
+
+
+@pytest.mark.parametrize("table", ["work", "about"])
+def test_entries_that_are_exchanged_are_noticed(tmp_path, table):
+    with Cache(tmp_path) as cache:
+        cache.put({"one": {"x": np.zeros(3)}, "other": {"x": np.ones(3)}})
+        cache.note("one", [1])
+        cache.note("other", [2])
+    base = sqlite3.connect(tmp_path / "sweep.sqlite")
+    for name, other in (("one", "between"), ("other", "one"), ("between", "other")):
+        base.execute(f"UPDATE {table} SET name = ? WHERE name = ?", (other, name))
+    base.commit()
+    base.close()
+    with Cache(tmp_path) as cache:
+        read = cache.get if table == "work" else cache.note
+        for name in ("one", "other"):
+            with pytest.raises(
+                CacheError, match=rf"is damaged in .*'{name}': .* another (note|entry)"
+            ):
+                read(name)
 
 
 def test_a_file_cut_short_is_an_error_not_a_guess(tmp_path):

@@ -7,7 +7,7 @@
 A cache maps the name of a pure computation to the arrays that it returned, in one SQLite file. Each
 entry is committed when it is finished; in write-ahead mode a process that is killed at any moment
 leaves all committed entries. An entry is the bytes of its arrays with their types and shapes in
-JSON and a checksum: nothing in it is ever executed.
+JSON, and a checksum of these and of its name: nothing in it is ever executed.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ Arrays: TypeAlias = dict[str, np.ndarray]
 
 _MARK = 0x564A5357
 """SQLite's application id of a cache: "VJSW"."""
-_FORMAT = 2
+_FORMAT = 3
 """Format of the file; files of another format are refused."""
 _BEGIN = b"SQLite format 3\0"
 """First bytes of a database; an empty file has none yet."""
@@ -94,7 +94,9 @@ class Cache:
         self._base.execute("BEGIN IMMEDIATE")
         self._base.execute(f"PRAGMA application_id={_MARK}")
         self._base.execute(f"PRAGMA user_version={_FORMAT}")
-        self._base.execute("CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT)")
+        self._base.execute(
+            "CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT, checksum INTEGER)"
+        )
         self._base.execute(
             "CREATE TABLE IF NOT EXISTS work "
             "(name TEXT PRIMARY KEY, form TEXT, checksum INTEGER, bytes BLOB)"
@@ -113,7 +115,10 @@ class Cache:
         text = json.dumps(fingerprint, sort_keys=True)
         with self._transaction():
             # If two processes start at once, the first to write decides.
-            self._base.execute("INSERT OR IGNORE INTO about VALUES ('sweep', ?)", (text,))
+            self._base.execute(
+                "INSERT OR IGNORE INTO about VALUES ('sweep', ?, ?)",
+                (text, _checksum("sweep", text)),
+            )
         known = self.note("sweep")
         differences = list(_differences(json.loads(text), known))
         if differences:
@@ -127,13 +132,22 @@ class Cache:
         """Return the plain data stored under a name, after storing `value` where one is given."""
         with self._transaction():
             if value is not None:
-                entry = (name, json.dumps(value))
-                self._base.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", entry)
-            row = self._base.execute("SELECT value FROM about WHERE name=?", (name,)).fetchone()
+                text = json.dumps(value)
+                self._base.execute(
+                    "INSERT OR REPLACE INTO about VALUES (?, ?, ?)",
+                    (name, text, _checksum(name, text)),
+                )
+            row = self._base.execute(
+                "SELECT value, checksum FROM about WHERE name=?", (name,)
+            ).fetchone()
+        if row is None:
+            return None
         try:
-            return None if row is None else json.loads(row[0])
-        except (json.JSONDecodeError, TypeError) as error:
-            raise CacheError(f"{self.path} is damaged in its note {name!r}") from error
+            if _checksum(name, row[0]) != row[1]:
+                raise ValueError("its text has changed, or is that of another note")
+            return json.loads(row[0])
+        except (ValueError, TypeError) as error:
+            raise CacheError(f"{self.path} is damaged in its note {name!r}: {error}") from error
 
     def get(self, name: str) -> Arrays | None:
         """Return the arrays of a finished computation; None where it is not finished.
@@ -148,7 +162,7 @@ class Cache:
 
     def put(self, work: Mapping[str, Arrays]) -> None:
         """Store finished computations, all or none of them."""
-        rows = [(name, *_encode(arrays)) for name, arrays in work.items()]
+        rows = [(name, *_encode(name, arrays)) for name, arrays in work.items()]
         self.computed += len(rows)
         with self._transaction():
             self._base.executemany("INSERT OR REPLACE INTO work VALUES (?, ?, ?, ?)", rows)
@@ -160,7 +174,7 @@ class Cache:
             computed = {key: np.asarray(value) for key, value in compute().items()}
             self.put({name: computed})
             # Decoded as when it is read back, so that both ways give the same arrays.
-            arrays = self._decode(name, *_encode(computed))
+            arrays = self._decode(name, *_encode(name, computed))
         return arrays
 
     def names(self) -> list[str]:
@@ -196,8 +210,8 @@ class Cache:
 
     def _decode(self, name: str, form: str, checksum: int, data: bytes) -> Arrays:
         try:
-            if zlib.crc32(data, zlib.crc32(form.encode())) != checksum:
-                raise ValueError("its bytes have changed")
+            if _checksum(name, form, data) != checksum:
+                raise ValueError("its bytes have changed, or are those of another entry")
             return _decode(json.loads(form), data)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise CacheError(f"{self.path} is damaged in {name!r}: {error}") from error
@@ -245,7 +259,7 @@ def locked_cache(place: str | Path | None) -> Iterator[None]:
         yield
 
 
-def _encode(arrays: Mapping[str, np.ndarray]) -> tuple[str, int, bytes]:
+def _encode(name: str, arrays: Mapping[str, np.ndarray]) -> tuple[str, int, bytes]:
     forms, parts = [], []
     for key, value in arrays.items():
         array = np.ascontiguousarray(value)
@@ -254,7 +268,12 @@ def _encode(arrays: Mapping[str, np.ndarray]) -> tuple[str, int, bytes]:
         forms.append([key, array.dtype.str, list(np.shape(value))])
         parts.append(array.tobytes())
     form, data = json.dumps(forms), b"".join(parts)
-    return form, zlib.crc32(data, zlib.crc32(form.encode())), data
+    return form, _checksum(name, form, data), data
+
+
+def _checksum(name: str, form: str, data: bytes = b"") -> int:
+    # With the name: the entries of two names that are exchanged are whole, and both wrong.
+    return zlib.crc32(data, zlib.crc32(json.dumps([name, form]).encode()))
 
 
 def _decode(forms: list[list[Any]], data: bytes) -> Arrays:
