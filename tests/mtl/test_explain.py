@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from mtl_oracle import DT, Oracle
 
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl import draw, explain, parse
+from verifai_jax.mtl import draw, explain, parse, robustness
 from verifai_jax.mtl import formula as ast
 
 FORMULAS = [
@@ -108,3 +108,15 @@ def test_critical_instants_are_the_peaks():
     why = explain("G (x > 0)", Trace({"x": x}, dt=0.1), k=2)
     assert [round(i.time, 6) for i in why.critical] == [2.0, 3.3]
     assert why.critical[0].share > why.critical[1].share
+
+
+@pytest.mark.thorough
+def test_what_stands_in_many_places_is_written_out_once():
+    text = "x > 0"
+    for i in range(10):
+        text = f"({text}) <-> (y > {i})"
+    trace = Trace({"x": np.full(3, 2.0), "y": np.full(3, 3.5)}, dt=0.1)
+    why = explain(text, trace)
+    assert why.robustness == robustness(text, trace)
+    assert len(why.tree.flat()) < 150
+    assert "(as above)" in str(why)

@@ -105,3 +105,15 @@ def test_what_cannot_be_monitored_is_said_at_once():
         UnknownNameError, match="the sample has no signal 'speed'; did you mean 'sped'"
     ):
         monitor.step(monitor.init(), {"sped": 1.0})
+
+
+def test_a_part_that_stands_in_several_places_is_followed_once():
+    text = "x > 0"
+    for i in range(16):
+        text = f"({text}) <-> (y > {i})"
+    monitor = online(text, DT)
+    assert monitor.memory < 200
+    with jax.disable_jit():
+        state = monitor.step(monitor.init(), {"x": 2.0, "y": 3.5})
+        trace = Trace({"x": np.full(1, 2.0), "y": np.full(1, 3.5)}, dt=DT)
+        assert monitor.finish(state) == robustness(text, trace)

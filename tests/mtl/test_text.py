@@ -257,7 +257,7 @@ def test_latex():
 
 DEEP = {
     "parentheses": "(" * 200 + "x > 0" + ")" * 200,
-    "always": "G " * 200 + "x > 0",
+    "always": "G " * 40 + "x > 0",
     "not": "!" * 200 + "(x > 0)",
     "and": "(x > 0 & " * 200 + "x > 1" + ")" * 200,
     "implies": "(x > 0 -> " * 150 + "x > 1" + ")" * 150,
@@ -298,7 +298,9 @@ def test_deep_texts_have_a_robustness(name):
     [
         ("(" * 201 + "x > 0" + ")" * 201, "parentheses stand at most 200 deep"),
         ("(" * 100_000, "parentheses stand at most 200 deep"),
-        ("G " * 201 + "x > 0", "operators stand at most 200 deep"),
+        ("!" * 201 + "(x > 0)", "operators stand at most 200 deep"),
+        ("G " * 41 + "x > 0", "temporal operators stand at most 40 deep"),
+        ("F[0,1] G " * 30 + "x > 0", "temporal operators stand at most 40 deep"),
         ("x > 0 & " * 3000 + "x > 1", "at most 10000 words and symbols"),
         ("-" * 5000 + "x > 0", "at most 200 minus signs"),
         ("F[0,1e9999999] x > 0", "a time must be a finite number of seconds"),
@@ -307,6 +309,11 @@ def test_deep_texts_have_a_robustness(name):
         ("x > 1e999", "a number in a formula must be finite"),
         ("x / 0 > 1", "a division by zero: x / 0"),
         ("1 / 0 > x", "a division by zero: 1 / 0"),
+        ("x / (1 - 1) > 1", "a division by zero: x / (1 - 1)"),
+        ("x / sin(min(0, 3)) > 1", "a division by zero: x / sin(min(0, 3))"),
+        ("x > 1e300 * 1e300", "a number in a formula must be finite; 1e+300 * 1e+300 is not"),
+        ("x > sqrt(1 - 2)", "a number in a formula must be finite; sqrt(1 - 2) is not"),
+        ("x > (0 - 8)**0.5", "a number in a formula must be finite; (0 - 8)**0.5 is not"),
         ("F[0, nan] x > 0", "F"),
     ],
 )

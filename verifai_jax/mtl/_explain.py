@@ -47,9 +47,22 @@ class Node:
         below = next((child for child in self.children if child.decides), None)
         return (self,) if below is None else (self, *below.path())
 
-    def flat(self, depth: int = 0) -> list[tuple[int, "Node"]]:
-        """Return itself and all nodes below with their depths, parents first."""
-        return [(depth, self)] + [e for child in self.children for e in child.flat(depth + 1)]
+    def flat(self) -> list[tuple[int, "Node"]]:
+        """Return itself and all nodes below with their depths, parents first.
+
+        A node that stands in several places (as both sides of `<->` do) is followed by what is
+        below it in the first of them only.
+        """
+        rows: list[tuple[int, Node]] = []
+        listed: set[int] = set()
+        stack: list[tuple[int, Node]] = [(0, self)]
+        while stack:
+            depth, node = stack.pop()
+            rows.append((depth, node))
+            if id(node) not in listed:
+                listed.add(id(node))
+                stack.extend((depth + 1, child) for child in reversed(node.children))
+        return rows
 
 
 @dataclass(frozen=True)
@@ -97,9 +110,13 @@ class Explanation:
             f"by  {self.predicate}  at {self.time:g} s",
             "",
         ]
+        listed: set[int] = set()
         for depth, node in self.tree.flat():
             mark = "*" if node.decides else " "
-            name = node.formula if not node.children else heading(node.formula)
+            name = str(node.formula) if not node.children else heading(node.formula)
+            if node.children and id(node) in listed:
+                name += "  (as above)"
+            listed.add(id(node))
             lines.append(
                 f"{mark} {node.robustness:>10.4g} at {node.time:<8.6g} {'  ' * depth}{name}"
             )
@@ -208,6 +225,7 @@ class _Walk:
         self.series = series
         self.clock = seconds(trace)
         self.last = evaluator.length - 1
+        self._nodes: dict[tuple[Formula, int, bool], Node] = {}
 
     def time(self, i: int) -> float:
         # Beyond the end a trace repeats its last sample, so that is where to look.
@@ -218,6 +236,12 @@ class _Walk:
         return float(values[min(i, len(values) - 1)])
 
     def node(self, f: Formula, i: int, decides: bool) -> Node:
+        """Return the node of `f` at sample `i`: one object, wherever it stands."""
+        if (f, i, decides) not in self._nodes:
+            self._nodes[f, i, decides] = self._node(f, i, decides)
+        return self._nodes[f, i, decides]
+
+    def _node(self, f: Formula, i: int, decides: bool) -> Node:
         operands = self.operands(f, i)
         deciding = self.deciding(f, i, operands) if decides else None
         if not operands:

@@ -164,6 +164,7 @@ class _Machine:
         self._delays: dict[Formula, int] = {}
         self._settlings: dict[Formula, int] = {}
         self._streams: dict[tuple[Formula, int], Array] = {}
+        self._starts: dict[tuple[Formula, int], Array] = {}
 
     def span(self, interval: ast.Interval) -> tuple[int, float]:
         a = samples(interval.start, self.dt, interval)
@@ -319,7 +320,15 @@ class _Machine:
     # Anchored at time 0
 
     def value_at_start(self, path: str, f: Formula, sign: int) -> Array:
-        """Return the value of `f` at time 0 if every stream stays as it is from now on."""
+        """Return the value of `f` at time 0 if every stream stays as it is from now on.
+
+        A part that stands in several places is followed once, in the cells of the first of them.
+        """
+        if (f, sign) not in self._starts:
+            self._starts[f, sign] = self._value_at_start(path, f, sign)
+        return self._starts[f, sign]
+
+    def _value_at_start(self, path: str, f: Formula, sign: int) -> Array:
         match f:
             case ast.Constant():
                 return self.constant(f)

@@ -34,6 +34,9 @@ MOST_TOKENS = 10_000
 MOST_DEEP = 200
 """Operators, or parentheses, that may stand within each other."""
 
+MOST_DEEP_TEMPORAL = 40
+"""Temporal operators that may stand within each other: each is a loop of its own to compile."""
+
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 _CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 _TIMED = ("always", "eventually", "historically", "once", *BINARY)
@@ -53,7 +56,8 @@ def parse(
     - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.
 
     A text has at most 10 000 words and symbols; parentheses stand at most 200 deep within each
-    other, and so do operators, of which `<->`, `xor`, weak until and release are made of several.
+    other, and so do operators, of which `<->`, `xor`, weak until and release are made of several;
+    temporal operators stand at most 40 deep.
 
     **Raises:** `FormulaSyntaxError`, with a caret under the place and what is expected there.
     """
@@ -177,9 +181,15 @@ class _Builder:
             raise
         except ValueError as error:
             raise self._fail(str(error), *self._span(tree)) from None
-        if isinstance(part.value, Formula) and part.value.depth > MOST_DEEP:
-            reason = f"operators stand at most {MOST_DEEP} deep within each other"
-            raise self._fail(f"{reason}: name parts by definitions", part.start, part.start + 1)
+        if isinstance(part.value, Formula):
+            limits = {
+                "operators": (part.value.depth, MOST_DEEP),
+                "temporal operators": (part.value.temporal_depth, MOST_DEEP_TEMPORAL),
+            }
+            for kind, (depth, most) in limits.items():
+                if depth > most:
+                    reason = f"{kind} stand at most {most} deep within each other"
+                    raise self._fail(reason, part.start, part.start + 1)
         return part
 
     def _span(self, tree: Tree) -> tuple[int, int]:

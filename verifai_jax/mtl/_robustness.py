@@ -19,7 +19,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.trace import Trace
-from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl._smoothing_error import error_of_setting
 from verifai_jax.mtl.evaluate import End
@@ -131,12 +130,6 @@ def _values(
     return jnp.broadcast_to(value, (last + 1, *shape))
 
 
-def _nested(formula: Formula, within: bool = False) -> bool:
-    """Return whether a temporal operator stands within another."""
-    temporal = not isinstance(formula, ast.Not | ast.And | ast.Or) and bool(formula.operands())
-    return (within and temporal) or any(_nested(p, within or temporal) for p in formula.operands())
-
-
 class _Root:
     """The value at time 0, and optionally its gradient: the work behind `robustness`."""
 
@@ -148,7 +141,7 @@ class _Root:
     def __call__(self, lanes: int, *arguments: PyTree) -> tuple[PyTree, ...]:
         work = functools.partial(self._work, lanes)
         # One reduction makes no arrays in between, so there is nothing to keep in the cache.
-        if lanes and (self.gradient or _nested(self.setting.formula)):
+        if lanes and (self.gradient or self.setting.formula.temporal_depth > 1):
             return in_chunks(work, (1, 0, 0), self.out_axes, *arguments)
         return work(*arguments)
 

@@ -6,12 +6,27 @@ x, theta = signal("x"), signal("theta")
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.node import postorder
 from verifai_jax.mtl.words import FUNCTIONS, name_text, number_text
 
+_CONSTANT: dict[str, Callable[..., float]] = {
+    "neg": lambda a: -a,
+    "+": lambda a, b: a + b,
+    "-": lambda a, b: a - b,
+    "*": lambda a, b: a * b,
+    "/": lambda a, b: a / b,
+    "**": math.pow,
+    "abs": math.fabs,
+    "sqrt": math.sqrt,
+    "sin": math.sin,
+    "cos": math.cos,
+    "min": min,
+    "max": max,
+}
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3, "**": 4}
 """Binding strength of the operators."""
 
@@ -219,8 +234,17 @@ class Arithmetic(Expression):
         if least is not None and (n != 1 if least == 1 else n < least):
             wanted = "one argument" if least == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
-        if self.name == "/" and self.arguments[1] == Number(0.0):
+        values = [_constant_value(argument) for argument in self.arguments]
+        if self.name == "/" and values[1] == 0.0:
             raise ValueError(f"a division by zero: {self}")
+        if None not in values and self.name in _CONSTANT:
+            try:
+                value = float(_CONSTANT[self.name](*values))
+            except (ArithmeticError, ValueError):
+                value = math.nan
+            if not math.isfinite(value):
+                raise ValueError(f"a number in a formula must be finite; {self} is not")
+            object.__setattr__(self, "_constant", value)
 
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals in it, in order of appearance."""
@@ -247,6 +271,11 @@ class Arithmetic(Expression):
                 node = node.arguments[0]
             text = "".join([node.text(level), *reversed(pieces)])
         return f"({text})" if level < outer else text
+
+
+def _constant_value(e: Expression) -> float | None:
+    """Return the value of an expression without signals; None for one with signals."""
+    return e.value if isinstance(e, Number) else e.__dict__.get("_constant")
 
 
 def expression(value: "Term | float") -> Expression:

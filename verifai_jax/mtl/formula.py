@@ -180,6 +180,16 @@ class Formula(Node):
                 object.__setattr__(part, "_depth", max(below, default=0))
         return self.__dict__["_depth"]
 
+    @property
+    def temporal_depth(self) -> int:
+        """Temporal operators that stand within each other."""
+        for part in postorder(self, "_temporal_depth"):
+            if isinstance(part, Formula):
+                below = max((p.__dict__["_temporal_depth"] for p in part.operands()), default=0)
+                own = bool(part.operands()) and not isinstance(part, Not | And | Or)
+                object.__setattr__(part, "_temporal_depth", below + own)
+        return self.__dict__["_temporal_depth"]
+
     def _reach(self, dt: float) -> tuple[float, float]:
         """Return how many seconds the operator itself looks back and ahead."""
         return 0.0, 0.0
