@@ -23,6 +23,7 @@ import logging
 import os
 import select
 import socket
+import ssl
 import struct
 import subprocess
 import sys
@@ -103,6 +104,7 @@ def serve(
     capacity: int = 32,
     reconnect: bool | float = True,
     name: str | None = None,
+    certificate: str | os.PathLike[str] | None = None,
 ) -> None:
     """Simulate the points of the run at `host` and `port` until interrupted.
 
@@ -119,18 +121,23 @@ def serve(
     - `reconnect`: connect again, however often, when the server goes away; or for how many seconds
       to try before giving up; or False.
     - `name`: what the server's log calls this client.
+    - `certificate`: for an encrypted connection (TLS), a PEM file with the server's certificate or
+      that of the authority that signed it, or `"system"` for those that this machine trusts; the
+      environment variable `VERIFAI_JAX_CERTIFICATE` when left out, and not encrypted without.
 
-    **Raises:** `Refused` for a wrong token, another protocol, or something that is no run of
-    verifai_jax; `ConnectionError` when no run could
-    be reached at all and `reconnect` allows no more tries.
+    **Raises:** `Refused` for a wrong token, another protocol or certificate, or something that is
+    no run of verifai_jax; `ConnectionError` when no run could be reached at all and `reconnect`
+    allows no more tries; `ValueError` for a file that is no certificate.
     """
+    certificate = certificate or os.environ.get("VERIFAI_JAX_CERTIFICATE") or None
+    tls = None if certificate is None else _trusting(certificate)
     token = os.environ.get("VERIFAI_JAX_TOKEN") if token is None else token
     patience = float("inf") if reconnect is True else float(reconnect)
     since, pause, served = time.monotonic(), SHORTEST_PAUSE, False
     while True:
         connection = None
         try:
-            connection = _Connection(host, port, token, capacity, name)
+            connection = _Connection(host, port, token, capacity, name, tls)
             connection.work(simulate)
         except KeyboardInterrupt:
             return
@@ -156,11 +163,25 @@ def serve(
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
+def _trusting(certificate: str | os.PathLike[str]) -> ssl.SSLContext:
+    file = None if certificate == "system" else os.fspath(certificate)
+    try:
+        return ssl.create_default_context(cafile=file)
+    except (OSError, ssl.SSLError) as error:
+        raise ValueError(f"{file!r} is no certificate in a PEM file: {error}") from error
+
+
 class _Connection:
     """One connection, from the greeting to its end."""
 
     def __init__(
-        self, host: str, port: int, token: str | None, capacity: int, name: str | None
+        self,
+        host: str,
+        port: int,
+        token: str | None,
+        capacity: int,
+        name: str | None,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self.socket = socket.create_connection((host, port), timeout=10.0)
         self.welcome = False  # Whether the server has handed out a point.
@@ -177,6 +198,8 @@ class _Connection:
             for option, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3)):
                 if hasattr(socket, option):
                     self.socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+            if tls is not None:
+                self.socket = _encrypted(self.socket, tls, host)
             self._greet(token, name)
             self.socket.settimeout(None)
             self._most = MOST_BYTES
@@ -200,14 +223,26 @@ class _Connection:
             if late or many or sum(map(len, self._unsent)) > FLUSH_BYTES:
                 self._flush()
                 flushed = time.monotonic()
-                if select.select([self.socket], [], [], 0)[0]:
+                if self._readable():
                     self._receive()
+
+    def _readable(self) -> bool:
+        if isinstance(self.socket, ssl.SSLSocket) and self.socket.pending():
+            return True  # What OpenSSL has decrypted already, `select` does not see.
+        return bool(select.select([self.socket], [], [], 0)[0])
 
     def _greet(self, token: str | None, name: str | None) -> None:
         deadline = time.monotonic() + GREETING_SECONDS
         while (hello := self._frame()) is None:
             self.socket.settimeout(max(deadline - time.monotonic(), 1e-3))
-            self._read()
+            try:
+                self._read()
+            except (EOFError, TimeoutError) as error:
+                if isinstance(self.socket, ssl.SSLSocket) or self._received:
+                    raise
+                raise EOFError(
+                    f"it says no hello ({error}); a run with a certificate needs certificate=... here"
+                ) from error
         if hello.get("type") == "error":
             raise _refusal(hello)
         if hello.get("type") != "hello" or hello.get("protocol") != PROTOCOL:
@@ -277,6 +312,25 @@ class _Connection:
         if not isinstance(message, dict):
             raise _no_run(f"it sends {plain(message)}, no object")
         return message
+
+
+def _encrypted(plain_socket: socket.socket, tls: ssl.SSLContext, host: str) -> ssl.SSLSocket:
+    """Agree on keys with a server whose certificate is trusted.
+
+    **Raises:** `Refused` where it has another one, or speaks no TLS.
+    """
+    try:
+        return tls.wrap_socket(plain_socket, server_hostname=host)
+    except ssl.SSLCertVerificationError as error:
+        raise Refused(
+            f"the certificate of the server is not trusted: {error.verify_message}"
+        ) from error
+    except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
+        raise  # It has closed the connection, and may be there another time.
+    except ssl.SSLError as error:
+        raise Refused(
+            f"what answers there speaks no TLS, so it needs no certificate here: {error.reason}"
+        ) from error
 
 
 def _points_of(message: dict[str, Any]) -> list[dict[str, Any]]:
@@ -437,6 +491,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--reconnect", type=float, default=float("inf"), help="seconds to look for a run again"
     )
+    parser.add_argument(
+        "--certificate", help="PEM file of a certificate to trust, or 'system'; encrypts by TLS"
+    )
     given = parser.parse_args(arguments)
     # Run by its path, the folder of this file would hide modules of other names: `trace`, `search`.
     here = str(Path(__file__).parent)
@@ -448,13 +505,23 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         parser.error(str(error))
     same = ["--address", given.address, "--capacity", str(given.capacity)]
-    same += ["--reconnect", str(given.reconnect), given.simulator]
+    same += ["--reconnect", str(given.reconnect)]
+    if given.certificate:
+        same += ["--certificate", given.certificate]
+    same.append(given.simulator)
     others = [
         subprocess.Popen([sys.executable, __file__, *same]) for _ in range(given.processes - 1)
     ]
     try:
-        serve(simulate, host, port, capacity=given.capacity, reconnect=given.reconnect)
-    except ConnectionError as error:
+        serve(
+            simulate,
+            host,
+            port,
+            capacity=given.capacity,
+            reconnect=given.reconnect,
+            certificate=given.certificate,
+        )
+    except (ConnectionError, ValueError) as error:
         print(error, file=sys.stderr)
         return 1
     finally:

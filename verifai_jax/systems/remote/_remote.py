@@ -3,7 +3,7 @@
     with remote(port=4567) as system:                    # and there: serve(simulate, port=4567)
         falsify(Problem("cars", space, system, "always x <= 2"))
 
-    remote(host="0.0.0.0", port=4567, token=secret, timeout=600.0)       # beyond this machine
+    remote(host="0.0.0.0", port=4567, token=secret, certificate="run.pem")   # beyond this machine
     remote(signals=("x", "v"), dt=0.02, length=200)      # every trace is checked against these
 
 `verifai_jax.remote_client` is the other side in Python, `docs/remote.md` the protocol for others.
@@ -32,6 +32,7 @@ from verifai_jax.systems.blackbox._blackbox import (
 from verifai_jax.systems.remote import wire
 from verifai_jax.systems.remote.connection import Batch, Rules
 from verifai_jax.systems.remote.server import Server
+from verifai_jax.systems.remote.tls import File, server_context
 
 log = logging.getLogger("verifai_jax.remote")
 
@@ -144,6 +145,8 @@ def remote(
     port: int = 0,
     *,
     token: str | None = None,
+    certificate: File | None = None,
+    private_key: File | None = None,
     timeout: float | None = 60.0,
     retries: int = 1,
     patience: float | None = None,
@@ -162,6 +165,9 @@ def remote(
     - `port`: 0 for any that is free, see `Remote.address`.
     - `token`: a secret that clients have to know. Without one, whoever can open a connection on
       this machine may answer.
+    - `certificate`: a PEM file with a certificate, by which connections are encrypted (TLS) and
+      clients know that this is the run; not encrypted when None.
+    - `private_key`: a PEM file with the certificate's key, where `certificate` does not hold it.
     - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
       `timeout` and its client is sent away; None for no limit.
     - `retries`: how often a point is handed out again if the client vanishes that simulates it.
@@ -176,7 +182,8 @@ def remote(
     **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
 
     **Raises:** `ValueError` for options out of range, an address beyond this machine without a
-    token; when it is first needed, `OSError` for a port that is taken.
+    token, files that are no certificate; when it is first needed, `OSError` for a port that is
+    taken.
     """
     if not isinstance(host, str) or not host:
         raise ValueError(f"host must be a name or an address, such as '127.0.0.1'; got {host!r}")
@@ -199,8 +206,11 @@ def remote(
             f"host {host!r} is open to other machines, and whoever connects answers for the "
             "simulator: give token='...', the same here and to the clients, or host='127.0.0.1'"
         )
+    if private_key is not None and certificate is None:
+        raise ValueError("private_key belongs to a certificate: give certificate='...', too")
+    tls = None if certificate is None else server_context(certificate, private_key)
     declared = TraceForm(signals, dt, length)
-    rules = Rules(token, timeout, retries, patience, most_bytes, declared, most_memory)
+    rules = Rules(token, timeout, retries, patience, most_bytes, declared, most_memory, tls)
     return Remote(host, port, rules)
 
 

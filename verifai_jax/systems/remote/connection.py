@@ -10,6 +10,7 @@ import math
 import queue
 import secrets
 import socket
+import ssl
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,6 +30,8 @@ shrinks: enough points wait at a fast client to keep it busy, and none at a slow
 are idle."""
 WORK_BYTES = 1 << 18
 """Bytes of a message of points from which the others go into another one."""
+RECEIVED_BYTES = 1 << 18
+"""Bytes that are read at a time."""
 REMEMBERED = 4096
 """Answered points that a client may answer again without an error."""
 
@@ -44,6 +47,7 @@ class Rules:
     most_bytes: int
     declared: TraceForm
     most_memory: int
+    tls: ssl.SSLContext | None = None
 
 
 @dataclass(eq=False)
@@ -84,6 +88,8 @@ class Client:
         self.deadline = self.since + GREETING_SECONDS
         self.out = bytearray()
         self.writing = False  # Whether the selector waits for room to send.
+        # With TLS a side may have to hear of the other before it can send, and the other way round.
+        self._sends_after_reading = self.reads_after_sending = False
         self.capacity = self.parallel = self.window = 1
         self.has: dict[int, Point] = {}  # In the order in which they were handed out.
         self.answered: dict[int, None] = {}
@@ -209,15 +215,42 @@ class Client:
             about["retry"] = True
         self.out += wire.frame(about)
 
+    @property
+    def waits_to_send(self) -> bool:
+        """True where room to send is worth waiting for."""
+        return (bool(self.out) and not self._sends_after_reading) or self.reads_after_sending
+
+    def receive(self) -> bytes | None:
+        """Return bytes that have come; empty at the end of the connection, None if there are none.
+
+        **Raises:** `OSError` if it has vanished.
+        """
+        self.reads_after_sending = False
+        try:
+            data = self.socket.recv(RECEIVED_BYTES)
+            # What OpenSSL has decrypted already, no selector sees.
+            while data and isinstance(self.socket, ssl.SSLSocket) and self.socket.pending():
+                data += self.socket.recv(RECEIVED_BYTES)
+        except (BlockingIOError, InterruptedError, ssl.SSLWantReadError):
+            return None
+        except ssl.SSLWantWriteError:
+            self.reads_after_sending = True
+            return None
+        return data
+
     def flush(self) -> None:
         """Send as much as the socket takes.
 
         **Raises:** `OSError` if it has vanished.
         """
+        self._sends_after_reading = False
         if self.out:
             try:
                 sent = self.socket.send(self.out)
-            except (BlockingIOError, InterruptedError):
+            except (BlockingIOError, InterruptedError, ssl.SSLWantWriteError):
+                return
+            except ssl.SSLWantReadError:
+                self._sends_after_reading = True
                 return
             del self.out[:sent]
 

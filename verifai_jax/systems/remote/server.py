@@ -155,6 +155,11 @@ class Server(threading.Thread):
         try:
             sock.setblocking(False)
             keep_alive(sock)
+            if self.rules.tls is not None:
+                # The two agree on keys while the first bytes are sent.
+                sock = self.rules.tls.wrap_socket(
+                    sock, server_side=True, do_handshake_on_connect=False
+                )
         except OSError:  # It is gone already.
             sock.close()
             return
@@ -196,17 +201,15 @@ class Server(threading.Thread):
 
     def _attend(self, client: Client, events: int) -> None:
         try:
-            if events & selectors.EVENT_READ:
-                data = client.socket.recv(1 << 18)
-                if not data:
+            if events & selectors.EVENT_READ or client.reads_after_sending:
+                data = client.receive()
+                if data == b"":
                     self._drop(client, "closed the connection")
                     return
-                if not client.leaving:
+                if data and not client.leaving:
                     self._read(client, data)
                     if client.held > UNCOUNTED:
                         self._bound_memory()
-        except (BlockingIOError, InterruptedError):
-            pass
         except wire.WireError as error:
             self._send_away(client, str(error))
         except OSError as error:
@@ -229,9 +232,9 @@ class Server(threading.Thread):
             # The rest of what it sends has to be read, or it would be reset before it reads why.
             with contextlib.suppress(OSError):
                 client.socket.shutdown(socket.SHUT_WR)
-        if client.writing != bool(client.out):
-            client.writing = bool(client.out)
-            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.out else 0)
+        if client.writing != client.waits_to_send:
+            client.writing = client.waits_to_send
+            wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if client.writing else 0)
             self._selector.modify(client.socket, wanted, client)
 
     def _send_away(self, client: Client, why: str, retry: bool = False) -> None:
