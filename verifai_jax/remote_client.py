@@ -240,9 +240,8 @@ class _Connection:
             except (EOFError, TimeoutError) as error:
                 if isinstance(self.socket, ssl.SSLSocket) or self._received:
                     raise
-                raise EOFError(
-                    f"it says no hello ({error}); a run with a certificate needs certificate=... here"
-                ) from error
+                hint = "a run with a certificate needs certificate=... here, too"
+                raise EOFError(f"it says no hello ({error}); {hint}") from error
         if hello.get("type") == "error":
             raise _refusal(hello)
         if hello.get("type") != "hello" or hello.get("protocol") != PROTOCOL:

@@ -1004,7 +1004,7 @@ def test_a_server_that_is_none_ends_the_client_with_a_line(name):
 
 def test_a_server_that_is_slow_to_say_hello_is_given_up(monkeypatch):
     monkeypatch.setattr(remote_client, "GREETING_SECONDS", 0.2)
-    timed_out = pytest.raises(ConnectionError, match=r"no run at .* timed out")
+    timed_out = pytest.raises(ConnectionError, match=r"no run at .*no hello \(timed out\)")
     with socket.create_server(("127.0.0.1", 0)) as listening, timed_out:
         remote_client.serve(constant, *listening.getsockname(), reconnect=False)
 
