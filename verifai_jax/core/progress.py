@@ -7,14 +7,36 @@ Rich draws them on the error stream, on a terminal or in a notebook that has ipy
 nothing is drawn.
 """
 
+import contextlib
 import importlib.util
+import io
 import sys
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+
+class _Stream:
+    """The error stream, to which writing never fails: a run outlives the terminal that shows it."""
+
+    def __init__(self) -> None:
+        # Within another bar it stands in for the stream itself.
+        self._stream = getattr(sys.stderr, "rich_proxied_file", sys.stderr) or io.StringIO()
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 class ProgressBar:
@@ -41,7 +63,7 @@ class ProgressBar:
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}"),
                 TextColumn("{task.fields[figures]}"),
                 TimeRemainingColumn(),
-                console=Console(stderr=True),
+                console=Console(file=cast("IO[str]", _Stream())),
                 transient=True,
             )
             self._display.start()
@@ -119,7 +141,7 @@ class SimulationProgress:
 
 def has_viewer() -> bool:
     """Return whether the error stream is a terminal or a notebook that can draw a bar."""
-    if sys.stderr is not None and sys.stderr.isatty():
+    if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
         return True
     # In a notebook rich draws through ipywidgets, and without it warns instead.
     return "ipykernel" in sys.modules and importlib.util.find_spec("ipywidgets") is not None
