@@ -14,7 +14,7 @@ PACKAGE = ROOT / "verifai_jax"
 LAYERS = (
     {"core", "statistics", "_version"},
     {"features", "mtl", "systems", "search"},
-    {"rl", "problem"},
+    {"rl", "problem", "perception"},
     {"evaluation"},
     {"falsification"},
     {"counterexamples", "estimation", "synthesis", "certification", "analysis"},
