@@ -31,8 +31,8 @@ _UNITS = {
 MOST_TOKENS = 10_000
 """Words and symbols that a formula's text may have."""
 
-MOST_DEEP = 200
-"""Operators, or parentheses, that may stand within each other."""
+MOST_DEEP = 100
+"""Operators, or parentheses, that may stand within each other: far from where Python gives up."""
 
 MOST_DEEP_TEMPORAL = 40
 """Temporal operators that may stand within each other: each is a loop of its own to compile."""
@@ -55,7 +55,7 @@ def parse(
     - `constants`: numbers by name, also usable as the ends of intervals.
     - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.
 
-    A text has at most 10 000 words and symbols; parentheses stand at most 200 deep within each
+    A text has at most 10 000 words and symbols; parentheses stand at most 100 deep within each
     other, and so do operators, of which `<->`, `xor`, weak until and release are made of several;
     temporal operators stand at most 40 deep.
 

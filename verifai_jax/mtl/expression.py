@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import methodcaller
 
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.node import postorder
@@ -254,7 +255,8 @@ class Arithmetic(Expression):
     def text(self, outer: int = 0) -> str:
         """Return the text, in parentheses if its operator binds weaker than `outer`."""
         if self.name not in PRECEDENCE:
-            return f"{self.name}({', '.join(map(str, self.arguments))})"
+            # Deep arguments take one level of Python's stack each, as short as it can be.
+            return f"{self.name}({', '.join(map(methodcaller('text'), self.arguments))})"
         level = PRECEDENCE[self.name]
         if self.name == "neg":
             text = f"-{self.arguments[0].text(level + 1)}"

@@ -14,6 +14,8 @@ BINARY = ("until", "weak_until", "release", "since")
 
 _SHOWN = 400
 """Characters of a text that an error shows at most."""
+_MOST_REASON = 800
+"""Characters of what an error says, which may quote parts of the text."""
 
 
 class FormulaSyntaxError(ValueError):
@@ -24,6 +26,9 @@ class FormulaSyntaxError(ValueError):
 
     def __init__(self, reason: str, text: str, position: int, width: int = 1) -> None:
         self.position = position
+        if len(reason) > _MOST_REASON:
+            half = _MOST_REASON // 2
+            reason = f"{reason[:half]} ... {reason[-half:]}"
         before = text[:position]
         line = before.count("\n")
         shown = text.split("\n")[line]

@@ -1,0 +1,79 @@
+"""The memory of a run that goes on for long."""
+
+import gc
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import verifai_jax as vj
+from benchmarks.faults import kills
+
+MOST_GROWTH_GB = 0.3
+"""Memory beyond that of its rows by which a run may grow once it is under way."""
+EVERY = 1.0
+"""Seconds between two looks at the memory."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """What one run took: `grown` is memory since a fifth of its time, beyond that of its rows."""
+
+    seconds: float
+    rows: int
+    begun: float
+    ended: float
+    grown: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.rows:,} rows in {self.seconds:.0f} s; {self.begun:.2f} GB resident after a "
+            f"fifth of the time, {self.ended:.2f} GB at the end, {self.grown:.2f} GB of the growth "
+            "beyond that of the rows themselves"
+        )
+
+
+def resident() -> float:
+    """Return the resident memory of this process, in GB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 1e9
+
+
+def simulate(features):
+    """A black box that takes a millisecond, and so leaves the machine to others."""
+    time.sleep(0.001)
+    return kills.simulate(features)
+
+
+def soak(seconds: float) -> Report:
+    """Falsify a black box for so long by a search that learns, with a folder and confirmation."""
+    problem = vj.Problem("ramp", kills.SPACE, vj.blackbox(simulate), "always x <= 1.9")
+    seen: list[tuple[float, float]] = []
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(EVERY):
+            seen.append((time.monotonic(), resident()))
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    begun = time.monotonic()
+    watcher.start()
+    with tempfile.TemporaryDirectory() as place:
+        run = vj.falsify(
+            problem,
+            "cross_entropy",
+            1_000_000_000,
+            batch=256,
+            max_seconds=seconds,
+            folder=Path(place) / "run",
+            progress=False,
+        )
+        ended.set()
+        watcher.join()
+        gc.collect()
+        table = run.table.all
+        rows, size = len(table), table.memory_usage(deep=True).sum() / 1e9
+    early = next((m for t, m in seen if t - begun > seconds / 5), seen[0][1])
+    late = max(m for t, m in seen if t - begun > seconds / 2)
+    return Report(time.monotonic() - begun, rows, early, late, late - early - 0.8 * size)
