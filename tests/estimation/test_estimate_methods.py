@@ -41,27 +41,28 @@ def test_one_in_a_million_within_a_factor_of_1_3(name, dim):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(
-    ("dim", "p", "budget"),
+    ("dim", "p", "budget", "seeds", "least"),
     [
-        (2, 1e-2, 50_000),
-        (2, 1e-7, 50_000),
-        (5, 1e-6, 50_000),
-        (20, 1e-4, 20_000),
-        (50, 1e-6, 50_000),
+        (2, 1e-2, 50_000, 8, 28),
+        (2, 1e-7, 50_000, 8, 28),
+        (5, 1e-6, 50_000, 8, 28),
+        (20, 1e-4, 20_000, 8, 28),
+        (50, 1e-6, 50_000, 4, 13),
     ],
 )
-def test_intervals_cover_and_estimates_are_within_a_factor(name, dim, p, budget):
-    robustness = CASES[name](dim, p)
-    seeds = 20
-    covered, off = 0, []
-    for seed in range(seeds):
-        answer, _ = answered(robustness, dim, budget, seed)
-        covered += answer.low <= p <= answer.high
-        off.append(abs(np.log(answer.probability / p)))
-    assert covered >= 17
-    assert max(off) < np.log(1.3)
+def test_intervals_cover_and_estimates_are_within_a_factor(dim, p, budget, seeds, least):
+    covered = 0
+    for case in CASES.values():
+        robustness = case(dim, p)
+        for seed in range(seeds):
+            answer, _ = answered(robustness, dim, budget, seed)
+            covered += answer.low <= p <= answer.high
+            assert p / 1.3 < answer.probability < 1.3 * p
+    # By the binomial distribution: of 32 intervals with a coverage of 0.95, fewer than 28 hold with
+    # probability 0.02, and with a coverage of 0.8 with probability 0.8; of 16, fewer than 13 with
+    # probabilities 0.007 and 0.65.
+    assert covered >= least
 
 
 def test_frequent_failures_are_counted_in_fresh_samples():

@@ -1,5 +1,7 @@
 """Bayesian optimization: quality on known landscapes, what it keeps, and what it never does."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,12 +16,14 @@ from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search
 
 KEY = jax.random.key(0)
-SMALL = Bayes(capacity=128, candidates=128)
-IMPROVEMENT = Bayes("expected_improvement", capacity=128, candidates=128)
+SMALL = Bayes(capacity=96, candidates=128)
+IMPROVEMENT = Bayes("expected_improvement", capacity=96, candidates=128)
 FLAT = ("ball", "ripples")
 
 
+@cache
 def jitted(search):
+    """Its compiled ask and tell, which all tests of one search share."""
     return (
         jax.jit(search.ask, static_argnums=(1, 2)),
         jax.jit(search.tell, static_argnums=1),
@@ -150,10 +154,10 @@ def test_small_and_large_batches(search, batch):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("search", [SMALL, IMPROVEMENT], ids=["thompson", "improvement"])
-def test_contract(search):
+def test_contract_of_expected_improvement():
+    """That of Thompson sampling, the default, is among those of all searches."""
     cube = Cube((3, 0, 9), weights=((0.7, 0.2, 0.1), None, None), ordered=(False, True, True))
-    check_search(Bayes(search.acquisition, capacity=32, candidates=32), cube)
+    check_search(Bayes("expected_improvement", capacity=32, candidates=32), cube)
 
 
 @pytest.mark.parametrize(

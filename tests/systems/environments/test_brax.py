@@ -391,25 +391,36 @@ def test_pendulum_is_that_of_brax_stepped_by_hand(backend, path):
     field = path.split("[")[0]
     index = 2 if backend == "mjx" else 1
     old = np.asarray(env.sys.body_mass if backend == "mjx" else env.sys.link.inertia.mass)
+
+    def under(machine, function):
+        kept, env.sys = env.sys, machine
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)
+                return function()
+        finally:
+            env.sys = kept
+
+    @jax.jit
+    def begin(machine):
+        drawn = under(machine, lambda: env.reset(episode_keys(KEY).start)).pipeline_state
+        return under(machine, lambda: env.pipeline_init(drawn.q.at[1].set(0.05), drawn.qd))
+
+    step = jax.jit(lambda machine, *given: under(machine, lambda: env.step(*given)))
     for lane, mass in enumerate((3.0, 9.0)):
-        changed = jnp.asarray(old).at[index].set(mass)
-        env.sys = env.sys.tree_replace({field: changed})
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)
-            drawn = jax.jit(env.reset)(episode_keys(KEY).start).pipeline_state
-            physics = jax.jit(env.pipeline_init)(drawn.q.at[1].set(0.05), drawn.qd)
-            state = State(
-                physics,
-                jnp.concatenate([physics.q, physics.qd]),
-                jnp.zeros(()),
-                jnp.zeros(()),
-                {},
-                {"time_out": jnp.zeros(())},
-            )
-            step = jax.jit(env.step)
-            for k in range(int(trace.valid[lane])):
-                np.testing.assert_allclose(trace["observation"][lane, k], state.obs, atol=2e-4)
-                state = step(state, balance(state.obs))
+        machine = env.sys.tree_replace({field: jnp.asarray(old).at[index].set(mass)})
+        physics = begin(machine)
+        state = State(
+            physics,
+            jnp.concatenate([physics.q, physics.qd]),
+            jnp.zeros(()),
+            jnp.zeros(()),
+            {},
+            {"time_out": jnp.zeros(())},
+        )
+        for k in range(int(trace.valid[lane])):
+            np.testing.assert_allclose(trace["observation"][lane, k], state.obs, atol=2e-4)
+            state = step(machine, state, balance(state.obs))
 
 
 def test_a_missing_or_old_package_is_one_line(monkeypatch):
