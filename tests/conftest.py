@@ -18,6 +18,7 @@ matplotlib.use("Agg")
 
 CHECKED_ROOMS: list[str] = [
     "analysis",
+    "augmentation",
     "core.cube",
     "core.devices",
     "core.keys",

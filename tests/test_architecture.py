@@ -18,7 +18,7 @@ LAYERS = (
     {"evaluation"},
     {"falsification"},
     {"counterexamples", "estimation", "synthesis", "certification", "analysis"},
-    {"sweeps"},
+    {"sweeps", "augmentation"},
     {"plotting"},
     {"cli"},
 )

@@ -8,10 +8,14 @@ from verifai_jax.core.cores import claim_cores as _claim_cores
 
 if TYPE_CHECKING:
     from verifai_jax import analysis as analysis
+    from verifai_jax import augmentation as augmentation
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
     from verifai_jax import rl as rl
     from verifai_jax import search as search
+    from verifai_jax.augmentation import Augmentation as Augmentation
+    from verifai_jax.augmentation import SupervisedTask as SupervisedTask
+    from verifai_jax.augmentation import augment as augment
     from verifai_jax.certification import Certificates as Certificates
     from verifai_jax.certification import certify as certify
     from verifai_jax.core.trace import Status as Status
@@ -91,10 +95,15 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
 
-_ROOMS = ("analysis", "mtl", "perception", "rl", "search")
+_ROOMS = ("analysis", "augmentation", "mtl", "perception", "rl", "search")
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 _NAMES = {
+    "augmentation": (
+        "Augmentation",
+        "SupervisedTask",
+        "augment",
+    ),
     "certification": (
         "Certificates",
         "certify",

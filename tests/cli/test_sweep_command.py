@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from drifting import quick_certificates
+from verifai_jax.sweeps.cache import Cache
 
 from verifai_jax.cli.main import main
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver
-from verifai_jax.sweeps.cache import Cache
 
 STUDY = """
 import verifai_jax as vj
@@ -93,7 +93,7 @@ class _Stopping:
         self.after = after
 
     def __call__(self, path):
-        from verifai_jax.sweeps.cache import Cache
+        from verifai_jax.core.cache import Cache
 
         cache, put = Cache(path), Cache.put
 

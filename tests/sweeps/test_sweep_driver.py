@@ -9,13 +9,13 @@ from checked_types import unchecked
 from drifting import Drift, Point, drifting, quick_certificates
 
 import verifai_jax as vj
+from verifai_jax.core.cache import Cache, CacheError
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.rl import evaluate, train
 from verifai_jax.rl._evaluate import mean_returns
 from verifai_jax.sweeps import _sweep as driver
 from verifai_jax.sweeps import training_runs
 from verifai_jax.sweeps._sweep import sweep
-from verifai_jax.sweeps.cache import Cache, CacheError
 from verifai_jax.sweeps.halving import Halving
 from verifai_jax.sweeps.optuna import OptunaSampler
 from verifai_jax.sweeps.proposers import WORST, SearchProposer, objective

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies
 
+from verifai_jax.core.cache import Cache, CacheError, locked_cache
 from verifai_jax.core.locks import FolderInUse
-from verifai_jax.sweeps.cache import Cache, CacheError, locked_cache
 
 ABOUT = {"study": "s", "space": {"a": "Box(0, 1)"}, "seeds": [0, 1]}
 

@@ -179,7 +179,7 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
 
 def _read_command(place: Path) -> dict[str, Any]:
     """Read the command of an interrupted sweep from its cache."""
-    from verifai_jax.sweeps.cache import Cache, CacheError, cache_file
+    from verifai_jax.core.cache import Cache, CacheError, cache_file
 
     if not cache_file(place).exists():
         raise FileNotFoundError(f"no sweep to resume in {place}{_describe_place(place)}")

@@ -4,8 +4,8 @@ sweep = vj.sweep(study, configurations=64, folder="sweeps/mine")
 sweep.best, sweep.safe, sweep.importance()
 """
 
+from verifai_jax.core.cache import CacheError as CacheError
 from verifai_jax.sweeps._sweep import sweep as sweep
-from verifai_jax.sweeps.cache import CacheError as CacheError
 from verifai_jax.sweeps.curves import curve_robustness as curve_robustness
 from verifai_jax.sweeps.halving import Halving as Halving
 from verifai_jax.sweeps.optuna import OptunaSampler as OptunaSampler

@@ -18,11 +18,11 @@ import numpy as np
 from verifai_jax._version import __version__
 from verifai_jax.certification.attack import check_attack
 from verifai_jax.certification.result import Certificates
+from verifai_jax.core.cache import Arrays, Cache, locked_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.cache import Arrays, Cache, locked_cache
 from verifai_jax.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
 from verifai_jax.sweeps.fingerprint import digest, fingerprint
 from verifai_jax.sweeps.halving import SAFETY, Halving

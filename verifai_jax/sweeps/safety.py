@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from verifai_jax.certification._certify import certify
 from verifai_jax.certification.result import Certificate, Certificates
+from verifai_jax.core.cache import Arrays
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
-from verifai_jax.sweeps.cache import Arrays
 
 SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.

@@ -1,6 +1,6 @@
-"""The cache of a sweep's finished work: a killed sweep continues from it, with the same numbers.
+"""The cache of finished work: what was killed continues from it, with the same numbers.
 
-    with Cache(path) as cache:
+    with Cache(path, "sweep") as cache:
         cache.claim(fingerprint)                        # refuses the cache of another sweep
         cache.remember("train/...", lambda: {"x": np.arange(3)})
 
@@ -25,39 +25,40 @@ from verifai_jax.core.locks import write_lock
 Arrays: TypeAlias = dict[str, np.ndarray]
 """The result of one computation: arrays of numbers or texts, by name."""
 
-_MARK = 0x564A5357
-"""SQLite's application id of a cache: "VJSW"."""
+_MARKS = {"sweep": 0x564A5357, "augmentation": 0x564A4155}
+"""SQLite's application id of each kind of cache: "VJSW", "VJAU"."""
 _FORMAT = 3
 """Format of the file; files of another format are refused."""
 _BEGIN = b"SQLite format 3\0"
 """First bytes of a database; an empty file has none yet."""
-_FILE = "sweep.sqlite"
-"""Name of the file in a folder."""
 _KINDS = "biufU"
 """NumPy's kinds of the arrays that can be stored."""
 
 
 class CacheError(ValueError):
-    """An error for a cache that is damaged, foreign, of another format, or of another sweep."""
+    """An error for a cache that is damaged, foreign, of another format, or of other work."""
 
 
 class Cache:
-    """The finished work of a sweep, on disk.
+    """Finished work on disk.
 
     **Arguments:**
 
-    - `path`: the file (`.sqlite`, `.db`), or a folder, in which it is `sweep.sqlite`; None keeps
-      everything in this process only.
+    - `path`: the file (`.sqlite`, `.db`), or a folder, in which it is `sweep.sqlite` for a sweep;
+      None keeps everything in this process only.
+    - `kind`: of the work: `"sweep"` or `"augmentation"`.
 
-    **Raises:** `CacheError` for a file that is no cache of a sweep, damaged, or of another format.
+    **Raises:** `CacheError` for a file that is no cache of this kind, damaged, or of another
+    format.
     """
 
-    def __init__(self, path: str | Path | None = None) -> None:
-        self.path = None if path is None else cache_file(Path(path))
+    def __init__(self, path: str | Path | None = None, kind: str = "sweep") -> None:
+        self.kind = kind
+        self.path = None if path is None else cache_file(Path(path), kind)
         self.computed = 0
         """Entries that this process computed."""
         if self.path is not None:
-            _refuse_other_files(self.path)
+            _refuse_other_files(self.path, kind)
             self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             # Transactions begin and end in `_transaction`, not by the module.
@@ -70,7 +71,7 @@ class Cache:
             self._open()
         except sqlite3.Error as error:
             self._base.close()
-            raise CacheError(f"{self.path} is no cache of a sweep: {error}") from error
+            raise CacheError(f"{self.path} is no cache of {_one(kind)}: {error}") from error
         except BaseException:
             self._base.close()
             raise
@@ -78,13 +79,15 @@ class Cache:
     def _open(self) -> None:
         tables = self._base.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
         mark = self._base.execute("PRAGMA application_id").fetchone()[0]
-        if tables and mark != _MARK:
-            raise CacheError(f"{self.path} is a database of something else, not of a sweep")
+        if tables and mark != _MARKS[self.kind]:
+            raise CacheError(
+                f"{self.path} is a database of something else, not of {_one(self.kind)}"
+            )
         form = self._base.execute("PRAGMA user_version").fetchone()[0]
         if tables and form != _FORMAT:
             raise CacheError(
                 f"{self.path} has format {form}, and this verifai_jax reads format {_FORMAT}; "
-                "resume the sweep with the version that began it, or give another folder"
+                f"resume the {self.kind} with the version that began it, or give another folder"
             )
         self._base.execute("PRAGMA journal_mode=WAL")
         # A killed process loses nothing; a power cut at most the last transactions.
@@ -92,7 +95,7 @@ class Cache:
         if tables:
             return
         self._base.execute("BEGIN IMMEDIATE")
-        self._base.execute(f"PRAGMA application_id={_MARK}")
+        self._base.execute(f"PRAGMA application_id={_MARKS[self.kind]}")
         self._base.execute(f"PRAGMA user_version={_FORMAT}")
         self._base.execute(
             "CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT, checksum INTEGER)"
@@ -104,7 +107,7 @@ class Cache:
         self._base.execute("COMMIT")
 
     def claim(self, fingerprint: Mapping[str, Any]) -> None:
-        """Record the sweep that this cache belongs to, or refuse the cache of another sweep.
+        """Record the work that this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**
 
@@ -116,16 +119,16 @@ class Cache:
         with self._transaction():
             # If two processes start at once, the first to write decides.
             self._base.execute(
-                "INSERT OR IGNORE INTO about VALUES ('sweep', ?, ?)",
-                (text, _checksum("sweep", text)),
+                "INSERT OR IGNORE INTO about VALUES (?, ?, ?)",
+                (self.kind, text, _checksum(self.kind, text)),
             )
-        known = self.note("sweep")
+        known = self.note(self.kind)
         differences = list(_differences(json.loads(text), known))
         if differences:
             raise CacheError(
-                f"{self.path} holds a different sweep: {'; '.join(differences[:4])}"
+                f"{self.path} holds a different {self.kind}: {'; '.join(differences[:4])}"
                 f"{'; ...' if len(differences) > 4 else ''}. Give another folder, or repeat "
-                "the sweep that this one belongs to"
+                f"the {self.kind} that this one belongs to"
             )
 
     def note(self, name: str, value: object = None) -> Any:
@@ -217,17 +220,21 @@ class Cache:
             raise CacheError(f"{self.path} is damaged in {name!r}: {error}") from error
 
 
-def _refuse_other_files(path: Path) -> None:
+def _one(kind: str) -> str:
+    return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
+
+
+def _refuse_other_files(path: Path, kind: str) -> None:
     """Refuse a file that SQLite would take for an empty database, and write over."""
     if path.is_file():
         with open(path, "rb") as file:
             begin = file.read(len(_BEGIN))
         if begin not in (b"", _BEGIN):
-            raise CacheError(f"{path} is no cache of a sweep: it is a file of another kind")
+            raise CacheError(f"{path} is no cache of {_one(kind)}: it is a file of another kind")
 
 
-def cache_file(path: Path) -> Path:
-    """Return the path of the cache file at a place.
+def cache_file(path: Path, kind: str = "sweep") -> Path:
+    """Return the path of the cache file at a place, for one kind of work.
 
     **Raises:** `CacheError` for a folder that is named as a file, and the other way round.
     """
@@ -237,11 +244,11 @@ def cache_file(path: Path) -> Path:
         return path
     if path.is_file():
         raise CacheError(f"{path} is a file of another kind; give a folder, or a .sqlite file")
-    return path / _FILE
+    return path / f"{kind}.sqlite"
 
 
 @contextlib.contextmanager
-def locked_cache(place: str | Path | None) -> Iterator[None]:
+def locked_cache(place: str | Path | None, kind: str = "sweep") -> Iterator[None]:
     """Be the only one who writes to a cache; None is none on disk.
 
     **Raises:** `FolderInUse`, which names the process that writes to it; `CacheError` where it
@@ -250,7 +257,7 @@ def locked_cache(place: str | Path | None) -> Iterator[None]:
     with contextlib.ExitStack() as held:
         if place is not None:
             path = Path(place)
-            file = cache_file(path)
+            file = cache_file(path, kind)
             try:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 held.enter_context(write_lock(file if file == path else path))
