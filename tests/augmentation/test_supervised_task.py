@@ -25,6 +25,7 @@ def never(*arguments):
             {"training_space": {"x": vj.Box(-1, 0)}},
             "space has x, y, training_space x",
         ),
+        ({"space": {"seed": vj.Box(0, 1)}}, "a feature may not be called 'seed'"),
         ({"lanes": 0}, "lanes must be an integer of at least 1; got 0"),
         ({"measures": {"rate": 0.5}}, "measure 'rate' of task 'rings' must be a function; got 0.5"),
     ],

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from drifting import quick_certificates
-from verifai_jax.sweeps.cache import Cache
 
 from verifai_jax.cli.main import main
+from verifai_jax.core.cache import Cache
 from verifai_jax.core.targets import TargetError, definitions, load_target
 from verifai_jax.sweeps import Study
 from verifai_jax.sweeps import _sweep as driver

@@ -15,13 +15,12 @@ of artificial intelligence-based systems, CAV 2019.
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float, Key
@@ -272,11 +271,8 @@ class _Study:
         self, examples: Examples, weights: Weights | None, steps: int, key: Key[Array, ""]
     ) -> Weights:
         """Train a network of the task."""
-        inputs, labels = examples.inputs, examples.labels
-        if not self.task.black_box:
-            inputs, labels = jax.tree.map(jnp.asarray, (inputs, labels))
         try:
-            return self.task.train(inputs, labels, weights, steps, key)
+            return self.task.train(examples.inputs, examples.labels, weights, steps, key)
         except Exception as error:
             why = explain_user_error(error, system=False)
             raise TaskError(f"train of task {self.task.name!r} fails: {why}") from error
@@ -377,6 +373,7 @@ class _Seed:
         union = self.initial.join(examples)
         weights = self.study.train(union, self.base, self.plan.further_steps, self.key(FURTHER))
         numbers = self.study.measure(weights, self.test, self.key(MEASURES))
+        addition = replace(addition, rows=examples.rows)
         return self._finished(numbers, addition, judged.wrongness, weights)
 
     def _finished(

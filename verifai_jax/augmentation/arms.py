@@ -55,7 +55,7 @@ class Base:
 
     def features(self, table: pd.DataFrame) -> pd.DataFrame:
         """Return the columns of features of rows."""
-        return table[list(self.task.space.columns)].reset_index(drop=True)
+        return table.loc[:, list(self.task.space.columns)].reset_index(drop=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,19 +117,22 @@ class Workshop:
         return pd.concat(parts, ignore_index=True).iloc[:count][list(space.columns)]
 
     def render(self, rows: pd.DataFrame) -> Examples:
-        """Render the inputs of features, and their labels."""
-        rows = rows.loc[:, list(self.task.space.columns)].reset_index(drop=True)
+        """Render the inputs of features, and their labels.
+
+        The rows of the examples are those that were rendered: with the types, and the precision, of
+        features.
+        """
         # One row too many where there is none: it tells the shapes.
         some = rows if len(rows) else self.draw(self.task.space, jax.random.key(0), 1)
-        columns = {str(name): some[name].to_numpy() for name in some.columns}
+        columns = {name: some[name].to_numpy() for name in self.task.space.columns}
         features = self.task.space.features_of(columns)
         if self.task.black_box:
             each = [self._render_one(features, i) for i in range(len(some))]
             inputs, labels = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
         else:
             inputs, labels = in_blocks(self._render, features, len(some))
-        inputs, labels = jax.tree.map(lambda leaf: leaf[: len(rows)], (inputs, labels))
-        return Examples(rows, inputs, labels)
+        whole = Examples(pd.DataFrame(self.task.space.rows(features)), inputs, labels)
+        return whole if len(rows) else whole.take(slice(0, 0))
 
     def _render_one(self, features: PyTree, i: int) -> tuple[Any, Any]:
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[i], features)

@@ -81,12 +81,12 @@ def findings(outcome: Outcome, metric: str = "error") -> list[str]:
 
 
 def _gain(outcome: Outcome, metric: str) -> list[str]:
-    """Compare the gains of counterexamples and random inputs, where both gain."""
+    """Compare the gains of counterexamples and random inputs, where the former is no chance."""
     if not {"none", "random", "counterexamples"} <= {*outcome.arms}:
         return []
     differences = _differences(outcome, metric, "none")
     found = [differences.get(arm) for arm in ("counterexamples", "random")]
-    if any(d is None or not d.mean < 0 for d in found):
+    if any(d is None or not d.mean < 0 for d in found) or not (found[0] and found[0].negative):
         return []
     guided, blind = (-d.mean for d in found if d is not None)
     return [

@@ -19,6 +19,7 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import defined_at, explain_user_error
+from verifai_jax.falsification.table import RESERVED
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
@@ -36,6 +37,8 @@ Transformation: TypeAlias = Callable[[Inputs, Labels, Key[Array, ""]], tuple[Inp
 
 MARGIN = "margin"
 """Signal of the problem of a network: minus the wrongness."""
+_RESERVED = (*RESERVED, "arm", "seed", "wrongness")
+"""Names of columns of results, which no feature may have."""
 _FUNCTIONS = ("render", "label", "train", "predict", "wrongness")
 """Functions that every task has."""
 
@@ -56,7 +59,7 @@ class SupervisedTask:
     - `label`: features -> its label, which the renderer knows without anybody's work.
     - `train`: `(inputs, labels, weights, steps, key) -> weights`: so many training steps from
       these weights, or from initial ones where they are None. A plain Python function, which
-      compiles what it likes; inputs and labels have a leading axis `[n]`.
+      compiles what it likes; inputs and labels are NumPy arrays with a leading axis `[n]`.
     - `predict`: `(weights, inputs) -> predictions`, all with a leading axis `[n]`.
     - `wrongness`: `(prediction, label) -> number` for one input: positive where the prediction is
       wrong, and the more so the greater it is. A number instead of a verdict is what lets a search
@@ -73,7 +76,8 @@ class SupervisedTask:
     - `black_box`: True where render, label, predict, wrongness, present and detected are plain
       Python that JAX cannot trace; they get NumPy arrays, and searches do without gradients.
 
-    **Raises:** `TaskError` for an empty name, a function that is none, or spaces that do not fit.
+    **Raises:** `TaskError` for an empty name, a function that is none, spaces that do not fit, or a
+    feature with the name of a column of results.
     """
 
     name: str
@@ -126,6 +130,12 @@ class SupervisedTask:
             "lanes": check_count("lanes", lanes, error=TaskError),
             "black_box": bool(black_box),
         }
+        taken = next((name for name in values["space"].columns if name in _RESERVED), None)
+        if taken is not None:
+            raise TaskError(
+                f"a feature may not be called {taken!r}: tables of results have a column of that "
+                f"name; reserved are {', '.join(_RESERVED)}"
+            )
         if training_space is not None:
             values["training_space"] = _as_space("training_space", training_space)
             _check_same_columns(values["space"], values["training_space"])
