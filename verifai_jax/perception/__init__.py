@@ -1,5 +1,11 @@
 """A differentiable camera, and small networks that look through it."""
 
+from verifai_jax.perception._detector import Detection as Detection
+from verifai_jax.perception._detector import Detector as Detector
+from verifai_jax.perception._detector import DetectorFileError as DetectorFileError
+from verifai_jax.perception._detector import detector as detector
+from verifai_jax.perception._detector import load_detector as load_detector
+from verifai_jax.perception._detector import save_detector as save_detector
 from verifai_jax.perception.camera import Camera as Camera
 from verifai_jax.perception.camera import facing as facing
 from verifai_jax.perception.conditions import Conditions as Conditions
@@ -17,6 +23,11 @@ from verifai_jax.perception.solids import Box as Box
 from verifai_jax.perception.solids import Cone as Cone
 from verifai_jax.perception.solids import Cylinder as Cylinder
 from verifai_jax.perception.solids import Sphere as Sphere
+from verifai_jax.perception.training import Labels as Labels
+from verifai_jax.perception.training import Score as Score
+from verifai_jax.perception.training import losses_of as losses_of
+from verifai_jax.perception.training import score as score
+from verifai_jax.perception.training import train_detector as train_detector
 
 __all__ = [
     "Box",
@@ -25,17 +36,28 @@ __all__ = [
     "Cone",
     "Cross",
     "Cylinder",
+    "Detection",
+    "Detector",
+    "DetectorFileError",
     "Disc",
     "Ground",
+    "Labels",
     "Line",
     "Rectangle",
     "Ring",
     "Scene",
+    "Score",
     "Sky",
     "Sphere",
     "Sun",
+    "detector",
     "facing",
     "hsv",
+    "load_detector",
+    "losses_of",
+    "save_detector",
+    "score",
+    "train_detector",
 ]
 
 
