@@ -352,7 +352,19 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
     (folder / "sweep.json").write_text("{")
     with pytest.raises(SweepFileError, match=r"sweep.json is damaged"):
         load_sweep(folder)
+    (folder / "sweep.json").write_text(json.dumps({**data, "seed": data["seed"] + 1}))
+    with pytest.raises(SweepFileError, match=r"sweep.json is damaged: its content has changed"):
+        load_sweep(folder)
     (folder / "sweep.json").write_text(json.dumps(data))
+    policy = folder / "policies" / "0.npz"
+    for file in ("curves.npz", "failing.parquet", "policies/0.npz", "table.parquet"):
+        whole = (folder / file).read_bytes()
+        (folder / file).write_bytes(whole[:-30] + bytes([whole[-30] ^ 1]) + whole[-29:])
+        with pytest.raises(SweepFileError, match=f"is damaged: {file} has changed since"):
+            load_sweep(folder)
+        (folder / file).write_bytes(whole)
+    policy.unlink()
+    assert load_sweep(folder).record.policies[0] is None
     (folder / "curves.npz").unlink()
     with pytest.raises(SweepFileError, match="is not whole"):
         load_sweep(folder)

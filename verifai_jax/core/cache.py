@@ -7,11 +7,13 @@
 A cache maps the name of a pure computation to the arrays that it returned, in one SQLite file. Each
 entry is committed when it is finished; in write-ahead mode a process that is killed at any moment
 leaves all committed entries. An entry is the bytes of its arrays with their types and shapes in
-JSON, and a checksum of these and of its name: nothing in it is ever executed.
+JSON, and a checksum of these and of its name: nothing in it is ever executed. An entry that is
+damaged is one that is missing: it is computed anew, and the log says so.
 """
 
 import contextlib
 import json
+import logging
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -21,6 +23,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from verifai_jax.core.locks import write_lock
+
+log = logging.getLogger("verifai_jax.sweeps")
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 """The result of one computation: arrays of numbers or texts, by name."""
@@ -153,15 +157,18 @@ class Cache:
             raise CacheError(f"{self.path} is damaged in its note {name!r}: {error}") from error
 
     def get(self, name: str) -> Arrays | None:
-        """Return the arrays of a finished computation; None where it is not finished.
-
-        **Raises:** `CacheError` for an entry that is damaged.
-        """
+        """Return the arrays of a finished computation; None where it is not, or is damaged."""
         with self._transaction(reading=True):
             row = self._base.execute(
                 "SELECT form, checksum, bytes FROM work WHERE name=?", (name,)
             ).fetchone()
-        return None if row is None else self._decode(name, *row)
+        if row is None:
+            return None
+        try:
+            return self._decode(name, *row)
+        except CacheError as error:
+            log.warning("%s; it is computed anew", error)
+            return None
 
     def put(self, work: Mapping[str, Arrays]) -> None:
         """Store finished computations, all or none of them."""
@@ -207,9 +214,10 @@ class Cache:
             self._base.execute("COMMIT")
         except sqlite3.Error as error:
             what = "is damaged" if isinstance(error, sqlite3.DatabaseError) else "failed"
+            hint = "; restore it from a copy, or give another folder"
             if isinstance(error, sqlite3.OperationalError):
-                what = "cannot be used"  # Locked, read-only, or the disk is full.
-            raise CacheError(f"{self.path} {what}: {error}") from error
+                what, hint = "cannot be used", ""  # Locked, read-only, or the disk is full.
+            raise CacheError(f"{self.path} {what}: {error}{hint}") from error
 
     def _decode(self, name: str, form: str, checksum: int, data: bytes) -> Arrays:
         try:

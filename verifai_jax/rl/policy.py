@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.text import one_line
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
@@ -218,7 +219,7 @@ def load_policy(path: str | Path) -> Policy:
         how = {name: about[name] for name in ("activation", "squash") if name in about}
         return Policy(layers=layers, action=kind, **optional, **how)
     except (KeyError, TypeError, ValueError) as error:
-        raise PolicyFileError(f"{path} holds no policy: {error}") from error
+        raise PolicyFileError(f"{path} holds no policy: {one_line(str(error))}") from error
 
 
 def policy_notes(path: str | Path) -> dict[str, Any]:
@@ -237,4 +238,4 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except FileNotFoundError:
         raise
     except Exception as error:
-        raise PolicyFileError(f"{path} holds no policy: {error}") from error
+        raise PolicyFileError(f"{path} holds no policy: {one_line(str(error))}") from error

@@ -6,10 +6,13 @@
     curves.npz            the learning curves
     policies/12.npz       the policy of row 12; `rl.load_policy` reads it too
 
+`sweep.json` has the checksums of the others and one of itself: what has changed is told by name.
 The study is code, which the files never name: `load_sweep(folder, study)` takes it from its caller.
 """
 
 import json
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.sweeps.record import Curve, SweepRecord
@@ -34,7 +38,7 @@ CURVES = "curves.npz"
 """File of the learning curves."""
 POLICIES = "policies"
 """Folder of the policies."""
-FORMAT = 2
+FORMAT = 3
 """Format of the files; another one is refused."""
 _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version", "seconds")
 """Fields of the record that are plain data."""
@@ -106,10 +110,27 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         "mixed": mixed,
         "worst": _plain(record.worst),
         "space": _space_to_json(stored.space),
+        "checksums": {
+            file.relative_to(folder).as_posix(): zlib.crc32(file.read_bytes())
+            for file in _files(folder, record.rows)
+        },
     }
+    data["checksum"] = _checksum(data)
     partial = folder / f"{RECORD}.part"
     partial.write_text(json.dumps(data, indent=2) + "\n")
     partial.replace(folder / RECORD)
+
+
+def _files(folder: Path, rows: int) -> list[Path]:
+    """Return the files beside the record; rows may have no policy."""
+    policies = (folder / POLICIES / f"{row}.npz" for row in range(rows))
+    return [folder / TABLE, folder / FAILING, folder / CURVES, *(p for p in policies if p.exists())]
+
+
+def _checksum(data: Mapping[str, Any]) -> int:
+    """Return the checksum of a record, but for the field that holds it."""
+    rest = {name: value for name, value in data.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
 
 def read_description(folder: Path) -> dict[str, Any]:
@@ -123,14 +144,16 @@ def read_description(folder: Path) -> dict[str, Any]:
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
         data = json.loads(file.read_text())
-    except ValueError as error:
-        raise SweepFileError(f"{file} is damaged: {error}") from error
+    except (ValueError, RecursionError, IsADirectoryError) as error:
+        raise SweepFileError(f"{file} is damaged: {one_line(str(error))}") from error
     form = data.get("format") if isinstance(data, dict) else None
     if form != FORMAT:
         raise SweepFileError(
             f"{file} has format {form!r}, and this verifai_jax reads format {FORMAT}; "
             "read it with the version that wrote it"
         )
+    if data.get("checksum") != _checksum(data):
+        raise SweepFileError(f"{file} is damaged: its content has changed since it was written")
     return data
 
 
@@ -165,13 +188,25 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
     import pandas as pd
 
     try:
+        _check_files(folder, description["checksums"])
         used = {name: tuple(names) for name, names in description.get("used", {}).items()}
         record, space = _read_record(folder, description), _space_from_json(description["space"])
         return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
-    except (KeyError, TypeError, ValueError, OSError) as error:
-        raise SweepFileError(f"the sweep in {folder} is damaged: {error}") from error
+    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+        reason = one_line(str(error))
+        raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error
+
+
+def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
+    """Check that the files are those that were written; a policy may have been removed."""
+    for name, checksum in checksums.items():
+        file = folder / name
+        optional = name.startswith(f"{POLICIES}/")
+        if not (optional and not file.exists()) and zlib.crc32(file.read_bytes()) != checksum:
+            hint = "; the rest can be read without this file" if optional else ""
+            raise SweepFileError(f"{name} has changed since it was written{hint}")
 
 
 def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
