@@ -17,9 +17,14 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.locks import LOCK, FolderInUse, write_lock
-from verifai_jax.falsification.checkpoint import STATE
+from verifai_jax.falsification.checkpoint import (
+    RECORD_CHECKSUM,
+    ROWS_CHECKSUM,
+    STATE,
+    write_checkpoint,
+)
 from verifai_jax.falsification.run import RECORD
-from verifai_jax.falsification.table import STREAM
+from verifai_jax.falsification.tail import TAIL
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
 
@@ -46,19 +51,6 @@ def full_disk(folder, name):
     (folder / name).symlink_to("/dev/full")
 
 
-class Full:
-    """A writer to a disk that has no room."""
-
-    def __init__(self, file):
-        self.file = file
-
-    def write_batch(self, batch):
-        self.file.write(bytes(99))
-
-    def close(self):
-        pass
-
-
 @pytest.mark.thorough
 def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, monkeypatch):
     folder = tmp_path / "run"
@@ -66,10 +58,9 @@ def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, m
 
     def append(self, columns):
         # The disk is full from the fourth batch on: what is written goes nowhere.
-        if len(self) == 48 and self._stream is not None:
-            self._stream._file.close()
-            self._stream._file = open("/dev/full", "wb")  # noqa: SIM115 - closed by the table
-            self._stream._writer = Full(self._stream._file)
+        if len(self) == 48 and self._tail is not None:
+            self._tail._file.close()
+            self._tail._file = open("/dev/full", "wb")  # noqa: SIM115 - closed by the table
         rows(self, columns)
 
     monkeypatch.setattr(vj.ErrorTable, "append", append)
@@ -87,7 +78,9 @@ def test_a_full_disk_stops_the_run_with_nothing_lost(problem, whole, tmp_path, m
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", [f"{STATE}.part", f"{RECORD}.part", "table.parquet.part"])
+@pytest.mark.parametrize(
+    "name", [f"{STATE}.part", f"{RECORD}.part", ".table.parquet.part", f".{TAIL}.part"]
+)
 def test_a_disk_that_is_full_at_the_end(problem, whole, tmp_path, name):
     folder = tmp_path / "run"
     vj.falsify(problem, "cross_entropy", 64, batch=16, folder=folder)
@@ -111,7 +104,7 @@ def test_a_damaged_folder_is_told(problem, tmp_path):
     run = vj.falsify(problem, "cross_entropy", 64, batch=16, folder=tmp_path / "run")
     assert run.folder is not None
     (run.folder / "table.parquet").unlink()
-    (run.folder / STREAM).write_bytes(b"")
+    (run.folder / TAIL).write_bytes(b"")
     with pytest.raises(ValueError, match="its search had seen 64 simulations, of which its table"):
         vj.resume(run.folder, problem, budget=160)
 
@@ -124,11 +117,17 @@ def kept(problem, tmp_path_factory):
     ).folder
 
 
-def snapshot(rows):
+def snapshot(**changed):
+    """Change arrays of a snapshot, with its checksum as it was or with the right one."""
+
     def write(file):
         with np.load(file) as stored:
             arrays = {name: stored[name] for name in stored.files}
-        np.savez(file, **{**arrays, "rows": rows})
+        if changed.pop("checked", False):
+            checksums = (int(arrays.pop(each)) for each in (ROWS_CHECKSUM, RECORD_CHECKSUM))
+            write_checkpoint({**arrays, **changed}, file.parent, *checksums)
+        else:
+            np.savez(file, **{**arrays, **changed})
 
     return write
 
@@ -139,9 +138,12 @@ def snapshot(rows):
         (lambda file: file.write_bytes(b""), r"search.npz is damaged: "),
         (lambda file: file.write_bytes(file.read_bytes()[:300]), r"search.npz is damaged: BadZip"),
         (lambda file: file.write_text("nonsense"), r"search.npz is damaged: "),
-        (snapshot(np.array(-3)), r"does not say how many rows its search saw"),
-        (snapshot(np.array([1, 2])), r"does not say how many rows its search saw"),
-        (snapshot(np.array(10**12)), r"seen 1000000000000 simulations, of which its table has 64"),
+        (snapshot(rows=np.array(48)), r"search.npz is damaged: its arrays have changed since"),
+        (snapshot(extra=np.ones(3)), r"search.npz is damaged: its arrays have changed since"),
+        (snapshot(checked=True, rows=np.array(-3)), r"does not say how many rows its search saw"),
+        (snapshot(checked=True, rows=np.array([1])), r"does not say how many rows its search saw"),
+        (snapshot(checked=True, rows=np.array(10**12)), r"seen 1000000000000 simulations, of whi"),
+        (snapshot(checked=True, rows=np.array(48)), r"the first 48 rows .* are not those that"),
     ],
 )
 def test_a_damaged_checkpoint_does_not_hide_the_table(problem, whole, kept, tmp_path, damage, told):
@@ -192,9 +194,9 @@ def test_a_table_that_is_damaged_is_told_by_name(problem, kept, tmp_path):
     # Without any snapshot: a run that has ended had rows, or said that it had none.
     (folder / STATE).unlink()
     for garbage in (b"", b"garbage" * 50):
-        (folder / STREAM).write_bytes(garbage)
-        assert "rows.arrows is damaged: it has no row" in vj.load(folder).summary()
-        with pytest.raises(ValueError, match=r"cannot go on: .*rows.arrows is damaged"):
+        (folder / TAIL).write_bytes(garbage)
+        assert "rows.tail is damaged: it has no row" in vj.load(folder).summary()
+        with pytest.raises(ValueError, match=r"cannot go on: .*rows.tail is damaged"):
             vj.resume(folder, problem, budget=160)
 
 

@@ -128,7 +128,7 @@ def falsify(
                 target=target,
             )
     _print(run, pictures)
-    if fail_on is not None and len(run.table.counterexamples):
+    if fail_on is not None and run.table.counts.claimed:
         raise fail_gate()
 
 
@@ -154,7 +154,7 @@ def _print(run: "Run", pictures: bool) -> None:
     assert run.folder is not None
     if run.stopped == "interrupted":
         click.echo(f"  resume       verifai-jax falsify --resume {run.folder}")
-    click.echo(f"  table        {run.folder / 'table.parquet'}")
+    click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
         from verifai_jax.plotting import write_run_pictures
 

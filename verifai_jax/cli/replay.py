@@ -36,7 +36,7 @@ def replay(
         assert run.problem is not None
         precision = run.precision if run.problem.draws() else "float64"
     again = run.replay(number, precision)
-    stored = run.table.all.iloc[number]
+    stored = run.table.row(number)
     click.echo(printable(f"{run.name}, row {number}, {precision}"))
     for name in run.table.features:
         value = stored[name]

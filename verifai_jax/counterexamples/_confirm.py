@@ -199,9 +199,7 @@ def _one(
 ) -> Confirmation:
     number: int | None
     if isinstance(row, (int, np.integer)):
-        if not 0 <= row < len(run.table):
-            raise IndexError(f"row {row} is not in the table of {len(run.table)} simulations")
-        number, values = int(row), run.table.all.iloc[int(row)]
+        number, values = int(row), run.table.row(int(row))
     else:
         name = getattr(row, "name", None)
         number, values = int(name) if isinstance(name, int | np.integer) else None, row

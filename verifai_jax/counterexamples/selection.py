@@ -54,9 +54,7 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     if isinstance(number, bool) or not isinstance(number, int | np.integer):
         raise TypeError(f"row must be the number of a row of the table; got {row!r}")
     number = int(number)
-    if not 0 <= number < run.simulations:
-        raise IndexError(f"row {number} is not in the table of {run.simulations} simulations")
-    entry = {str(name): value for name, value in run.table.all.iloc[number].items()}
+    entry = {str(name): value for name, value in run.table.row(number).items()}
     # A row that was not confirmed is none that the run claims; it may be asked for all the same.
     if number not in failing.index and not bool(entry.get("violated", False)):
         some = ", ".join(map(str, failing.index[:5]))

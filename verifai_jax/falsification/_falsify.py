@@ -21,7 +21,13 @@ from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
-from verifai_jax.falsification.run import RECORD, Run, load, write_record
+from verifai_jax.falsification.run import (
+    RECORD,
+    Run,
+    check_not_continued,
+    load,
+    write_record,
+)
 from verifai_jax.falsification.silent_mistakes import (
     NOMINAL_FAILS,
     nominal_note,
@@ -234,7 +240,10 @@ def resume(
         load(run)  # Says what is missing; a lock would be written to what is no run.
     # The rows are read under the lock, so that nobody adds to them meanwhile.
     with locked(folder):
-        run = load(run, problem) if isinstance(run, str | Path) else run
+        if isinstance(run, str | Path):
+            run = load(run, problem)
+        elif run.folder is not None:
+            check_not_continued(run, run.folder)
         return _resume(run, problem, search, budget, ends, progress)
 
 
@@ -379,7 +388,7 @@ def _run_rounds(
 
     if place is not None:
         with writing(place):
-            write_record(run("running"), place)
+            rounds.record_checksum = write_record(run("running"), place)
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
@@ -403,7 +412,7 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     result = run(stopped)
-    after = notes_after(rounds.table.all, result.formulas, search, warm)
+    after = notes_after(rounds.table, result.formulas, search, warm)
     result = replace(result, notes=(*result.notes, *after))
     try:
         rounds.table.close()

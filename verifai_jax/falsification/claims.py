@@ -15,7 +15,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.confirmation import LIMIT, Confirmer
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.falsification.table import NOT_CLAIMED
+from verifai_jax.falsification.counts import NOT_CLAIMED
 from verifai_jax.problem.problem import Problem
 
 MORE = 4

@@ -19,7 +19,8 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_checkpoint
-from verifai_jax.falsification.table import NOT_CLAIMED, ErrorTable
+from verifai_jax.falsification.counts import NOT_CLAIMED
+from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Diverse, Search
@@ -40,6 +41,7 @@ class Rounds:
 
     `found` counts the counterexamples that are claimed, `violating` the simulations that violate
     the property, and `without_verdict` those that have none; `best` is the least robustness.
+    `record_checksum` is that of the run's record, for the checkpoints.
     `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
     which they were.
     """
@@ -86,6 +88,7 @@ class Rounds:
         self.compile_seconds = self.confirm_seconds = 0.0
         self.checked = ""
         self.checkpoint: dict[str, Any] = {}
+        self.record_checksum = 0
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
@@ -247,8 +250,11 @@ class Rounds:
         now = time.perf_counter()
         if self.folder is None or (seldom and now - self._saved < 1.0):
             return
+        if not self.checkpoint:
+            return  # Interrupted before there was a search: it begins where it would have.
         self._saved = now
-        write_checkpoint(self.checkpoint, self.folder)
+        rows = self.table.digest(int(self.checkpoint.get("rows", 0)))
+        write_checkpoint(self.checkpoint, self.folder, rows, self.record_checksum)
         if self._journal is not None:
             # Only now: rows of the table that the checkpoint does not know are simulated again.
             self._journal.settle(int(self.checkpoint.get("rows", 0)))
@@ -268,11 +274,10 @@ class Rounds:
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
-        table = self.table.all
-        self.without_verdict = len(self.table.failed)
-        self.violating = len(self.table.violating)
-        self.found = len(self.table.counterexamples)
-        self.best = float(np.fmin.reduce(table["rho"].to_numpy(), initial=np.nan))
+        counts = self.table.counts
+        self.without_verdict, self.violating = counts.without_verdict, counts.violating
+        self.found = counts.claimed
+        self.best = counts.least
         self._keep()
 
     def _keep(self) -> None:

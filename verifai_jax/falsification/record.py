@@ -1,15 +1,18 @@
 """The record of a run, `run.json`: everything about it but its table and its checkpoint."""
 
 import json
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.falsification.table import FINISHED, STREAM
+from verifai_jax.falsification.segments import SEGMENTS, list_segments
+from verifai_jax.falsification.table import FINISHED
+from verifai_jax.falsification.tail import TAIL
 
 RECORD = "run.json"
 """Name of the file with everything about a run but its table and its checkpoint."""
-FORMAT = 2
+FORMAT = 3
 """Number of the format of a run's files; others are refused."""
 
 
@@ -40,6 +43,19 @@ ADDED = (
     "checked",
 )
 """Entries that may be absent, as from the records of 0.1."""
+DECIDING = (
+    "features",
+    "name",
+    "formulas",
+    "search_data",
+    "seed",
+    "batch",
+    "precision",
+    "backend",
+    "confirm",
+    "prior",
+)
+"""Entries that decide what the rows of a run are; they stay what they are when it is resumed."""
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -75,12 +91,20 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record
 
 
+def record_checksum(record: Mapping[str, Any]) -> int:
+    """Return a checksum of the entries of a record that decide what the rows of its run are."""
+    deciding = {name: record.get(name) for name in DECIDING}
+    return zlib.crc32(json.dumps(deciding, sort_keys=True).encode())
+
+
 def _rows_beside(folder: Path) -> str:
     """Say how the rows of a folder are read without its record."""
     if (folder / FINISHED).is_file():
         return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"
-    if (folder / STREAM).is_file():
-        return f"; the rows are in {folder / STREAM}: vj.ErrorTable.load(folder, features)"
+    if list_segments(folder / SEGMENTS) and not (folder / TAIL).exists():
+        return f"; the rows are in {folder / SEGMENTS}, which pandas.read_parquet reads"
+    if list_segments(folder / SEGMENTS) or (folder / TAIL).is_file():
+        return f"; the rows are in {folder}: vj.ErrorTable.load(folder, features)"
     return ""
 
 

@@ -19,12 +19,24 @@ from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
+    RECORD_CHECKSUM,
+    ROWS_CHECKSUM,
+    STATE,
     CheckpointError,
     read_checkpoint,
     write_checkpoint,
 )
-from verifai_jax.falsification.record import ADDED, FORMAT, RECORD, RECORDED, read_record
-from verifai_jax.falsification.table import FINISHED, STREAM, ErrorTable
+from verifai_jax.falsification.record import (
+    ADDED,
+    DECIDING,
+    FORMAT,
+    RECORD,
+    RECORDED,
+    read_record,
+    record_checksum,
+)
+from verifai_jax.falsification.table import FINISHED, ErrorTable
+from verifai_jax.falsification.tail import TAIL
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -97,21 +109,28 @@ class Run:
         return len(self.table)
 
     @property
+    def table_path(self) -> Path | None:
+        """File of the table on disk, or folder of a long one: `pandas.read_parquet` opens both.
+
+        None for a run in memory.
+        """
+        if self.folder is None or self.table.path is None:
+            return None
+        return self.folder / self.table.path.name
+
+    @property
     def best(self) -> "pd.Series":
         """The row with the least robustness among the counterexamples, or among all that ended.
 
         **Raises:** `ValueError` when no simulation ended properly.
         """
-        table = self.table.all
-        proper = table.loc[table["status"] == "ok"]
-        if len(claimed := self.table.counterexamples):
-            return claimed.loc[claimed["rho"].idxmin()]
-        if not len(proper):
+        number = self.table.counts.best
+        if number is None:
             raise ValueError(
-                f"run of {self.name!r} has no simulation with a verdict: "
-                f"{len(table)} simulated, {len(self.table.failed)} of them failed"
+                f"run of {self.name!r} has no simulation with a verdict: {self.simulations} "
+                f"simulated, {self.table.counts.without_verdict} of them failed"
             )
-        return proper.loc[proper["rho"].idxmin()]
+        return self.table.row(number)
 
     @property
     def failure_rate(self) -> Rate | None:
@@ -124,7 +143,7 @@ class Run:
         samples of the feature space and at least one of them has a verdict: an active search may
         refute, it never certifies.
         """
-        return self._rate(len(self.table.violating), 0)
+        return self._rate(self.table.counts.violating, 0)
 
     @property
     def confirmed_failure_rate(self) -> Rate | None:
@@ -141,7 +160,7 @@ class Run:
         return self._rate(confirmed, sum(counts.values()) - confirmed - counts.get("refuted", 0))
 
     def _rate(self, failures: int, undecided: int) -> Rate | None:
-        without = len(self.table.failed)
+        without = self.table.counts.without_verdict
         if not self.prior or self.simulations == without:
             return None
         stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
@@ -151,10 +170,7 @@ class Run:
     @property
     def verdict_counts(self) -> dict[str, int]:
         """Number of violating rows by the verdict of closer replays; empty without `confirm`."""
-        violating = self.table.violating
-        if "verdict" not in violating:
-            return {}
-        return {str(name): int(n) for name, n in violating["verdict"].value_counts().items()}
+        return dict(self.table.counts.verdicts)
 
     @property
     def front(self) -> "pd.DataFrame":
@@ -198,9 +214,7 @@ class Run:
                 "give it: vj.load(path, problem)"
             )
         if isinstance(row, (int, np.integer)):
-            if not 0 <= row < len(self.table):
-                raise IndexError(f"row {row} is not in the table of {len(self.table)} simulations")
-            number, values = int(row), self.table.all.iloc[int(row)]
+            number, values = int(row), self.table.row(int(row))
         else:
             index = getattr(row, "name", None)
             number, values = None if index is None else int(index), row
@@ -218,29 +232,61 @@ class Run:
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.
 
-        **Raises:** `FolderInUse` where another process writes there.
+        **Raises:** `FolderInUse` where another process writes there; `ValueError` where it is the
+        run's own folder, and somebody has gone on with the run there.
         """
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
         with write_lock(folder):
-            self.table.save(folder)
-            write_record(self, folder)
+            check_not_continued(self, folder)
+            table = self.table.save(folder)
+            checksum = write_record(self, folder)
             if self.checkpoint:
-                write_checkpoint(self.checkpoint, folder)
+                rows = table.digest(int(self.checkpoint["rows"]))
+                write_checkpoint(self.checkpoint, folder, rows, checksum)
         return folder
 
     def __repr__(self) -> str:
         return self.summary()
 
 
-def write_record(run: Run, folder: Path) -> None:
-    """Write everything about a run but its table to `run.json`."""
+def write_record(run: Run, folder: Path) -> int:
+    """Write everything about a run but its table to `run.json`; return its checksum."""
     record = {"format": FORMAT, "features": list(run.table.features)}
     for name in (*RECORDED, *ADDED):
         record[name] = getattr(run, name)
+    text = json.dumps(record, indent=2) + "\n"
     partial = folder / f"{RECORD}.part"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.write_text(text)
     partial.replace(folder / RECORD)
+    return record_checksum(json.loads(text))
+
+
+def check_not_continued(run: Run, folder: Path) -> None:
+    """Refuse to write a run over its own folder where that has become longer, or another run's.
+
+    **Raises:** `ValueError`.
+    """
+    if run.folder is None or folder.absolute() != run.folder.absolute():
+        return
+    if not (folder / RECORD).exists():
+        return
+    record = read_record(folder)
+    own = {name: getattr(run, name) for name in DECIDING if name != "features"}
+    own["features"] = list(run.table.features)
+    remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
+    if record_checksum(record) != record_checksum(json.loads(json.dumps(own))):
+        raise ValueError(f"{folder} holds another run by now, of {record['name']!r}; {remedy}")
+    rows = ErrorTable.count_rows(folder)
+    if rows > run.simulations:
+        raise ValueError(
+            f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
+            f"this one {run.simulations}; {remedy}"
+        )
+
+
+ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
+"""How to go on with a run that cannot be resumed."""
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
@@ -274,25 +320,37 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     begun = ErrorTable.exists(folder) or record["stopped"] != "running"
     # A run that was cut off before its first batch came to the disk has no rows yet.
     table = ErrorTable.load(folder, features) if begun else ErrorTable(features)
-    checkpoint, damage = None, ""
+    damage, checkpoint = [table.damage] if table.damage else [], None
     try:
         checkpoint = read_checkpoint(folder)
     except CheckpointError as error:
-        damage = f"{error}; its rows are there all the same"
+        damage.append(f"{error}; its rows are there all the same: {ANEW}")
     seen = int(checkpoint["rows"]) if checkpoint else 0
+    if checkpoint and checkpoint[RECORD_CHECKSUM] != record_checksum(record):
+        damage.append(
+            f"{folder / RECORD} is not the one that {STATE} was written with: the run's search, "
+            f"seed, options or formulas have changed; {ANEW}"
+        )
     if seen > len(table):
-        damage = (
+        damage.append(
             f"its search had seen {seen} simulations, of which its table has {len(table)}; files "
             f"of {folder} are missing or damaged"
         )
+    elif checkpoint and not table.missing and checkpoint[ROWS_CHECKSUM] != table.digest(seen):
+        damage.append(
+            f"the first {seen} rows of the table in {folder} are not those that its search had "
+            f"seen: they have changed, or are of another run; {ANEW}"
+        )
     elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
-        damage = damage or f"{folder / STREAM} is damaged: it has no row that can be read"
+        damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
+    elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
+        damage.append(f"{folder / STATE} is missing, which says what its rows are; {ANEW}")
     return Run(
         table=table,
         folder=folder,
         problem=problem,
         checkpoint=checkpoint,
-        damage=damage,
+        damage="; ".join(damage),
         **{name: record[name] for name in RECORDED},
         **{name: record[name] for name in ADDED if name in record},
     )

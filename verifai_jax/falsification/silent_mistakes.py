@@ -2,30 +2,26 @@
 
     notes_before(problem, search)                       # nothing compiles
     nominal_note(problem, evaluate)                     # one simulation, on the run's own engine
-    notes_after(run.table.all, run.formulas)
+    notes_after(run.table, run.formulas, search)
 
 Each is a sentence that is true of the run, for its `notes` and so for its summary.
 """
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, traced_by_default
 from verifai_jax.search import PointList, Search
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
@@ -102,43 +98,52 @@ def _samples(problem: Problem, rows: int) -> int:
 
 
 def notes_after(
-    table: "pd.DataFrame", formulas: Mapping[str, str], search: Search, warm: bool = False
+    table: ErrorTable, formulas: Mapping[str, str], search: Search, warm: bool = False
 ) -> tuple[str, ...]:
     """Return what all simulations of a run have in common and is likely a mistake.
 
     **Arguments:**
 
-    - `table`: of the run, all rows.
+    - `table`: of the run.
     - `formulas`: texts by name.
     - `search`: of the run.
     - `warm`: whether the search began where an earlier run had ended.
     """
-    proper = table["status"].to_numpy() == "ok"
-    count = int(np.sum(proper))
+    count = len(table) - table.counts.without_verdict
     if count < ENOUGH or isinstance(search, PointList):
         return ()
-    if np.all(table["violated"].to_numpy(bool)[proper]):
+    if table.counts.violating == count:
         if warm:
             return ()
         return (
             f"all {count} simulations with a verdict violate the property: are the formula and "
             "its units right?",
         )
-    notes = []
-    for name in formulas if len(formulas) > 1 else [""]:
-        column = f"rho.{name}" if name else "rho"
-        if column in table:
-            which = f"formula {name!r}" if name else "the property"
-            notes += _never_near(which, table[column].to_numpy()[proper])
-    return tuple(notes)
+    if len(formulas) == 1:
+        # The least robustness is known: most tables need not be read for it.
+        ranges = {"the property": _range(table, "rho")} if table.counts.least > 0 else {}
+    else:
+        ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
+    return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))
 
 
-def _never_near(which: str, values: Float[np.ndarray, " n"]) -> list[str]:
-    low, high = float(values.min()), float(values.max())
+def _range(table: ErrorTable, column: str) -> tuple[float, float]:
+    """Return the least and the greatest robustness of all rows with a verdict."""
+    low, high = math.inf, -math.inf
+    for block in table.blocks((column, "status")):
+        values = block[column].to_numpy()[block["status"].to_numpy() == "ok"]
+        if len(values):
+            # Not that of Python, which drops what is not a number.
+            low, high = float(np.minimum(low, values.min())), float(np.maximum(high, values.max()))
+    return low, high
+
+
+def _never_near(which: str, ends: tuple[float, float], count: int) -> list[str]:
+    low, high = ends
     # A constant one counts whole things, or tells how far a truth value is from the other.
     if not 0 < low < high < math.inf or high - low > HARDLY_MOVES * low:
         return []
     return [
         f"{which} was never near being violated: its robustness lay between {low:.4g} and "
-        f"{high:.4g} in all {len(values)} simulations; are its bounds and units right?"
+        f"{high:.4g} in all {count} simulations; are its bounds and units right?"
     ]

@@ -6,8 +6,6 @@ of these     334 confirmed in double precision, 102 refuted and not claimed, 168
 failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 """
 
-import numpy as np
-
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmation import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
@@ -16,16 +14,17 @@ from verifai_jax.falsification.run import Run
 
 def summarize(run: Run) -> str:
     """Write the summary of a run, every number of it from its table."""
-    violating, failed = len(run.table.violating), run.table.failed
+    counts = run.table.counts
+    violating, failed = counts.violating, counts.without_verdict
     lines = [f"{run.name}: {_headline(run, violating)}"]
     for name, text in run.formulas.items():
         lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
         if len(run.formulas) > 1 and violating:
-            lines[-1] += f" (fails in {_failing_alone(run, name):,})"
+            lines[-1] += f" (fails in {counts.failing_alone[name]:,})"
     if violating and (verdicts := _closer_look(run)):
         lines.append(f"  of these     {verdicts}")
     lines += _rates(run)
-    if len(failed) < run.simulations:
+    if failed < run.simulations:
         best = run.best.to_dict()
         labels = None if run.problem is None else run.problem.space.labels(run.problem.duration)
         where = format_features({name: best[name] for name in run.table.features}, labels)
@@ -34,16 +33,14 @@ def summarize(run: Run) -> str:
             f"  {'worst' if best['violated'] else 'nearest':<13}row {run.best.name}"
             f"{f' ({verdict})' if verdict else ''}, robustness {best['rho']:.4g} at {where}"
         )
-    if len(failed):
-        counts = ", ".join(f"{n} {status}" for status, n in failed["status"].value_counts().items())
-        lines.append(f"  no verdict   {counts}")
-        if "message" in failed and len(raised := failed.loc[failed["message"] != ""]):
-            number, message = raised.index[0], raised["message"].iloc[0]
-            lines.append(f"               first in row {number}: {one_line(str(message))}")
-    if "gradient_finite" in run.table.all:
-        lost = run.simulations - int(np.sum(run.table.all["gradient_finite"].to_numpy(bool)))
-        if lost:
-            lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
+    if failed:
+        statuses = ", ".join(f"{n} {status}" for status, n in counts.failed.items())
+        lines.append(f"  no verdict   {statuses}")
+        if counts.first_message is not None:
+            number, message = counts.first_message
+            lines.append(f"               first in row {number}: {one_line(message)}")
+    if lost := counts.not_differentiated:
+        lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
     lines.extend(f"  note         {note}" for note in run.notes)
     if run.damage:
         lines.append(f"  damaged      {run.damage}")
@@ -70,7 +67,7 @@ def summarize(run: Run) -> str:
 
 def _headline(run: Run, violating: int) -> str:
     """Write how many simulations violate the property, and whatever makes that number doubtful."""
-    without = len(run.table.failed)
+    without = run.table.counts.without_verdict
     if run.simulations and without == run.simulations:
         return f"no verdict: none of {run.simulations} simulations ended properly"
     text = f"{violating} of {run.simulations} simulations violate the property"
@@ -109,16 +106,6 @@ _UNDECIDED_IN_WORDS = {
 }
 
 
-def _failing_alone(run: Run, name: str) -> int:
-    """Count the rows that violate one of several formulas."""
-    violating = run.table.violating
-    rho = violating[[f"rho.{each}" for each in run.formulas]].to_numpy(np.float64)
-    own = violating[f"rho.{name}"].to_numpy(np.float64)
-    # At exactly zero the row does not say which formula is strict, unless there is only one.
-    alone = (own == 0) & (np.sum(rho <= 0, axis=1) == 1)
-    return int(np.sum((own < 0) | alone))
-
-
 def _rates(run: Run) -> list[str]:
     """Write the failure rate as simulated, and that of confirmed failures where it differs."""
     if not run.prior:
@@ -130,6 +117,6 @@ def _rates(run: Run) -> list[str]:
         return []
     lines = [f"  failure rate {run.failure_rate} as simulated"]
     confirmed = run.confirmed_failure_rate
-    if confirmed is not None and confirmed.failures < len(run.table.violating):
+    if confirmed is not None and confirmed.failures < run.table.counts.violating:
         lines.append(f"               {confirmed} confirmed")
     return lines

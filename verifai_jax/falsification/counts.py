@@ -1,0 +1,113 @@
+"""Counts over the rows of a table that stand out: what a summary says, without the other rows."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.falsification.columns import Columns
+
+NOT_CLAIMED = ("fragile", "refuted")
+"""Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
+
+
+@dataclass
+class Counts:
+    """Counts over a table, from the rows of it that stand out.
+
+    - `violating`: rows that violate the property as simulated.
+    - `claimed`: those among them that closer replays did not refute.
+    - `failing_alone`: violating rows that violate this formula, where there are several.
+    - `failed`: rows without a verdict, by status, the most frequent first.
+    - `verdicts`: violating rows by what closer replays say, the most frequent first.
+    - `worst`: number of the row of least robustness among those claimed; None without one.
+    - `nearest`: that among all rows with a verdict.
+    - `least`: the least robustness of all rows; NaN where none has one.
+    - `first_message`: number and text of the first row that has one, of those without a verdict.
+    - `not_differentiated`: rows whose gradient is not finite.
+    """
+
+    violating: int = 0
+    claimed: int = 0
+    failing_alone: Counter[str] = field(default_factory=Counter)
+    failed: dict[str, int] = field(default_factory=dict)
+    verdicts: dict[str, int] = field(default_factory=dict)
+    worst: int | None = None
+    nearest: int | None = None
+    least: float = float("nan")
+    first_message: tuple[int, str] | None = None
+    not_differentiated: int = 0
+
+    @property
+    def without_verdict(self) -> int:
+        """Rows without a verdict."""
+        return sum(self.failed.values())
+
+    @property
+    def best(self) -> int | None:
+        """Number of the worst row, or of the nearest where none is claimed."""
+        return self.nearest if self.worst is None else self.worst
+
+
+def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
+    """Tell rows that violate the property and are claimed to."""
+    claimed = violating_rows(columns)
+    if "verdict" in columns:
+        places = np.flatnonzero(claimed)
+        claimed[places] = ~np.isin(columns["verdict"][places], NOT_CLAIMED)
+    return claimed
+
+
+def violating_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
+    """Tell rows that ended properly and violate the property as simulated."""
+    return (columns["status"] == "ok") & columns["violated"].astype(bool)
+
+
+def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
+    """Count over parts of a table in their order: numbers of rows, and their columns."""
+    counts, statuses, verdicts = Counts(), Counter[str](), Counter[str]()
+    lowest = {"worst": np.inf, "nearest": np.inf}
+    for numbers, columns in parts:
+        if not len(numbers):
+            continue
+        proper = columns["status"] == "ok"
+        violating, claimed = violating_rows(columns), claimed_rows(columns)
+        counts.violating += int(np.sum(violating))
+        counts.claimed += int(np.sum(claimed))
+        statuses.update(map(str, columns["status"][~proper]))
+        if "verdict" in columns:
+            verdicts.update(map(str, columns["verdict"][violating]))
+        least = np.fmin.reduce(np.asarray(columns["rho"], np.float64))
+        counts.least = float(np.fmin(counts.least, least))
+        rho = np.nan_to_num(np.asarray(columns["rho"], np.float64), nan=np.inf)
+        for name, among in (("worst", claimed), ("nearest", proper)):
+            places = np.flatnonzero(among)
+            if len(places):
+                place = places[np.argmin(rho[places])]
+                if getattr(counts, name) is None or rho[place] < lowest[name]:
+                    setattr(counts, name, int(numbers[place]))
+                    lowest[name] = float(rho[place])
+        if counts.first_message is None and "message" in columns:
+            said = (i for i in np.flatnonzero(~proper) if columns["message"][i])
+            if (first := next(said, None)) is not None:
+                counts.first_message = int(numbers[first]), str(columns["message"][first])
+        if "gradient_finite" in columns:
+            finite = columns["gradient_finite"].astype(bool)
+            counts.not_differentiated += int(np.sum(~finite))
+        each = [name for name in columns if name.startswith("rho.")]
+        if each:
+            of_each = np.stack([columns[name][violating] for name in each], axis=1)
+            failing = _failing_alone(of_each.astype(np.float64))
+            counts.failing_alone.update(
+                {name.removeprefix("rho."): int(n) for name, n in zip(each, failing, strict=True)}
+            )
+    counts.failed, counts.verdicts = dict(statuses.most_common()), dict(verdicts.most_common())
+    return counts
+
+
+def _failing_alone(rho: Float[np.ndarray, "n formulas"]) -> Int[np.ndarray, " formulas"]:
+    # At exactly zero the row does not say which formula is strict, unless there is only one.
+    only = np.sum(rho <= 0, axis=1, keepdims=True) == 1
+    return np.sum((rho < 0) | ((rho == 0) & only), axis=0)

@@ -1,0 +1,205 @@
+"""The rows of a long run on disk: closed Parquet files of a fixed number of rows each.
+
+    table/rows-000000000000-000001048576-9f3c2a1b.parquet       rows 0 to 1048575
+    failures/rows-000000000000-000001048576-07d1e44a.parquet    those of them that stand out
+
+A file is written once, in whole, and renamed into place; its name has its first row, the one behind
+its last, and its checksum. Beside each segment stand the rows of it that stand out: those that
+violate the property, have no verdict or a gradient that is not finite, and the one of least
+robustness. What counts or shows failures reads these alone. `pandas.read_parquet` opens either
+folder as one table.
+"""
+
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Int
+
+from verifai_jax.core.text import format_error
+from verifai_jax.falsification.columns import ROW, Columns
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+SEGMENT_ROWS = 1 << 20
+"""Rows of a closed segment."""
+SEGMENTS = "table"
+"""Name of the folder of the segments."""
+FAILURES = "failures"
+"""Name of the folder of the rows that stand out."""
+_NAME = re.compile(r"rows-(\d{12})-(\d{12})-([0-9a-f]{8})\.parquet")
+_BLOCK = 1 << 20
+
+
+class TableError(ValueError):
+    """An error for a table on disk that is damaged."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The rows `first` to `stop - 1` of a table on disk, in the file `path`."""
+
+    first: int
+    stop: int
+    path: Path
+
+    def __len__(self) -> int:
+        return self.stop - self.first
+
+    @property
+    def damage(self) -> str:
+        """Say what has become of the file; empty where it is as it was written."""
+        try:
+            checksum = 0
+            with open(self.path, "rb") as file:
+                while block := file.read(_BLOCK):
+                    checksum = zlib.crc32(block, checksum)
+        except OSError as error:
+            return format_error(error)
+        return "" if self._is_of(checksum) else "its bytes have changed"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its columns.
+
+        **Raises:** `TableError` for a file that is damaged.
+        """
+        import pyarrow.parquet as pq
+
+        try:
+            return tuple(name for name in pq.read_schema(self.path).names if name != ROW)
+        except Exception as error:
+            raise TableError(f"{self.path} is damaged: {format_error(error)}") from error
+
+    def read(self, columns: Sequence[str] | None = None) -> "pd.DataFrame":
+        """Return its rows, or some columns of them, indexed by row number.
+
+        **Raises:** `TableError` for a file that is damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        try:
+            content = self.path.read_bytes()
+            if not self._is_of(zlib.crc32(content)):
+                raise TableError(f"{self.path} is damaged: its bytes have changed")
+            names = None if columns is None else [ROW, *columns]
+            return pq.read_table(pa.BufferReader(content), columns=names).to_pandas()
+        except (TableError, PermissionError):
+            raise
+        except FileNotFoundError as error:
+            raise TableError(f"{self.path} is gone; was the run's folder moved?") from error
+        except Exception as error:  # Whoever wrote the file, it is none of ours.
+            raise TableError(f"{self.path} is damaged: {format_error(error)}") from error
+
+    def read_standing_out(self) -> "pd.DataFrame":
+        """Return those of its rows that stand out, from their own file where it is whole."""
+        folder = self.path.parent.parent / FAILURES
+        for beside in list_segments(folder):
+            if (beside.first, beside.stop) == (self.first, self.stop) and not beside.damage:
+                return beside.read()
+        frame = self.read()
+        return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
+
+    def _is_of(self, checksum: int) -> bool:
+        return self.path.name.endswith(f"-{checksum:08x}.parquet")
+
+
+def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
+    """Return the places of the rows that counts, statistics and searches for failures need."""
+    proper = columns["status"] == "ok"
+    out = ~proper | columns["violated"].astype(bool)
+    if "gradient_finite" in columns:
+        out = out | ~columns["gradient_finite"].astype(bool)
+    rho = np.where(proper, columns["rho"], np.nan)
+    if not np.all(np.isnan(rho)):
+        out[np.nanargmin(rho)] = True
+    return np.flatnonzero(out)
+
+
+def write_segment(run: Path, first: int, columns: Columns) -> Segment:
+    """Write rows from `first` on into the folder of a run, and those that stand out beside them.
+
+    **Raises:** `OSError` where they cannot be written.
+    """
+    places = standing_out(columns)
+    few = {name: values[places] for name, values in columns.items()}
+    stop = first + len(columns["rho"])
+    # First: without its segment it is none, and the segment comes with one.
+    _write(run / FAILURES, first, stop, parquet(few, first + places))
+    path = _write(run / SEGMENTS, first, stop, parquet(columns, np.arange(first, stop)))
+    return Segment(first, stop, path)
+
+
+def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
+    folder.mkdir(exist_ok=True)
+    return write_whole(
+        folder / f"rows-{first:012d}-{stop:012d}-{zlib.crc32(content):08x}.parquet", content
+    )
+
+
+def write_whole(path: Path, content: "pa.Buffer | bytes") -> Path:
+    """Write a file such that a reader never meets a half of it; return its path."""
+    partial = path.with_name(f".{path.name}.part")  # Readers of a folder leave it out.
+    try:
+        with open(partial, "wb") as file:
+            file.write(content)
+        partial.replace(path)
+    except OSError:
+        partial.unlink(missing_ok=True)  # What little room there is, others need.
+        raise
+    return path
+
+
+def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":
+    """Return rows as the content of a Parquet file, which pandas indexes by row number."""
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {ROW: pa.array(rows), **{name: pa.array(v) for name, v in columns.items()}}
+    one = pd.DataFrame({name: values[:1] for name, values in columns.items()})
+    one.index = pd.Index(rows[:1], name=ROW)
+    metadata = pa.Schema.from_pandas(one, preserve_index=True).metadata
+    table = pa.table(arrays).replace_schema_metadata(metadata)
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    sink = pa.BufferOutputStream()
+    pq.write_table(
+        table,
+        sink,
+        # Numbers that a search chose hardly repeat, and those of the rows follow each other.
+        use_dictionary=texts,  # pyright: ignore[reportArgumentType]
+        column_encoding={ROW: "DELTA_BINARY_PACKED"},
+        write_page_checksum=True,
+    )
+    return sink.getvalue()
+
+
+def list_segments(folder: Path) -> list[Segment]:
+    """Return the segments of a folder in the order of their rows, whole or not."""
+    found = []
+    if folder.is_dir():
+        for path in folder.iterdir():
+            if (match := _NAME.fullmatch(path.name)) and int(match[1]) < int(match[2]):
+                found.append(Segment(int(match[1]), int(match[2]), path))
+    return sorted(found, key=lambda each: (each.first, each.stop, each.path.name))
+
+
+def remove_segments(run: Path, begin: int) -> None:
+    """Remove the segments of a run with rows from `begin` on, the last one first."""
+    for name in (SEGMENTS, FAILURES):
+        folder = run / name
+        for segment in reversed(list_segments(folder)):
+            if segment.stop > begin:
+                segment.path.unlink(missing_ok=True)
+        if not folder.is_symlink() and folder.is_dir():
+            for partial in folder.glob(".rows-*.part"):
+                partial.unlink(missing_ok=True)
+            if not any(folder.iterdir()):
+                folder.rmdir()
