@@ -1,5 +1,7 @@
 """Whole augmentations of a tiny task: arms, paired numbers, resuming, and what goes wrong."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,6 +143,25 @@ def test_an_interrupted_study_goes_on(whole, tmp_path):
         whole_again.table.sort_values(columns, ignore_index=True),
         expected.sort_values(columns, ignore_index=True),
     )
+
+
+def test_a_search_that_is_interrupted_leaves_no_table(tmp_path, monkeypatch):
+    from verifai_jax.augmentation import _augment
+
+    def cut(*arguments, **options):
+        run = search(*arguments, **options)
+        return replace(run, stopped="interrupted")
+
+    search = _augment.falsify
+    monkeypatch.setattr(_augment, "falsify", cut)
+    options = {**SMALL, "steps": STEPS, "further_steps": STEPS, "hard": 0}
+    result = vj.augment(TASK, "counterexamples", seeds=1, folder=tmp_path, **options)
+    assert not result.complete
+    assert list(result.table["arm"]) == ["base"]
+    monkeypatch.undo()
+    result = vj.augment(TASK, "counterexamples", seeds=1, folder=tmp_path, **options)
+    assert result.complete
+    assert len(result.error_tables[0]) == SMALL["budget"]
 
 
 def test_pictures(whole, tmp_path):

@@ -339,6 +339,9 @@ class _Seed:
                 problem, self.plan.search, self.plan.budget,
                 seed=seed, confirm=False, progress=False,
             )  # fmt: skip
+            if run.stopped == "interrupted":
+                # A search ends with what it has; a table that is cut short is no finished work.
+                raise KeyboardInterrupt
             names = [*self.task.space.columns, "rho", "violated", "status"]
             return encode_frame(run.table.all.loc[:, names].reset_index(drop=True))
 
@@ -452,8 +455,8 @@ def _searched(
     Without gradients one program serves the networks of all seeds, with their weights as arguments;
     with gradients each network has its own.
     """
-    traced = needs_gradient(search) or isinstance(search, Portfolio)
-    if task.black_box or traced or workshop is None:
+    slopes = needs_gradient(search) or isinstance(search, Portfolio)
+    if workshop is None or (slopes and not task.black_box):
         return task.problem(weights)
     return Problem(task.name, task.space, _Judged(workshop, weights), f"{MARGIN} >= 0")
 

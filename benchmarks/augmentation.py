@@ -1,0 +1,87 @@
+"""Ten ways to choose training data for a network that sees cones, over seeds; see RESULTS.md.
+
+    python benchmarks/augmentation.py in_distribution [--seeds 5] [--folder augmentations]
+    python benchmarks/augmentation.py shifted [--seeds 5] [--folder augmentations]
+    python benchmarks/augmentation.py rules
+
+The scene, the network and the closed loop are those of `benchmarks/augmentation_scene.py`.
+`in_distribution`: the base is trained on 1000 images from the whole domain. `shifted`: from a
+domain without orange and red cars and without glare; error table and tests are of the whole, and
+the failure rate of the closed loop is measured. `rules`: the rules of the shifted base's error
+table. Interrupted, either of the first two goes on where it was.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+from augmentation_scene import least_gaps, task
+
+import verifai_jax as vj
+from verifai_jax.statistics.paired import paired_difference
+
+OPTIONS = {"initial": 1000, "added": 200, "steps": 600, "further_steps": 300}
+
+
+def compare(result, metric):
+    """Print every arm's mean of a metric, and its differences to none and to random."""
+    print(f"\n{metric}: means over seeds, and differences with 95 % t intervals")
+    for arm, mean in result.means[metric].items():
+        row = f"  {arm:<16}{100 * mean:6.2f} %"
+        for reference in ("none", "random"):
+            difference = result.compare(metric, reference).get(arm)
+            if difference is None:
+                row += f"{'':28}"
+                continue
+            ends = f"({100 * difference.low:+.2f} to {100 * difference.high:+.2f})"
+            row += f"  {100 * difference.mean:+6.2f} {ends:<19}"
+        print(row)
+
+
+def run(args, shifted):
+    name = "shifted" if shifted else "in_distribution"
+    folder = None if args.folder is None else Path(args.folder) / name
+    result = vj.augment(task(shifted), "all", seeds=args.seeds, folder=folder, **OPTIONS)
+    print(result)
+    for metric in result.metrics:
+        compare(result, metric)
+    differences = result.compare("error", "none")
+    guided, blind = differences["counterexamples"], differences["random"]
+    print(f"\ngain of counterexamples over that of random inputs: {guided.mean / blind.mean:.2f}")
+    print(f"counterexamples against random: {result.compare('error', 'random')['counterexamples']}")
+    errors = {
+        arm: result.table.loc[result.table["arm"] == arm, "error"].to_numpy() for arm in result.arms
+    }
+    # Twice the gain of random inputs: 2 random - none is what counterexamples have to beat.
+    twice = paired_difference(errors["counterexamples"], 2 * errors["random"] - errors["none"])
+    print(f"counterexamples against twice the gain of random: {twice}")
+    if folder is not None:
+        result.plot(folder / "arms.png")
+        result.montage(folder / "added.png")
+        if shifted:
+            result.plot(folder / "loop.png", "loop_failures")
+    if shifted:
+        gaps, _ = least_gaps(None, jax.random.key(1), 10_240, "truth")
+        print(
+            f"with perfect perception {int((gaps < 0.8).sum())} of {len(gaps)} drives fail; "
+            f"least gap {gaps.min():.2f} m"
+        )
+
+
+def rules(args):
+    """Print the rules of the error table of the shifted base."""
+    options = {**OPTIONS, "budget": 4000, "hard": 0}
+    result = vj.augment(task(True), "counterexamples", seeds=1, **options)
+    print(vj.analysis.rules(result.error_tables[0]))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("what", choices=("in_distribution", "shifted", "rules"))
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--folder", type=str)
+    arguments = parser.parse_args()
+    if arguments.what == "rules":
+        rules(arguments)
+    else:
+        run(arguments, arguments.what == "shifted")
