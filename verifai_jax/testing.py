@@ -221,7 +221,7 @@ def check_system(
     **Raises:** `AssertionError` naming the broken law.
     """
     points = jax.random.uniform(jax.random.key(seed), (samples, space.dim), jnp.float32)
-    features = jax.jit(jax.vmap(space.unflatten))(points)
+    features = space.features_at(points)
     keys = jax.random.split(jax.random.key(seed), samples)
     each = [jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], features) for i in range(samples)]
     system, forms = as_system(system), jax.eval_shape(space.unflatten, jnp.zeros(space.dim))

@@ -127,6 +127,19 @@ def test_the_same_seed_gives_the_same(edges):
 
 
 @pytest.mark.thorough
+def test_another_row_compiles_nothing(edges):
+    one, other = starts(edges, 2)
+    shrink(edges, int(one), seed=5)
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **about: compiled.append((event, about.get("fun_name")))
+    )
+    found = shrink(edges, int(other), seed=6)
+    found.replay()
+    assert [name for event, name in compiled if event.endswith("backend_compile_duration")] == []
+
+
+@pytest.mark.thorough
 def test_a_few_simulations_do_not_make_it_safe(edges):
     for budget in (1, 5, 20):
         found = shrink(edges, budget=budget)

@@ -1,6 +1,7 @@
 """A search that is kept away from what it has found: the contract, the modes, distinct points."""
 
 import math
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -144,10 +145,14 @@ def test_modes_in_other_dimensions(d, count, least):
     assert found.mean() >= least
 
 
+@cache
+def compiled_tell(search):
+    return jax.jit(search.tell, static_argnums=1)
+
+
 def told(search, state, cube, u, rho, gradient=None):
     u, rho = jnp.asarray(u, jnp.float32), jnp.asarray(rho, jnp.float32)
-    tell = jax.jit(search.tell, static_argnums=1)
-    return tell(state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient))
+    return compiled_tell(search)(state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient))
 
 
 @pytest.mark.thorough

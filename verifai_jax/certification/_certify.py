@@ -220,15 +220,9 @@ def _columns(space: FeatureSpace, u: np.ndarray) -> dict[str, np.ndarray]:
     for start in range(0, len(u), ROWS):
         part = u[start : start + ROWS]
         whole = np.pad(part, ((0, ROWS - len(part)), (0, 0)), mode="edge")
-        features = jax.device_get(_features(space)(whole))
+        features = jax.device_get(space.features_at(whole))
         parts.append({name: col[: len(part)] for name, col in space.rows(features).items()})
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def _features(space: FeatureSpace) -> Any:
-    if "features" not in space.__dict__:
-        space.__dict__["features"] = jax.jit(jax.vmap(space.unflatten))
-    return space.__dict__["features"]
 
 
 class _Report:

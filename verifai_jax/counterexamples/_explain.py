@@ -120,7 +120,7 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     why = replayed.explain()
     fixed = fix_key(problem, run, number)
     features = problem.space.from_row(entry)
-    u = at.settle(np.asarray(jax.jit(problem.space.flatten)(features))[None])[0]
+    u = at.settle(np.asarray(problem.space.point_of(features))[None])[0]
     candidates = Candidates(fixed, at, 10**9, run.precision)
     groups = at.groups
     singles = list(range(len(u)))
@@ -180,6 +180,6 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
 
 def values_of(space: FeatureSpace, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:
     """Return the entries of the table's columns of one feature at a point."""
-    features = jax.tree.map(lambda leaf: np.asarray(leaf)[None], jax.jit(space.unflatten)(u))
+    features = jax.tree.map(np.asarray, space.features_at(u[None]))
     columns = space.domains[name].to_columns(features[name], name)
     return tuple(c[0].item() if isinstance(c[0], np.generic) else c[0] for c in columns.values())

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
@@ -204,7 +203,7 @@ def shrink(
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
             f"({reason}); see what confirm says of it, and shrink another"
         )
-    u = np.asarray(jax.jit(problem.space.flatten)(problem.space.from_row(first)))
+    u = np.asarray(problem.space.point_of(problem.space.from_row(first)))
     start = at.settle(u[None])
     if stay:
         at = at.restrict_to_side(start[0])
@@ -444,7 +443,7 @@ def _verified(
 
 def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[Any, Any]]:
     """Return the coordinates that depart: the nominal value of each and that at `u`."""
-    pair = jax.jit(jax.vmap(nominal.space.unflatten))(np.stack([nominal.u, u]))
+    pair = nominal.space.features_at(np.stack([nominal.u, u]))
     columns = nominal.space.rows(pair)
     names = list(columns) if len(columns) == len(u) else []
     changed = {}

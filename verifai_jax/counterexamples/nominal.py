@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -61,7 +60,7 @@ class Nominal:
             )
         # What a view of the space holds fixed is not said again.
         features = space.coerce({name: whole[name] for name in varied})
-        return cls(space, np.asarray(jax.jit(space.flatten)(features), np.float32))
+        return cls(space, np.asarray(space.point_of(features), np.float32))
 
     def restrict_to_side(self, u: Float[np.ndarray, " d"]) -> "Nominal":
         """Return the same point with departures allowed only to the side on which `u` is.

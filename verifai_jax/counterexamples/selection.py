@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -84,8 +83,7 @@ def select_others(run: Run, nominal: Nominal, number: int, most: int) -> Float[n
 
 def _rough_distance(nominal: Nominal, rows: pd.DataFrame) -> Float[np.ndarray, " n"]:
     """Estimate how far rows are from nominal from the table, since points take time to compute."""
-    at = jax.jit(nominal.space.unflatten)(nominal.u)
-    columns = nominal.space.rows(jax.tree.map(lambda leaf: np.asarray(leaf)[None], at))
+    columns = nominal.space.rows(nominal.space.features_at(nominal.u[None]))
     total = np.zeros(len(rows))
     for name, value in columns.items():
         entries = rows[name].to_numpy()
@@ -99,7 +97,5 @@ def _rough_distance(nominal: Nominal, rows: pd.DataFrame) -> Float[np.ndarray, "
 
 def columns_at(problem: Problem, u: Float[np.ndarray, " d"]) -> dict[str, Any]:
     """Return the row of a table with the features at a point."""
-    features = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[None], jax.jit(problem.space.unflatten)(u)
-    )
-    return {name: column[0] for name, column in problem.space.rows(features).items()}
+    columns = problem.space.rows(problem.space.features_at(u[None]))
+    return {name: column[0] for name, column in columns.items()}

@@ -112,7 +112,7 @@ class SeedClaims:
         padded = np.pad(u, ((0, (1 << (len(u) - 1).bit_length()) - len(u)), (0, 0)), mode="edge")
         space = self.problem.space
         with in_precision(self.precision):
-            features = jax.jit(jax.vmap(space.unflatten))(padded.astype(self.precision))
+            features = space.features_at(padded.astype(self.precision))
             columns = space.rows(jax.tree.map(np.asarray, features))
         return {name: column[: len(u)] for name, column in columns.items()}
 

@@ -10,7 +10,6 @@ Each is a sentence that is true of the run, for its `notes` and so for its summa
 import math
 from collections.abc import Mapping
 
-import jax
 import numpy as np
 
 from verifai_jax.core.programs import Slot
@@ -82,7 +81,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     space = problem.space
     nominal = problem.nominal or {}
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
-    u = np.asarray(jax.jit(space.flatten)(space.coerce(varied)), np.float32)
+    u = np.asarray(space.point_of(space.coerce(varied)), np.float32)
     verdict = engine.evaluate(u[None], evaluate.key, 0)
     if not verdict.violated[0]:
         return ()

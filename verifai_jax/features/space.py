@@ -154,6 +154,20 @@ class FeatureSpace:
         return self.root.to_unit(self.root.coerce(self._completed(features)))
 
     @cached_property
+    def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
+        """`unflatten` as a compiled function of points `[n, dim]`, compiled once for each `n`."""
+        return jax.jit(jax.vmap(self.unflatten))
+
+    @cached_property
+    def point_of(self) -> Callable[[Mapping[str, Any]], Float[Array, " dim"]]:
+        """`flatten` as a compiled function of the features of one simulation."""
+        return jax.jit(self.flatten)
+
+    @cached_property
+    def _points_of(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
+        return jax.jit(jax.vmap(self.flatten))
+
+    @cached_property
     def cube(self) -> Cube:
         """The unit cube of this space, as searches see it."""
         return Cube(
@@ -173,7 +187,7 @@ class FeatureSpace:
         records = rows.loc[:, list(self.columns)].to_dict("records")
         features = [self.from_row(row) for row in records]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *features)
-        return np.asarray(jax.jit(jax.vmap(self.flatten))(stacked))
+        return np.asarray(self._points_of(stacked))
 
     def features_of(
         self, rows: Mapping[str, Numbers], precision: str = "float32"
@@ -268,12 +282,11 @@ class FeatureSpace:
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ValueError(f"the number of samples must be a positive integer; got {count!r}")
         samples, total = [], 0
-        many = jax.jit(jax.vmap(self.unflatten))
         while total < count:
             key, now = jax.random.split(key)
             points = jax.random.uniform(now, (max(count, 64), self.dim))
             accepted = np.flatnonzero(self.accepts_points(points))[: count - total]
-            samples.append(jax.tree.map(lambda leaf, i=accepted: leaf[i], many(points)))
+            samples.append(jax.tree.map(lambda leaf, i=accepted: leaf[i], self.features_at(points)))
             total += len(accepted)
         return jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
 

@@ -4,8 +4,7 @@ values_at(space, points)                            # [{"learning_rate": 0.001, 
 probe_values(space.domains["width"])                # [(16, "a choice"), (64, "a choice")]
 """
 
-from collections.abc import Callable, Mapping
-from functools import lru_cache
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import jax
@@ -45,14 +44,8 @@ def values_at(space: FeatureSpace, points: Float[np.ndarray, "n dim"]) -> list[H
     for start in range(0, len(points), _CHUNK):
         some = points[start : start + _CHUNK]
         padded = np.pad(some, ((0, _CHUNK - len(some)), (0, 0)), mode="edge")
-        values += values_of_features(space, _unflatten(space)(padded))[: len(some)]
+        values += values_of_features(space, space.features_at(padded))[: len(some)]
     return values
-
-
-@lru_cache(maxsize=16)
-def _unflatten(space: FeatureSpace) -> Callable[[Float[np.ndarray, "n dim"]], dict[str, Any]]:
-    """Compile the map from points to features, once for a space."""
-    return jax.jit(jax.vmap(space.unflatten))
 
 
 def values_of_features(space: FeatureSpace, features: Mapping[str, Any]) -> list[Hyperparameters]:

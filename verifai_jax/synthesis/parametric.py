@@ -12,7 +12,7 @@ is not simulated, and its robustness is infinite.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -346,7 +346,7 @@ def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:
     u = np.asarray(points, np.float32).reshape(len(points), space.dim)
     padded = np.pad(u, ((0, -len(u) % ROWS), (0, 0)), constant_values=0.5)
     parts = [
-        space.rows(jax.tree.map(np.asarray, _unflatten(space)(padded[start : start + ROWS])))
+        space.rows(jax.tree.map(np.asarray, space.features_at(padded[start : start + ROWS])))
         for start in range(0, max(len(padded), 1), ROWS)
         if len(padded)
     ]
@@ -363,11 +363,6 @@ def rows_of(space: FeatureSpace | None, points: Any) -> "pd.DataFrame":
     if space is None:
         return pd.DataFrame(index=range(len(points)))
     return pd.DataFrame(columns_of(space, points))
-
-
-@lru_cache(maxsize=32)
-def _unflatten(space: FeatureSpace) -> Any:
-    return jax.jit(jax.vmap(space.unflatten))
 
 
 def _plain(domain: Any, name: str, columns: dict[str, Any]) -> Any:

@@ -98,13 +98,12 @@ def marginals(samples: Samples) -> tuple[Marginal, ...]:
 def _prior(samples: Samples) -> dict[str, Any]:
     if samples.space is None or _uniform(samples.space.root):
         return {}
-    import jax
     import jax.numpy as jnp
     from scipy.stats import qmc
 
     u = qmc.Sobol(samples.space.dim, rng=0).random_base2(POINTS)
     # One program: step by step, each of the columns would compile its own.
-    features = jax.jit(jax.vmap(samples.space.unflatten))(jnp.asarray(u, jnp.float32))
+    features = samples.space.features_at(jnp.asarray(u, jnp.float32))
     return {name: pd.Series(v) for name, v in samples.space.rows(features).items()}
 
 
