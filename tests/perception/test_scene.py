@@ -162,20 +162,43 @@ def flat(scene: Scene) -> Scene:
     return dataclasses.replace(scene, sun=Sun(ambient=1.0, shadows=False), sky=sky)
 
 
+FAR_AND_THIN = (
+    Box((-20.0, 0.5, 0.0), (2.0, 1.0, 1.0), RED),  # behind, as those at -500 m
+    Cone((40.0, -3.0, 0.0), 0.25, 0.75, GREEN),
+    Cylinder((-500.0, -1.0, 0.0), 0.2, 1.0, BLUE),
+    Cylinder((12.0, 1.5, 0.3), 0.3, 1.0, YELLOW, axis=(1.0, -0.05, 0.0)),  # seen along its axis
+    Sphere((-500.0, 2.0, 1.0), 0.5, YELLOW),
+)
+FAR_MARKINGS = (
+    Line((0.0, -6.0), width=0.1),
+    Line((0.0, 3.0), width=0.1, dash=2.0, gap=2.0),
+    Rectangle((70.0, 0.0), (8.0, 1.0), RED),
+    Disc((80.0, 4.0), 2.0, BLUE),
+    Ring((60.0, -8.0), 1.5, 0.3),
+    Cross((-30.0, 0.0), 4.0, 1.0),
+)
+"""As many of each kind as above: both scenes are rendered by one program."""
+
+
 @pytest.fixture(scope="module")
 def views():
-    """Return depth and image of one scene from each eye, as rendered."""
-    scene = flat(Scene(SOLIDS, Ground((0.3, 0.3, 0.3), MARKINGS)))
-    both = jax.jit(lambda camera: (scene.depth(camera), scene.render(camera)))
+    """Return depth and image of a scene from each eye, as rendered."""
+    near = flat(Scene(SOLIDS, Ground((0.3, 0.3, 0.3), MARKINGS)))
+    far = flat(Scene(FAR_AND_THIN, Ground((0.3, 0.3, 0.3), FAR_MARKINGS)))
+    both = jax.jit(lambda scene, camera: (scene.depth(camera), scene.render(camera)))
     cameras = {name: Camera(24, 36, field_of_view=1.0, **eye) for name, eye in EYES.items()}
-    return scene, {name: (camera, *both(camera)) for name, camera in cameras.items()}
+    cameras["far"] = Camera(24, 36, 1.0, (0.0, 0.1, 1.3), 0.02, -0.05, 0.0)
+    seen = {}
+    for name, camera in cameras.items():
+        scene = far if name == "far" else near
+        seen[name] = (scene, camera, *both(scene, camera))
+    return seen
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", EYES)
+@pytest.mark.parametrize("name", [*EYES, "far"])
 def test_depth_is_that_of_a_ray_caster(views, name):
-    scene, seen = views
-    camera, depth, _ = seen[name]
+    scene, camera, depth, _ = views[name]
     centres, _, what = cast(scene, camera, 1)
     around = blocks(cast(scene, camera, 5)[2], 5)
     whole = (around == what[..., None]).all(-1)  # nothing ends within the pixel
@@ -184,10 +207,9 @@ def test_depth_is_that_of_a_ray_caster(views, name):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", EYES)
+@pytest.mark.parametrize("name", [*EYES, "far"])
 def test_colours_are_those_of_a_ray_caster_with_many_samples(views, name):
-    scene, seen = views
-    camera, _, image = seen[name]
+    scene, camera, _, image = views[name]
     exact = blocks(cast(scene, camera, 9)[1], 9).mean(2)
     error = np.abs(np.array(image) - exact).max(-1)
     assert error.mean() < 0.012

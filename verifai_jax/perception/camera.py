@@ -131,8 +131,13 @@ def round_edge(
     radius: Float[Array, "*stack 3"],
     one: Float[Array, "*stack 3"],
     other: Float[Array, "*stack 3"],
+    within: tuple[Float[Array, "*stack 3"], Float[Array, "*stack"]],
 ) -> Float[Array, "*stack height width"]:
-    """Return the distance in pixels from a conic, `radius . d = |(one . d, other . d)|`.
+    """Return the distance in pixels within a conic, `radius . d >= |(one . d, other . d)|`.
+
+    `within` is a ball around the curve, as its middle, seen from the eye, and its radius. It bounds
+    curves that are thinner than a pixel: from the whole of their axis the first-order distance is
+    small.
 
     The distance is that of first order: the function's value over the norm of its gradient
     (Sampson, "Fitting conic sections to very scattered data", 1982).
@@ -147,7 +152,22 @@ def round_edge(
 
     slopes = zip(rays.slopes(radius), rays.slopes(one), rays.slopes(other), strict=True)
     along, down = (slope(*parts) for parts in slopes)
-    return value / jnp.sqrt(along**2 + down**2 + TINY)
+    distance = value / jnp.sqrt(along**2 + down**2 + TINY)
+    return jnp.minimum(distance, ball_edge(rays, *within))
+
+
+def ball_edge(
+    rays: Rays, away: Float[Array, "*stack 3"], radius: Float[Array, "*stack"]
+) -> Float[Array, "*stack height width"]:
+    """Return the distance in pixels within the outline of a ball at `away` from the eye."""
+    beyond = dot(away, away) - radius**2
+    tangent = jnp.sqrt(jnp.maximum(beyond, TINY))[..., None, None]
+    length = rays.lengths()
+    along, down = (slope[..., None, None] for slope in rays.slopes(away))
+    along = along - tangent * (rays.u[None, :] / length / rays.focal)
+    down = down - tangent * (rays.v[:, None] / length / rays.focal)
+    edge = rays.linear(away) - tangent * length
+    return edge / jnp.sqrt(along**2 + down**2 + TINY)
 
 
 @described

@@ -160,11 +160,13 @@ def _rectangle(rays: Rays, position: Place, yaw: Number, length: Number, width: 
 
 def _circle(rays: Rays, position: Place, radius: Number) -> Array:
     """Return the distance in pixels within a circle."""
-    x, y, z = rays.eye - _point(position)
+    away = _point(position) - rays.eye
+    x, y, z = -away
     up = _vertical()
     one = jnp.asarray([1.0, 0.0, 0.0]) - x / z * up
     other = jnp.asarray([0.0, 1.0, 0.0]) - y / z * up
-    return round_edge(rays, -jnp.asarray(radius, float) / z * up, one, other)
+    radius = jnp.asarray(radius, float)
+    return round_edge(rays, -radius / z * up, one, other, (away, radius))
 
 
 def _dashes(rays: Rays, line: Line) -> Array:

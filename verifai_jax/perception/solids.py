@@ -18,6 +18,7 @@ from verifai_jax.perception.camera import (
     Number,
     Rays,
     Vector,
+    ball_edge,
     computed_once,
     coverage,
     described,
@@ -119,14 +120,15 @@ def look(rays: Rays, solids: Sequence[Solid], sun: Sun, shadows: bool) -> Look:
     return _frusta(rays, solids, sun, shadows)  # pyright: ignore[reportArgumentType]
 
 
-def _thin(cover: Array, rays: Rays, centre: Array, size: Array) -> Array:
-    """Fade what is narrower than a pixel, whose two edges blur into one another.
+def _thin(cover: Array, rays: Rays, centre: Array, size: Array, reach: Array) -> Array:
+    """Fade what is narrower than a pixel, whose two edges blur into one another, or behind the eye.
 
     The least of two ramps of one pixel about a bar of width w < 1 integrates to (1 + w)^2 / 4
-    instead of w.
+    instead of w. `reach` is how far a solid extends from its centre.
     """
-    distance = jnp.maximum(dot(centre - rays.eye, rays.forward), 1e-3)
-    width = jnp.clip(size * rays.focal / distance, 0.0, 1.0)
+    ahead = dot(centre - rays.eye, rays.forward)
+    width = jnp.clip(size * rays.focal / jnp.maximum(ahead, 1e-3), 0.0, 1.0)
+    width = jnp.where(ahead + reach > 0, width, 0.0)
     return cover * computed_once(4 * width / (1 + width) ** 2)[:, None, None]
 
 
@@ -163,7 +165,7 @@ def _boxes(rays: Rays, boxes: Sequence[Box], sun: Sun, shadows: bool) -> Look:
     normal = jnp.cross(middle - rays.eye, along)
     outline = _within(rays, _oriented(normal, centre - rays.eye), seen)
     narrow = 2 * (jnp.sum(half, -1) - jnp.max(half, -1) - jnp.min(half, -1))
-    cover = _thin(coverage(outline), rays, centre, narrow)
+    cover = _thin(coverage(outline), rays, centre, narrow, jnp.sqrt(dot(half, half)))
     shadow = None
     if shadows:
         facing_sun = axes @ sun.direction()
@@ -270,7 +272,7 @@ def _frusta(
     foot = jnp.asarray([0.0, 0.0, 1.0]) * height[:, None]
     for end in [eye] if pointed else [eye, eye - foot]:
         cover = jnp.maximum(cover, coverage(_disc(rays, end, radius, frame)))
-    cover = _thin(cover, rays, base, 2 * radius)
+    cover = _thin(cover, rays, base, 2 * radius, jnp.hypot(radius, height))
     shadow = None
     if shadows:
         to_sun = frame @ sun.direction()
@@ -299,8 +301,9 @@ def _between_ends(
     """
     norm = jnp.sqrt(dot(towards, towards) + TINY)
     cosine = across / norm
-    exists = (jnp.abs(cosine) < 1)[:, None, None]
-    cosine = jnp.clip(cosine, -0.9999, 0.9999)
+    # Where the points of contact nearly coincide, the ends are all that is seen.
+    exists = (jnp.abs(cosine) < 0.998)[:, None, None]
+    cosine = jnp.clip(cosine, -0.999, 0.999)
     sine = jnp.sqrt(1 - cosine**2)
     x, y = (towards / norm[:, None]).T
 
@@ -332,7 +335,8 @@ def _disc(rays: Rays, eye: Array, radius: Array, frame: Array) -> Array:
     first = eye[:, :1] * frame[:, 2] - eye[:, 2:] * frame[:, 0]
     second = eye[:, 1:2] * frame[:, 2] - eye[:, 2:] * frame[:, 1]
     side = jnp.where(eye[:, 2] > 0, -1.0, 1.0)
-    return round_edge(rays, (radius * side)[:, None] * frame[:, 2], first, second)
+    away = -jnp.sum(eye[..., None] * frame, axis=1)
+    return round_edge(rays, (radius * side)[:, None] * frame[:, 2], first, second, (away, radius))
 
 
 def _frustum_surface(rays: Rays, eye: Array, shape: _Frusta, sun: Sun) -> tuple[Array, Array]:
@@ -368,15 +372,10 @@ def _spheres(rays: Rays, spheres: Sequence[Sphere], sun: Sun, shadows: bool) -> 
     centre = jnp.stack([vector(sphere.position) for sphere in spheres])
     radius = jnp.stack([jnp.asarray(sphere.radius, float) for sphere in spheres])
     away = centre - rays.eye
+    cover = coverage(ball_edge(rays, away, radius))
+    cover = _thin(cover, rays, centre, 2 * radius, radius)
     beyond = dot(away, away) - radius**2
-    tangent = jnp.sqrt(jnp.maximum(beyond, TINY))[:, None, None]
-    length = rays.lengths()
-    along, down = (slope[:, None, None] for slope in rays.slopes(away))
-    along = along - tangent * (rays.u[None, :] / length / rays.focal)
-    down = down - tangent * (rays.v[:, None] / length / rays.focal)
-    towards = rays.linear(away)
-    edge = (towards - tangent * length) / jnp.sqrt(along**2 + down**2 + TINY)
-    cover = _thin(coverage(edge), rays, centre, 2 * radius)
+    towards, length = rays.linear(away), rays.lengths()
     root = jnp.sqrt(jnp.maximum(towards**2 - length**2 * beyond[:, None, None], 1e-9))
     depth = beyond[:, None, None] / (towards + root)
     to_sun = rays.linear(sun.direction())
@@ -388,5 +387,7 @@ def _spheres(rays: Rays, spheres: Sequence[Sphere], sun: Sun, shadows: bool) -> 
         up = jnp.asarray([0.0, 0.0, 1.0])
         radial = -(radius / rays.eye[2])[:, None] * up
         one, other = (_on_ground(rays, frame[:, k], centre) for k in range(2))
-        shadow = coverage(round_edge(rays, radial, one, other))
+        sun_height = sun.direction()[2]
+        middle = away - (centre[:, 2] / sun_height)[:, None] * sun.direction()
+        shadow = coverage(round_edge(rays, radial, one, other, (middle, radius / sun_height)))
     return Look(cover, depth, light, shadow, centre)
