@@ -76,6 +76,7 @@ bench: .venv-bench/installed .venv/installed
 	.venv-bench/bin/python benchmarks/search_cost.py
 	.venv-bench/bin/python benchmarks/monitor.py
 	$(BIN)/python benchmarks/engine.py
+	$(BIN)/python benchmarks/large_runs.py
 	$(BIN)/python benchmarks/contact_gradients.py
 	$(BIN)/python benchmarks/remote.py
 
