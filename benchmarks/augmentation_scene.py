@@ -50,8 +50,11 @@ FEATURES = {
     "asphalt": vj.Box(0.22, 0.42),
 }
 """The whole domain."""
-NARROW = {**FEATURES, "hue": vj.Box(0.35, 1.0), "glare": vj.Box(-1.4, 0.0)}
-"""No orange or red car, and no glare."""
+NARROW = vj.FeatureSpace(
+    {**FEATURES, "glare": vj.Box(-1.4, 0.0)},
+    where=lambda features: ~((features["present"] > 0) & (features["hue"] < 0.35)),
+)
+"""No glare, and no cones before an orange, red or yellow car."""
 CHANNELS, DENSE, BATCH, NOISE = (12, 16, 24), 48, 64, 0.02
 TOLERANCE = 0.2
 """Relative error of a distance that is still right."""

@@ -211,24 +211,25 @@ class _Study:
 
     def _finish(self, number: int, arm: str, compute: Any) -> None:
         name = f"seed/{number}/{arm}"
-        if self.cache.get(name) is None:
-            entry, rows, weights = compute()
-            work = {name: entry, f"{name}/added": encode_frame(rows)}
+        entry, added = self.cache.get(name), self.cache.get(f"{name}/added")
+        if entry is None or added is None:
+            computed, rows, weights = compute()
+            work = {name: computed, f"{name}/added": encode_frame(rows)}
             stored = None if weights is None else encode_weights(weights)
             if stored is not None:
                 work[f"{name}/weights"] = stored
             if weights is not None:
                 self.weights[arm, number] = weights
             self.cache.put(work)
-        entry = self.cache.get(name)
+            entry, added = self.cache.get(name), self.cache.get(f"{name}/added")
+        assert entry is not None
+        assert added is not None
         stored = self.cache.get(f"{name}/weights")
         if stored is not None:
             self.weights[arm, number] = decode_weights(stored)
-        assert entry is not None
         row = {key: value.item() for key, value in entry.items()}
         self.rows.append({"arm": arm, "seed": number, **row})
-        rows = decode_frame(self.cache.get(f"{name}/added") or {})
-        self.added.append(rows.assign(arm=arm, seed=number))
+        self.added.append(decode_frame(added).assign(arm=arm, seed=number))
         self.bar.advance(1, f"seed {number}, {arm}: error {100 * row['error']:.3g} %")
 
     def result(self, arms: Sequence[str], confidence: float, complete: bool) -> Augmentation:

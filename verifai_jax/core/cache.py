@@ -24,7 +24,7 @@ import numpy as np
 
 from verifai_jax.core.locks import write_lock
 
-log = logging.getLogger("verifai_jax.sweeps")
+log = logging.getLogger("verifai_jax.cache")
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 """The result of one computation: arrays of numbers or texts, by name."""
