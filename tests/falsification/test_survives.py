@@ -163,6 +163,7 @@ def test_a_damaged_record_says_where_the_rows_are(kept, tmp_path):
     folder = shutil.copytree(kept, tmp_path / "run")
     record = json.loads((folder / RECORD).read_text())
     wrong = {"seed": "0", "batch": None, "features": "ab", "notes": 3, "prior": 1, "formulas": []}
+    wrong |= {"space_data": {"features": [["a"]], "where": None}}
     damaged = [(f"has {n!r} of another form", {**record, n: value}) for n, value in wrong.items()]
     for name in ("name", "seed", "features", "formulas", "stopped", "prior", "version"):
         damaged += [(f"has no {name!r}", {n: v for n, v in record.items() if n != name})]
@@ -174,6 +175,17 @@ def test_a_damaged_record_says_where_the_rows_are(kept, tmp_path):
         (folder / RECORD).write_text(text)
         with pytest.raises(ValueError, match=r"its run.json is damaged, .*table.parquet, "):
             vj.load(folder)
+
+
+@pytest.mark.parametrize("data", [{"options": {}}, {"name": [], "options": {}}, {"split": 3}])
+def test_a_record_without_a_search_needs_one(problem, kept, tmp_path, data):
+    folder = shutil.copytree(kept, tmp_path / "run")
+    record = json.loads((folder / RECORD).read_text())
+    (folder / RECORD).write_text(json.dumps({**record, "search_data": data}))
+    with pytest.raises(
+        ValueError, match=r"describes no search .*; give it: resume\(..., search=\)"
+    ):
+        vj.resume(folder, problem, budget=160)
 
 
 def test_a_table_that_is_damaged_is_told_by_name(problem, kept, tmp_path):

@@ -152,7 +152,9 @@ def compiled_tell(search):
 
 def told(search, state, cube, u, rho, gradient=None):
     u, rho = jnp.asarray(u, jnp.float32), jnp.asarray(rho, jnp.float32)
-    return compiled_tell(search)(state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient))
+    return compiled_tell(search)(
+        state, cube, Observations(u, rho, jnp.ones(len(u), bool), gradient)
+    )
 
 
 @pytest.mark.thorough

@@ -46,6 +46,7 @@ from verifai_jax.falsification.validation import (
     locked,
     needs_gradient,
     new_folder,
+    recorded_search,
     space_as_data,
     usual_batch,
     writing,
@@ -264,7 +265,7 @@ def _resume(
             raise ValueError(
                 f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
             )
-        search = searches.from_json(run.search_data)
+        search = recorded_search(run)
     search = check_search(problem, search)
     check_same_space(run, problem)
     check_rule(search, ends.stop_when)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.core.text import one_line
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
@@ -78,9 +79,9 @@ def read_record(folder: Path) -> dict[str, Any]:
         )
     if record.get("format") != FORMAT:
         raise ValueError(
-            f"{file} has format {record.get('format')!r}, and this version of "
+            f"{file} has format {one_line(repr(record.get('format')), 40)}, and this version of "
             f"verifai_jax reads format {FORMAT}: load it with the version that wrote it, "
-            f"{record.get('version', 'unknown')}"
+            f"{one_line(str(record.get('version', 'unknown')), 40)}"
         )
     for name, fits in _FORMS.items():
         if name not in record and name in ADDED:
@@ -132,6 +133,16 @@ def _is_mapping(value: object) -> bool:
     return value is None or isinstance(value, dict)
 
 
+def _is_space(value: object) -> bool:
+    if not isinstance(value, dict) or not isinstance(value.get("features"), list):
+        return value is None
+    pairs = all(
+        isinstance(each, list) and len(each) == 2 and isinstance(each[0], str)
+        for each in value["features"]
+    )
+    return pairs and (value.get("where", 0) is None or isinstance(value.get("where"), str))
+
+
 _FORMS: dict[str, Callable[[Any], bool]] = {
     "features": _is_texts,
     "name": _is_text,
@@ -147,7 +158,7 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "target": lambda value: True,
     "budget": _is_count,
     "search_data": _is_mapping,
-    "space_data": _is_mapping,
+    "space_data": _is_space,
     "acceptance": lambda value: value is None or _is_number(value),
     "precision": lambda value: value in ("float32", "float64"),
     "backend": lambda value: value is None or _is_text(value),

@@ -17,6 +17,7 @@ import numpy as np
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
     RECORD_CHECKSUM,
@@ -312,7 +313,8 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         ):
             if recorded != given:
                 raise ValueError(
-                    f"the run in {folder} is of another problem: its {what} is {recorded!r}, "
+                    f"the run in {folder} is of another problem: its {what} is "
+                    f"{one_line(repr(recorded))}, "
                     f"the given one's {given!r}"
                 )
         if record.get("backend") is not None:

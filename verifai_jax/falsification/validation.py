@@ -11,6 +11,7 @@ from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.locks import LOCK, write_lock
+from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import has_gradient
@@ -176,6 +177,20 @@ def space_as_data(problem: Problem) -> dict[str, Any] | None:
         return None  # It has domains that only the user knows.
 
 
+def recorded_search(run: Run) -> Search:
+    """Return the search that is recorded with a run.
+
+    **Raises:** `ValueError` where the record describes none.
+    """
+    try:
+        return searches.from_json(run.search_data or {})
+    except (LookupError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise ValueError(
+            f"the record of the run of {run.name!r} describes no search "
+            f"({one_line(format_error(error))}); give it: resume(..., search=)"
+        ) from error
+
+
 def check_same_space(run: Run, problem: Problem) -> None:
     """Refuse to go on with a run in another space than it was in.
 
@@ -189,7 +204,8 @@ def check_same_space(run: Run, problem: Problem) -> None:
         if was.get(name) != now[name]:
             raise ValueError(
                 f"the run of {run.name!r} was over another space: its feature {name!r} was "
-                f"{was.get(name)}, that of the given problem is {now[name]} (a run with --only is "
+                f"{one_line(str(was.get(name)))}, that of the given problem is "
+                f"{one_line(str(now[name]))} (a run with --only is "
                 "resumed with the same --only)"
             )
     # The name of a constraint may change with the line it is written in.
