@@ -146,7 +146,7 @@ def _forge(file: Path, random_: random.Random) -> None:
     """Change one value of a JSON file, or what it is."""
     try:
         content = json.loads(file.read_text())
-    except ValueError:
+    except (ValueError, RecursionError):
         return
     places: list[tuple[Any, Any]] = []
 

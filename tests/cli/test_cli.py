@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from verifai_jax.cli import arguments
 from verifai_jax.cli.doctor import bad_pairs
 from verifai_jax.cli.main import main
+from verifai_jax.falsification.record import sealed
 from verifai_jax.falsification.run import load
 
 ROOT = Path(__file__).parents[2]
@@ -188,7 +189,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
         "specs/none.py:x", "specs/ramp.py\0:x", "specs:ramp", "runs.two.evil:x", ":", 3,
         ["specs/ramp.py"], None,
     ):  # fmt: skip
-        (tmp_path / "r" / "run.json").write_text(json.dumps(record | {"target": target}))
+        (tmp_path / "r" / "run.json").write_text(json.dumps(sealed(record | {"target": target})))
         result = CliRunner().invoke(main, ["replay", "r", "0"])
         assert "does not say which problem of this project" in result.output, target
         assert result.exit_code == 2
@@ -197,7 +198,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
     (tmp_path / "pack" / "two").mkdir(parents=True)
     (tmp_path / "pack" / "two" / "evil.py").write_text("raise SystemExit('ran')")
     shutil.copytree(tmp_path / "r", tmp_path / "pack" / "one")
-    evil_target = json.dumps(record | {"target": "pack/two/evil.py:ramp"})
+    evil_target = json.dumps(sealed(record | {"target": "pack/two/evil.py:ramp"}))
     (tmp_path / "pack" / "one" / "run.json").write_text(evil_target)
     assert "does not say which" in call("replay", "pack/one", 0, code=2)
     output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")

@@ -1,6 +1,7 @@
 """A run that was stopped or cut off goes on as if it had not been."""
 
 import dataclasses
+import json
 import shutil
 
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax import search
 from verifai_jax.falsification.checkpoint import STATE
+from verifai_jax.falsification.record import sealed
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1), "kind": vj.Categorical("slow", "fast")}
 
@@ -102,7 +104,8 @@ def test_before_any_state_was_saved(problem, tmp_path):
     whole = vj.falsify(problem, "halton", 48, batch=16, folder=tmp_path / "run")
     (tmp_path / "run" / STATE).unlink()
     record = tmp_path / "run" / "run.json"
-    record.write_text(record.read_text().replace('"stopped": "budget"', '"stopped": "running"'))
+    entries = json.loads(record.read_text()) | {"stopped": "running"}
+    record.write_text(json.dumps(sealed(entries)))
     assert same(vj.resume(tmp_path / "run", problem), whole)
 
 

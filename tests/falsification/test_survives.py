@@ -23,7 +23,7 @@ from verifai_jax.falsification.checkpoint import (
     STATE,
     write_checkpoint,
 )
-from verifai_jax.falsification.run import RECORD
+from verifai_jax.falsification.record import RECORD, sealed
 from verifai_jax.falsification.tail import TAIL
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
@@ -171,6 +171,9 @@ def test_a_damaged_record_says_where_the_rows_are(kept, tmp_path):
         (folder / RECORD).write_text(json.dumps(content))
         with pytest.raises(ValueError, match=f"run.json is damaged: it {told}; the rows are in .*"):
             vj.load(folder)
+    (folder / RECORD).write_text(json.dumps({**record, "seed": 1}))
+    with pytest.raises(ValueError, match=r"its content has changed since it was written; the rows"):
+        vj.load(folder)
     for text in ("", "[" * 100_000, "[1]", "{"):
         (folder / RECORD).write_text(text)
         with pytest.raises(ValueError, match=r"its run.json is damaged, .*table.parquet, "):
@@ -181,7 +184,7 @@ def test_a_damaged_record_says_where_the_rows_are(kept, tmp_path):
 def test_a_record_without_a_search_needs_one(problem, kept, tmp_path, data):
     folder = shutil.copytree(kept, tmp_path / "run")
     record = json.loads((folder / RECORD).read_text())
-    (folder / RECORD).write_text(json.dumps({**record, "search_data": data}))
+    (folder / RECORD).write_text(json.dumps(sealed({**record, "search_data": data})))
     with pytest.raises(
         ValueError, match=r"describes no search .*; give it: resume\(..., search=\)"
     ):
@@ -215,7 +218,7 @@ def test_a_table_that_is_damaged_is_told_by_name(problem, kept, tmp_path):
 def test_a_kill_before_the_first_rows_is_resumed(problem, whole, tmp_path):
     run = vj.falsify(problem, "cross_entropy", 32, batch=16, folder=tmp_path)
     record = json.loads((tmp_path / RECORD).read_text())
-    (tmp_path / RECORD).write_text(json.dumps({**record, "stopped": "running"}))
+    (tmp_path / RECORD).write_text(json.dumps(sealed({**record, "stopped": "running"})))
     (tmp_path / "table.parquet").unlink()
     (tmp_path / STATE).unlink()
     assert len(run.table) == 32

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from verifai_jax.core.text import format_error
+from verifai_jax.core.text import format_error, printable
 
 STATE = "search.npz"
 """Name of the checkpoint in a run's folder."""
@@ -64,7 +64,7 @@ def read_checkpoint(folder: Path) -> dict[str, Any] | None:
         with open(file, "rb") as opened, np.load(opened, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
     except Exception as error:  # The bytes of an archive can be wrong in any way.
-        why = "it is empty" if isinstance(error, EOFError) else format_error(error)
+        why = "it is empty" if isinstance(error, EOFError) else printable(format_error(error), 300)
         raise CheckpointError(f"{file} is damaged: {why}") from error
     stored = arrays.pop(_CHECKSUM, None)
     if stored is None or stored.shape != () or stored != _checksum(arrays):

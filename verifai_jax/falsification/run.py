@@ -35,6 +35,7 @@ from verifai_jax.falsification.record import (
     RECORDED,
     read_record,
     record_checksum,
+    sealed,
 )
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
@@ -256,11 +257,11 @@ def write_record(run: Run, folder: Path) -> int:
     record = {"format": FORMAT, "features": list(run.table.features)}
     for name in (*RECORDED, *ADDED):
         record[name] = getattr(run, name)
-    text = json.dumps(record, indent=2) + "\n"
+    record = sealed(json.loads(json.dumps(record)))
     partial = folder / f"{RECORD}.part"
-    partial.write_text(text)
+    partial.write_text(json.dumps(record, indent=2) + "\n")
     partial.replace(folder / RECORD)
-    return record_checksum(json.loads(text))
+    return record_checksum(record)
 
 
 def check_not_continued(run: Run, folder: Path) -> None:

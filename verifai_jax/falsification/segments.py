@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Int
 
-from verifai_jax.core.text import format_error
+from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification.columns import ROW, Columns
 
 if TYPE_CHECKING:
@@ -39,6 +39,10 @@ _BLOCK = 1 << 20
 
 class TableError(ValueError):
     """An error for a table on disk that is damaged."""
+
+
+def _damaged(path: Path, error: Exception) -> TableError:
+    return TableError(f"{path} is damaged: {printable(format_error(error), 300)}")
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class Segment:
                 while block := file.read(_BLOCK):
                     checksum = zlib.crc32(block, checksum)
         except OSError as error:
-            return format_error(error)
+            return printable(format_error(error), 300)
         return "" if self._is_of(checksum) else "its bytes have changed"
 
     @property
@@ -75,7 +79,9 @@ class Segment:
         try:
             return tuple(name for name in pq.read_schema(self.path).names if name != ROW)
         except Exception as error:
-            raise TableError(f"{self.path} is damaged: {format_error(error)}") from error
+            raise TableError(
+                f"{self.path} is damaged: {printable(format_error(error), 300)}"
+            ) from error
 
     def read(self, columns: Sequence[str] | None = None) -> "pd.DataFrame":
         """Return its rows, or some columns of them, indexed by row number.
@@ -96,7 +102,9 @@ class Segment:
         except FileNotFoundError as error:
             raise TableError(f"{self.path} is gone; was the run's folder moved?") from error
         except Exception as error:  # Whoever wrote the file, it is none of ours.
-            raise TableError(f"{self.path} is damaged: {format_error(error)}") from error
+            raise TableError(
+                f"{self.path} is damaged: {printable(format_error(error), 300)}"
+            ) from error
 
     def read_standing_out(self) -> "pd.DataFrame":
         """Return those of its rows that stand out, from their own file where it is whole."""

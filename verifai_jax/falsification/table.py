@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Int
 
-from verifai_jax.core.text import format_error
+from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
     ROW,
@@ -239,8 +239,9 @@ class ErrorTable:
     @property
     def safe(self) -> "pd.DataFrame":
         """Rows that ended properly and satisfy the property."""
-        table = self.all
-        return table.loc[(table["status"] == "ok") & ~table["violated"]]
+        blocks = self.blocks() if self._segments else (self.all,)
+        safe = (rows.loc[(rows["status"] == "ok") & ~rows["violated"]] for rows in blocks)
+        return self._concatenate([*safe])
 
     @classmethod
     def load(cls, folder: Path, features: tuple[str, ...]) -> "ErrorTable":
@@ -539,7 +540,7 @@ def _read_finished(path: Path) -> "pd.DataFrame":
     except PermissionError:
         raise
     except Exception as error:  # Bytes can be wrong in any way.
-        raise TableError(f"{path} is damaged: {format_error(error)}") from error
+        raise TableError(f"{path} is damaged: {printable(format_error(error), 300)}") from error
     wrong = np.flatnonzero(frame.index.to_numpy() != np.arange(len(frame)))
     if len(wrong):
         raise TableError(
