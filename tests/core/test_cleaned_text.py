@@ -2,7 +2,7 @@
 
 import pytest
 
-from verifai_jax.core.text import folder_name, one_line, printable
+from verifai_jax.core.text import folder_name, format_error, one_line, printable
 
 
 def test_what_steers_a_terminal_is_written_out():
@@ -28,3 +28,9 @@ def test_what_steers_a_terminal_is_written_out():
 def test_a_name_stays_in_its_folder(name, folder):
     assert folder_name(name) == folder
     assert len(folder_name(name * 500)) < 110
+
+
+def test_an_error_is_one_line_that_is_not_too_long():
+    assert format_error(ValueError("first\nsecond")) == "ValueError: first"
+    assert format_error(KeyError()) == "KeyError"
+    assert len(format_error(ValueError("x" * 100_000))) < 600

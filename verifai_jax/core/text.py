@@ -63,8 +63,8 @@ def _format_value(value: object) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Write an exception in one line: its type and the first line of its message."""
-    first = (str(error).splitlines() or [""])[0]
+    """Write an exception in one line: its type and the first line of its message, shortened."""
+    first = shorten((str(error).splitlines() or [""])[0], MOST_OF_A_MESSAGE)
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
