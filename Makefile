@@ -79,11 +79,14 @@ bench: .venv-bench/installed .venv/installed
 	$(BIN)/python benchmarks/large_runs.py
 	$(BIN)/python benchmarks/contact_gradients.py
 	$(BIN)/python benchmarks/remote.py
+	$(BIN)/python benchmarks/perception.py frames
+	$(BIN)/python benchmarks/perception.py loop
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole
 	$(BIN)/python -m envs.train_lane_keeping
 	$(BIN)/python -m envs.train_hopper
+	$(BIN)/python -m envs.train_cones
 
 # The wheel must work away from the checkout, where there is no envs/ and no specs/.
 wheel: .venv/lint
