@@ -167,13 +167,29 @@ def test_journal_recalls_only_the_same_point(tmp_path):
     journal.settle(7)  # Nothing of the batch in flight is in the table yet.
     with open(journal.path, "a") as file:
         file.write('{"row": 8, "po')  # Where the process died.
+    again = Journal(tmp_path)
+    again.add(9, points[2], RowVerdict(np.array([0.5]), 0, np.array([True]), ""))
+    again.settle(7)
     known = Journal(tmp_path).recall(6, points)
     assert list(known) == [1]
     assert known[1].message == "é"
     np.testing.assert_array_equal(known[1].rho, [0.1, np.nan])
-    assert Journal(tmp_path).recall(7, points) == {}
-    Journal(tmp_path).settle(8)
+    assert list(Journal(tmp_path).recall(7, points)) == [2]  # Row 7 is of another point.
+    Journal(tmp_path).settle(10)
     assert not journal.path.exists()
+
+
+def test_a_line_of_the_journal_that_has_changed_is_none(tmp_path):
+    point = np.array([[0.25, 0.5]], np.float32)
+    journal = Journal(tmp_path)
+    journal.add(0, point[0], RowVerdict(np.array([0.1234]), 0, np.array([True]), "x"))
+    journal.settle(0)
+    whole = journal.path.read_bytes()
+    for at in range(len(whole) - 1):
+        journal.path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        assert Journal(tmp_path).recall(0, point) == {}
+    journal.path.write_bytes(whole)
+    assert Journal(tmp_path).recall(0, point)[0].rho == [0.1234]
 
 
 def test_a_system_says_early_what_does_not_fit():

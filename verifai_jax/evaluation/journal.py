@@ -6,11 +6,13 @@
     journal.settle(rows)                                # the table and its checkpoint have so many
 
 For simulators of which one simulation takes minutes: a run that is killed in the middle of a batch
-does not simulate its finished rows again. A row is recalled only for the same point.
+does not simulate its finished rows again. A row is recalled only for the same point, and only if
+its line is the one that was written: each begins with its checksum.
 """
 
 import hashlib
 import json
+import zlib
 from pathlib import Path
 from typing import IO
 
@@ -48,7 +50,10 @@ class Journal:
         self._last = max(self._last, row)
         if self._file is None:
             self._file = open(self.path, "a")  # noqa: SIM115 - lives as long as the run
-        self._file.write(json.dumps(entry) + "\n")
+            if self._file.tell():
+                self._file.write("\n")  # The last line may have been cut off.
+        text = json.dumps(entry)
+        self._file.write(f"{zlib.crc32(text.encode()):08x} {text}\n")
         self._file.flush()
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
@@ -82,12 +87,15 @@ def _fingerprint(point: Float[np.ndarray, " d"]) -> str:
 
 
 def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
-    if not path.exists():
+    if not path.is_file():
         return {}
     known = {}
-    for line in path.read_text().splitlines():
+    for line in path.read_bytes().split(b"\n"):
+        checksum, _, text = line.partition(b" ")
+        if checksum != f"{zlib.crc32(text):08x}".encode():
+            continue  # It has changed, or was being written when the process died.
         try:
-            entry = json.loads(line)
+            entry = json.loads(text)
             verdict = RowVerdict(
                 np.asarray(entry["rho"], np.float64),
                 int(entry["status"]),
@@ -96,5 +104,5 @@ def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
             )
             known[int(entry["row"])] = (str(entry["point"]), verdict)
         except (ValueError, KeyError, TypeError):
-            continue  # The line that was being written when the process died.
+            continue  # Of another program.
     return known
