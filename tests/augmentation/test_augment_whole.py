@@ -146,14 +146,14 @@ def test_an_interrupted_study_goes_on(whole, tmp_path):
 
 
 def test_a_search_that_is_interrupted_leaves_no_table(tmp_path, monkeypatch):
-    from verifai_jax.augmentation import _augment
+    from verifai_jax.augmentation import study
 
     def cut(*arguments, **options):
         run = search(*arguments, **options)
         return replace(run, stopped="interrupted")
 
-    search = _augment.falsify
-    monkeypatch.setattr(_augment, "falsify", cut)
+    search = study.falsify
+    monkeypatch.setattr(study, "falsify", cut)
     options = {**SMALL, "steps": STEPS, "further_steps": STEPS, "hard": 0}
     result = vj.augment(TASK, "counterexamples", seeds=1, folder=tmp_path, **options)
     assert not result.complete
