@@ -176,45 +176,35 @@ def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") 
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of the run in a folder.
+    """Read the record of the run in a folder; say what the folder is where it holds none.
 
-    **Raises:** `FileNotFoundError` where there is none, `ValueError` where it is none of a run;
-    both say what the folder is instead, as far as that can be seen.
+    **Raises:** as `verifai_jax.falsification.record.read_record`.
     """
-    from verifai_jax.falsification.run import RECORD
+    from verifai_jax.falsification import record
 
-    file = folder / RECORD
-    if not file.is_file():
-        raise FileNotFoundError(f"no run in {folder}: {_describe_place(folder, RECORD)}")
     try:
-        record = json.loads(file.read_text())
-    except (ValueError, RecursionError):
-        record = None
-    if isinstance(record, dict) and isinstance(record.get("format"), int):
-        return record
-    if not isinstance(record, dict) or not {"format", "name", "features"} <= record.keys():
-        raise ValueError(
-            f"no run in {folder}: its {RECORD} is damaged, or of another program; give a folder "
-            "that verifai-jax falsify has written"
-        )
-    return record
+        return record.read_record(folder)
+    except FileNotFoundError as missing:
+        raise FileNotFoundError(_describe_place(folder, record.RECORD, str(missing))) from None
 
 
-def _describe_place(folder: Path, record: str) -> str:
-    """Say what a folder without a run is."""
+def _describe_place(folder: Path, record: str, missing: str) -> str:
+    """Say what a folder without a run is; `missing` says that its record is."""
     if folder.is_file():
-        return "it is a file; give the folder that verifai-jax falsify has written"
+        what = "it is a file; give the folder that verifai-jax falsify has written"
+        return f"no run in {folder}: {what}"
     if not folder.exists():
         beside = folder.parent
         runs = sorted(path.name for path in beside.glob("*") if (path / record).is_file())
         there = f"; in {beside} there are {', '.join(runs)}" if runs else ""
-        return f"there is no such folder{there}"
+        return f"no run in {folder}: there is no such folder{there}"
     if is_sweep(folder):
-        return f"it is the folder of a sweep; verifai-jax sweep --resume {folder} goes on with it"
+        goes_on = f"verifai-jax sweep --resume {folder} goes on with it"
+        return f"no run in {folder}: it is the folder of a sweep; {goes_on}"
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
-        return f"{record} is missing; but its folders {', '.join(runs)} are runs"
-    return f"{record} is missing; give a folder that verifai-jax falsify has written"
+        return f"{missing}; but its folders {', '.join(runs)} are runs"
+    return f"{missing}; give a folder that verifai-jax falsify has written"
 
 
 def is_sweep(folder: Path) -> bool:

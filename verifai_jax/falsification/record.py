@@ -66,13 +66,13 @@ def read_record(folder: Path) -> dict[str, Any]:
     another format. Both say where the rows are, which are none the worse for it.
     """
     file = folder / RECORD
-    if not file.exists():
+    if not file.is_file():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_beside(folder)}")
     try:
         record = json.loads(file.read_text())
     except (ValueError, RecursionError):
         record = None
-    if not isinstance(record, dict):
+    if not isinstance(record, dict) or not isinstance(record.get("format"), int):
         raise ValueError(
             f"no run in {folder}: its {RECORD} is damaged, or of another program"
             f"{_rows_beside(folder)}"
