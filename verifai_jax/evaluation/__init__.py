@@ -1,1 +1,1 @@
-"""Points in, verdicts out: simulation and judgement of batches, on devices and on the host."""
+"""Points in, verdicts out: simulation and evaluation of batches, on devices and on the host."""

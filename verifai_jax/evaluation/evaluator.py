@@ -1,4 +1,4 @@
-"""Any number of points of the unit cube, simulated and judged in batches of one shape.
+"""Any number of points of the unit cube, simulated and evaluated in batches of one shape.
 
     evaluate = Evaluator(problem, batch=512, seed=0)
     verdicts = evaluate(u)                              # u [n, d], any n: Verdicts
@@ -22,7 +22,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class Evaluator:
-    """Simulates and judges points of a problem's unit cube; `simulations` counts them.
+    """Simulates and evaluates points of a problem's unit cube; `simulations` counts them.
 
     **Arguments:**
 
@@ -75,7 +75,7 @@ class Evaluator:
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
     ) -> Verdicts:
-        """Simulate and judge these points.
+        """Simulate and evaluate these points.
 
         **Arguments:**
 

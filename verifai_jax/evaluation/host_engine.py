@@ -4,7 +4,8 @@
     engine.evaluate(u, key, first=0)                    # Verdicts, as of `engine.Engine`
 
 A simulation that raises, hangs or takes its process with it becomes a row with a status and a
-message; the others go on. Traces are judged in blocks of one shape, so that few monitors compile.
+message; the others go on. Traces are evaluated in blocks of one shape, so that few monitors
+compile.
 """
 
 import time
@@ -35,9 +36,9 @@ from verifai_jax.systems.base import Outcome, System
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 BLOCK = 32
-"""Traces judged together, unless patience ends before there are so many."""
+"""Traces evaluated together, unless patience ends before there are so many."""
 PATIENCE = 0.5
-"""Seconds after which traces are judged in smaller blocks, so that they are safe on disk."""
+"""Seconds after which traces are evaluated in smaller blocks, so that they are safe on disk."""
 
 
 class HostMonitor:
@@ -156,7 +157,7 @@ class HostEngine:
         waiting = _Waiting(self._block_verdicts, rows.put)
         for i in range(count):
             row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
-            self._judge(i, Outcome(row), waiting)
+            waiting.add(i, Outcome(row))
         waiting.settle_all()
 
     def _one_by_one(
@@ -182,18 +183,10 @@ class HostEngine:
         waiting = _Waiting(self._block_verdicts, keep)
         try:
             for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
-                self._judge(todo[place], outcome, waiting)
+                waiting.add(todo[place], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
             waiting.settle_all()
-
-    @staticmethod
-    def _judge(row: int, outcome: Outcome, waiting: "_Waiting") -> None:
-        trace, without = _trace(outcome)
-        if trace is None:
-            waiting.keep(row, without)
-        else:
-            waiting.add(row, trace)
 
     def _outcomes(self, features: list[Any], seeds: list[int]) -> Iterator[tuple[int, Outcome]]:
         if self.system.can_simulate_each:
@@ -218,7 +211,7 @@ class HostEngine:
 
 
 class _Waiting:
-    """Traces that wait for others of their form, to be judged in one block."""
+    """Traces that wait for others of their form, to be evaluated in one block."""
 
     def __init__(
         self,
@@ -229,7 +222,11 @@ class _Waiting:
         self._blocks: dict[Any, list[tuple[int, Trace]]] = {}
         self._since = time.monotonic()
 
-    def add(self, row: int, trace: Trace) -> None:
+    def add(self, row: int, outcome: Outcome) -> None:
+        trace, without = _trace(outcome)
+        if trace is None:
+            self.keep(row, without)
+            return
         form = _form(trace)
         self._blocks.setdefault(form, []).append((row, trace))
         if len(self._blocks[form]) == BLOCK:
@@ -267,7 +264,7 @@ def _without_verdict(status: Status, message: str) -> RowVerdict:
 
 
 def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
-    """Return the trace to judge; or none, and what its row says instead."""
+    """Return the trace to evaluate; or none, and what its row says instead."""
     trace, status, message = outcome
     if not isinstance(trace, Trace) and (trace is not None or status == Status.OK):
         given = type(trace).__name__

@@ -117,11 +117,11 @@ def replay(
         features = problem.space.from_row(row)
         if problem.black_box:
             trace = problem.system(features, key)
-            judged = on_host_clock(trace)
+            read = on_host_clock(trace)
         else:
             precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
-            trace = judged = jax.jit(problem.system)(precise, key)
-        rho, status = jax.jit(trace_verdict, static_argnums=0)(problem, judged)
+            trace = read = jax.jit(problem.system)(precise, key)
+        rho, status = jax.jit(trace_verdict, static_argnums=0)(problem, read)
         return Replay(
             problem=problem,
             row=number,

@@ -34,7 +34,8 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
         if sum(monitor.memory for monitor in monitors) > SMALL:
             return None
     except ValueError:
-        return None  # It looks ahead without end; or its clock is wrong, which `judge` says better.
+        # It looks ahead without end; or its clock is wrong, which the engine says better.
+        return None
 
     def update(carry: PyTree, sample: Mapping[str, Array]) -> PyTree:
         states, finite = carry

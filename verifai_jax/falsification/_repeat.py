@@ -5,7 +5,7 @@
     trials.first_failure                                # [seeds], counted from 1; inf without one
     trials.violating, trials.first_violation            # the same as simulated, before confirmation
 
-Whole rounds (ask, simulate, judge, differentiate, tell) run in one `lax.scan`, all seeds side by
+Whole rounds (ask, simulate, evaluate, differentiate, tell) run in one `lax.scan`, all seeds side by
 side: for comparing searches, where a run a seed would spend its time between rounds.
 """
 
