@@ -17,6 +17,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Trace
 from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.evaluation.confirmation_verdicts import Checked
 from verifai_jax.evaluation.replay import replay
 
 
@@ -84,6 +85,21 @@ def test_artefacts_of_the_step_are_told_from_failures(circles, confirmed_circles
     assert (verdict[(a > 1.2) & (a < 1.5)] == "fragile").all()
     assert confirmed_circles.counts.keys() == {"confirmed", "fragile", "refuted"}
     assert len(confirmed_circles) == len(a) == sum(confirmed_circles.counts.values())
+
+
+def test_a_search_is_told_that_what_is_refused_holds():
+    verdict = np.array(["confirmed", "refuted", "fragile", "unexamined"], object)
+    replayed = {
+        "half_step": np.array([-1.0, 0.4, -0.2, np.nan]),
+        "quarter_step": np.array([-0.9, 0.5, -0.1, np.nan]),
+    }
+    rho = np.array([-1.0, -0.1, -0.3, -2.0])
+    refused, told = Checked(verdict, replayed, np.zeros(4), [""] * 4, ()).refuse(rho)
+    assert refused.tolist() == [False, True, True, False]
+    assert told[1:3].tolist() == [0.5, 1e-6]
+    refused, told = Checked(verdict, {}, np.zeros(4), [""] * 4, ()).refuse(rho)
+    assert refused.sum() == 2
+    assert np.isnan(told).all()
 
 
 @pytest.mark.thorough

@@ -18,13 +18,8 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.counterexamples.selection import Row
-from verifai_jax.evaluation.confirmation import (
-    IN_WORDS,
-    MEANING,
-    VERDICTS,
-    Checked,
-    Confirmer,
-)
+from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.evaluation.confirmation_verdicts import IN_WORDS, MEANING, VERDICTS, Checked
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 

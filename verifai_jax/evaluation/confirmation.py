@@ -9,44 +9,34 @@ A search simulates in single precision at the model's step; both may break a pro
 model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
 quarter of the step, there in single precision too, and with features that are one rounding away;
 and if it fails by more than the finer step has moved it, and by far more than rounding has.
+`confirmation_verdicts.py` has the verdicts and their words.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.trace import Trace
+from verifai_jax.evaluation.confirmation_verdicts import (
+    FINER,
+    RAISED,
+    SINGLE,
+    Checked,
+    describe_checks,
+    describe_disagreement,
+)
 from verifai_jax.evaluation.replays import HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
-VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unchecked", "unexamined")
-"""Verdicts of closer replays; see `Checked`."""
-UNDECIDED = ("fragile", "raised", "unchecked", "unexamined")
-"""Verdicts that leave open whether the failure is the system's or the simulation's."""
-MEANING = {
-    "confirmed": "it fails in every replay",
-    "refuted": "an artefact of the simulation",
-    "fragile": "closer replays disagree",
-    "raised": "it could not be replayed",
-    "unchecked": "there is nothing finer to check it with",
-    "unexamined": "it was not replayed",
-}
-"""Each verdict as people read it."""
-FINER = {"half_step": 2, "quarter_step": 4}
-"""Checks at a finer step, and how many times finer."""
-RAISED = (Status.ERROR, Status.TIMEOUT)
-"""Ends of a simulation that gave no trace."""
-SINGLE = "quarter_step_float32"
-"""Name of the check at the finest step in single precision."""
 AMPLIFIED = 4.0
 """Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
 roundings into any of its outcomes, and two or three programs may agree by chance."""
@@ -63,75 +53,6 @@ SAFE = 10.0
 any row."""
 BLOCK = 512
 """Rows examined between two looks at whether the rest may stay unexamined."""
-IN_WORDS = {
-    "float64": "in float64",
-    "again": "simulated again",
-    "half_step": "at half the step",
-    "quarter_step": "at a quarter of the step",
-    SINGLE: "at a quarter of the step in float32",
-    "nudged": "one rounding of the features away",
-    "simulator": "in the other simulator",
-}
-"""Each check as people read it."""
-
-
-def describe_checks(checks: Collection[str], exact_step: bool = False) -> str:
-    """Describe the checks that a confirmed row has passed, in words.
-
-    **Arguments:**
-
-    - `checks`: their names, as in `Checked.rho`.
-    - `exact_step`: whether the step belongs to the system, so that there is no finer one.
-
-    **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
-    the step`; empty without a check.
-    """
-    parts = []
-    if "float64" in checks:
-        parts.append("in double precision")
-    elif "again" in checks:
-        parts.append("when simulated again")
-    if "quarter_step" in checks:
-        parts.append("at a half and a quarter of the step")
-    if "nudged" in checks:
-        parts.append("one rounding of the features away")
-    if "simulator" in checks:
-        parts.append("in the other simulator")
-    words = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
-    if words and "quarter_step" not in checks:
-        words += (
-            "; the step belongs to the system" if exact_step else "; no finer step could be tried"
-        )
-    return words
-
-
-class Checked(NamedTuple):
-    """Verdicts of closer replays of `n` rows.
-
-    - `verdict`: `confirmed`: it fails in every check, at least one of which is finer than the run,
-      and by more than replays move it; `refuted`: none of the finer checks fails (half and quarter
-      of the step and the other simulator, or where the step stays, double precision); `fragile`:
-      the checks disagree, one of them gave no robustness, or it fails by less than that; `raised`:
-      a check raised, and the others fail; `unchecked`: there was nothing finer to check with;
-      `unexamined`: left out, see `Confirmer`.
-    - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
-      are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
-      `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
-      away) and `simulator`.
-    - `band`: how much the robustness moved: between half and quarter of the step, which is what a
-      method of order 1 is still off at the quarter (Richardson's extrapolation), or by rounding:
-      between two precisions, two neighbouring features, or the run and its replay where `rho` of
-      the run is known. A row is confirmed if it fails by more than the first and by four times the
-      second.
-    - `why`: the reason, for people; empty where confirmed.
-    - `notes`: which checks could not be made, and why.
-    """
-
-    verdict: np.ndarray
-    rho: dict[str, Float[np.ndarray, " n"]]
-    band: Float[np.ndarray, " n"]
-    why: list[str]
-    notes: tuple[str, ...]
 
 
 class Confirmer:
@@ -450,7 +371,6 @@ def _decide(
         ["raised", "confirmed", "refuted", "unchecked"],
         "fragile",
     )
-    proper = {name: r.proper for name, r in found.items()}
     why = [""] * count
     for i in np.flatnonzero(verdict != "confirmed").tolist():
         if verdict[i] == "unchecked":
@@ -458,7 +378,7 @@ def _decide(
         elif verdict[i] == "raised" and plan.raised:
             why[i] = plan.raised
         else:
-            why[i] = _reason(i, found, proper, float(rho[finest][i]), float(band[i]))
+            why[i] = describe_disagreement(i, found, float(rho[finest][i]), float(band[i]))
     return _Decision(verdict.astype(object), band, why, found)
 
 
@@ -473,36 +393,6 @@ def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.n
     """Return by how much a robustness moved: infinitely where one of the two is missing."""
     with np.errstate(invalid="ignore"):
         return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)
-
-
-def _reason(
-    i: int,
-    found: dict[str, Verdicts],
-    proper: dict[str, Bool[np.ndarray, " n"]],
-    rho: float,
-    band: float,
-) -> str:
-    lost = [name for name in found if not proper[name][i]]
-    if lost:
-        raised = [name for name in lost if found[name].status[i] in RAISED]
-        if raised:
-            messages = [m[i] for name in raised if (m := found[name].messages)]
-            message = next(filter(None, messages), "out of time")
-            return f"the replay {_and(raised)} raised: {message}"
-        return f"the replay {_and(lost)} is not finite"
-    holds = [name for name, replayed in found.items() if not replayed.violated[i]]
-    if len(holds) == len(found):
-        return "it holds in every replay"
-    if holds:
-        fails = [name for name in found if name not in holds]
-        few = len(holds) <= len(fails)
-        return f"it holds {_and(holds)}" if few else f"it fails only {_and(fails)}"
-    return f"its robustness {rho:.3g} moves by {band:.2g} between replays"
-
-
-def _and(names: Sequence[str]) -> str:
-    words = [IN_WORDS[name] for name in names]
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def _other(problem: Problem, simulator: System | Callable[..., Trace] | Problem | str) -> Problem:

@@ -15,7 +15,6 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.confirmation import LIMIT, Confirmer
 from verifai_jax.evaluation.engine import Engine
-from verifai_jax.falsification.counts import NOT_CLAIMED
 from verifai_jax.problem.problem import Problem
 
 MORE = 4
@@ -100,10 +99,7 @@ class SeedClaims:
             own = np.flatnonzero(whose == one)
             columns = {name: column[own] for name, column in rows.items()}
             checked = self._confirmer(one)(columns, numbers[own])
-            refused[own] = np.isin(checked.verdict, NOT_CLAIMED)
-            if checked.rho:
-                most = np.nanmax(np.stack([*checked.rho.values(), rho[own]]), axis=0)
-                greatest[own] = np.maximum(most, 1e-6)
+            refused[own], greatest[own] = checked.refuse(rho[own])
         return refused, greatest
 
     def _rows(self, u: Float[np.ndarray, "n d"]) -> dict[str, np.ndarray]:

@@ -7,10 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
 from verifai_jax.falsification.columns import Columns
-
-NOT_CLAIMED = ("fragile", "refuted")
-"""Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""The state of a run between its rounds, and one round: propose, simulate, judge, tell, store.
+"""The state of a run between its rounds, and one round: propose, simulate, evaluate, tell, store.
 
 A round leaves everything in step: the table, the search and the counts. The `checkpoint` after a
 round is enough to go on from there, whatever happened since.
@@ -19,7 +19,6 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_checkpoint
-from verifai_jax.falsification.counts import NOT_CLAIMED
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
@@ -152,13 +151,11 @@ class Rounds:
             objective = self._objective(verdicts.rho, verdicts.rho < 0)
         claimed = verdicts.violated
         if self._confirmer is not None:
-            verdict, greatest = self._confirmed(self._confirmer, columns, first)
-            columns["verdict"] = verdict
-            claimed = verdicts.violated & ~np.isin(verdict, NOT_CLAIMED)
+            columns["verdict"], refused, told = self._confirmed(self._confirmer, columns, first)
+            claimed = verdicts.violated & ~refused
             # A search that took them for failures would stay with them.
-            refuted = verdicts.violated & ~claimed
-            objective = np.where(refuted, greatest, objective)
-            verdicts = _raised(verdicts, refuted)
+            objective = np.where(refused, told, objective)
+            verdicts = _raised(verdicts, refused)
         self._tell(objective, verdicts)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
@@ -183,20 +180,20 @@ class Rounds:
 
     def _confirmed(
         self, confirmer: Confirmer, columns: dict[str, Any], first: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the verdict of each row, and the greatest robustness of its replays.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the verdict of each row, whether it is refused, and what to tell of it if it is.
 
-        The verdict is empty where nothing is violated; the robustness is at least 1e-6.
+        The verdict is empty where nothing is violated.
         """
         rows = np.flatnonzero(columns["violated"])
         verdict = np.full(len(columns["rho"]), "", object)
-        greatest = np.full(len(verdict), np.nan)
+        refused, told = np.zeros(len(verdict), bool), np.full(len(verdict), np.nan)
         if not len(rows):
-            return verdict, greatest
+            return verdict, refused, told
         if not confirmer.finer:
             # To simulate it again may take as long as the run, and would say little.
             verdict[rows] = "unchecked"
-            return verdict, greatest
+            return verdict, refused, told
         own = {name: column[rows] for name, column in columns.items()}
         started, compiled = time.perf_counter(), confirmer.compile_seconds
         checked = confirmer(own, first + rows, max(LIMIT, (first + len(verdict)) // SHARE))
@@ -205,10 +202,8 @@ class Rounds:
         self.confirm_seconds += time.perf_counter() - started - compiled
         self.checked = confirmer.checked or self.checked
         verdict[rows] = checked.verdict
-        if checked.rho:
-            most = np.nanmax(np.stack([*checked.rho.values(), own["rho"]]), axis=0)
-            greatest[rows] = np.maximum(most, 1e-6)
-        return verdict, greatest
+        refused[rows], told[rows] = checked.refuse(own["rho"])
+        return verdict, refused, told
 
     def _verdicts(self, points: Float[Any, "n d"], first: int) -> Verdicts:
         temperature = self._proposals.temperature

@@ -7,7 +7,7 @@ failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 """
 
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
-from verifai_jax.evaluation.confirmation import UNDECIDED
+from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.run import Run
 
