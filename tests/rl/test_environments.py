@@ -9,7 +9,7 @@ from checked_types import unchecked
 
 from envs import cartpole as cp
 from verifai_jax.core.errors import UnknownNameError
-from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, evaluate, train
+from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, train
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.rl.task.mjx import mjx_task
 from verifai_jax.rl.task.ode import ode_task
@@ -267,9 +267,9 @@ def test_an_environment_of_brax_is_its_own_rollout_and_can_be_learnt(brax):
         np.testing.assert_allclose(task.observe(ours), theirs.obs, rtol=1e-4, atol=1e-5)
         assert (float(reward), bool(over)) == (float(theirs.reward), bool(theirs.done))
     ppo = PPO(learning_rate=1e-3, hidden=(16, 16), normalise=True, entropy=0.0)
-    trained = train(task, ppo, steps=65_536)
-    first = trained.mean_return[~np.isnan(trained.mean_return)][0]
-    assert evaluate(task, trained.policy, episodes=16).mean() > 10 * first
+    returns = train(task, ppo, steps=65_536).mean_return
+    # The returns of training, as `evaluate` would compile the physics once more.
+    assert np.nanmean(returns[-8:]) > 10 * returns[~np.isnan(returns)][0]
 
 
 # Systems of our own
