@@ -71,11 +71,19 @@ with write_lock(Path(sys.argv[1])):
 with write_lock(Path(sys.argv[1])):
     os.close(goes)
     os.waitpid(child, 0)
+print("locked again while the child lived")
 """
 
 
 def test_a_forked_child_does_not_keep_it(tmp_path):
-    subprocess.run([sys.executable, "-c", FORKS, str(tmp_path)], check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", FORKS, str(tmp_path)],
+        check=True,
+        timeout=60,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == "locked again while the child lived\n"
 
 
 def test_a_lock_file_of_nonsense_is_no_owner(tmp_path):

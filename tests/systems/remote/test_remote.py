@@ -5,6 +5,7 @@ import hmac
 import json
 import os
 import re
+import select
 import shutil
 import signal
 import socket
@@ -278,9 +279,16 @@ def test_whatever_comes_is_a_trace_or_a_clear_error(data, changes):
     for place, new in changes:
         at = int(place * len(data))
         data = data[:at] + new + data[at + 1 :]
-    with contextlib.suppress(ValueError, TypeError):  # WireError is a ValueError
+    told = "a clear error"
+    try:
         for message in decoded(data, most=1 << 16) if data else ():
-            TraceForm(("x",), 0.1).accept(wire.trace_of(message))
+            trace = TraceForm(("x",), 0.1).accept(wire.trace_of(message))
+            assert list(trace.signals) == ["x"]
+            assert 1 <= len(trace.signals["x"]) == trace.length
+    except (ValueError, TypeError) as error:  # WireError is a ValueError
+        told = str(error)
+    assert told.isprintable()
+    assert 10 < len(told) < 1000
 
 
 def test_what_a_stranger_says_cannot_garble_a_log(system, caplog):
@@ -386,6 +394,8 @@ def test_a_slow_client_is_given_no_more_than_it_works_on(system, monkeypatch):
     asked = Asked(system, 3)
     for _ in range(3):
         (point,) = peer.points(1)
+        # Nothing else comes before the answer.
+        assert not select.select([peer.socket], [], [], 0.05)[0]
         peer.answer(point)
     asked.all()
 
