@@ -47,6 +47,7 @@ Scalar = Float[Array, ""]
 HEIGHT, WIDTH = 24, 48
 FIELD_OF_VIEW = 0.61
 FRAME_RATE = 4.0
+PERIOD = 1 / FRAME_RATE
 SUBSTEPS = 5
 LANE = 3.5
 LENGTH, BREADTH = 4.2, 1.8
@@ -366,11 +367,11 @@ class Cones(System):
 
     def __init__(self, perception: Perception, manoeuvre: Manoeuvre, duration: float) -> None:
         self.perception, self.manoeuvre, self.duration = perception, manoeuvre, duration
-        self.dt = 1 / FRAME_RATE
+        self.dt = PERIOD
 
     def __call__(self, features: Features, key: Key[Array, ""] | int | None = None) -> Trace:
         """Simulate once; the signals are those of `cones`."""
-        step = self.dt / SUBSTEPS
+        step = PERIOD / SUBSTEPS
         reaction = jnp.asarray(features["reaction_time"])
 
         def move(state: State, time: Scalar) -> tuple[State, Scalar]:
@@ -386,14 +387,16 @@ class Cones(System):
 
         def frame(carry: tuple[State, Scalar], number: Scalar) -> tuple[tuple[State, Scalar], dict]:
             state, gap = carry
-            time = number * self.dt
+            time = number * PERIOD
             logit, estimate = self.perception(features, state.pose)
             estimate = jnp.where(logit > 0, estimate, NOTHING)
             distance = distance_of_nearest(features, state.pose)
             waiting = time < state.begun
             sample = {
                 "cone_gap": gap,
+                "x": state.x,
                 "offset": state.y,
+                "heading": state.pose.heading,
                 "speed": state.speed,
                 "distance": jnp.where(waiting, distance, NOTHING),
                 "estimate": estimate,
@@ -410,15 +413,12 @@ class Cones(System):
         numbers = jnp.arange(round(self.duration * FRAME_RATE) + 1, dtype=start.x.dtype)
         first = (start, gap_to_cones(features, start.pose))
         _, signals = jax.lax.scan(frame, first, numbers)
-        return Trace(signals, dt=self.dt)
+        return Trace(signals, dt=PERIOD)
 
-    def poses(self, trace: Trace, features: Features) -> Pose:
-        """Return the car's pose at each sample of a trace, to render what the camera saw."""
-        speed, y = jnp.asarray(trace["speed"]), jnp.asarray(trace["offset"])
-        travelled = jnp.cumsum((speed[1:] + speed[:-1]) / 2) * self.dt
-        x = self._start(features).x + jnp.concatenate([jnp.zeros(1, speed.dtype), travelled])
-        drift = jnp.gradient(y, self.dt)
-        return Pose(x, y, jnp.arctan2(drift, jnp.maximum(speed, 0.5)))
+    def film(self, trace: Trace, features: Features) -> Float[Array, "time height width 3"]:
+        """Return what the camera saw in a simulation, from its trace."""
+        poses = Pose(*(jnp.asarray(trace[name]) for name in ("x", "offset", "heading")))
+        return jax.jit(lambda at: jax.lax.map(lambda pose: render(features, pose), at))(poses)
 
     def _start(self, features: Features) -> State:
         speed = jnp.asarray(features["cruising_speed"], float)
@@ -439,9 +439,10 @@ def cones(
     nominal where missing.
 
     **Signals:** `cone_gap` (m, between the car and the nearest cone, the least since the last
-    image), `offset` (m, to the left of the lane's middle), `speed` (m/s), `distance` (m, to the
-    nearest cone in sight; 60 without any, and once the manoeuvre has begun), `estimate` (m; 60
-    where nothing is seen), `presence` (probability).
+    image), `x` (m, of the car's middle; the first cone is at 0), `offset` (m, to the left of the
+    lane's middle), `heading` (rad), `speed` (m/s), `distance` (m, to the nearest cone in sight; 60
+    without any, and once the manoeuvre has begun), `estimate` (m; 60 where nothing is seen),
+    `presence` (probability).
 
     **Arguments:**
 

@@ -69,6 +69,8 @@ def test_the_car_goes_around_the_cones_or_stops_before_them():
     stops = jax.jit(specs.braking_perfectly.system)(specs.braking_perfectly.nominal, KEY)
     assert stops["speed"][-1] == 0
     assert 0.5 < stops["cone_gap"][-1] < 8
+    film = specs.perfectly.system.film(around, specs.perfectly.nominal)
+    assert film.shape == (len(around["x"]), ec.HEIGHT, ec.WIDTH, 3)
     begun = np.argmax(np.asarray(around["distance"]) == ec.NOTHING)
     assert ec.TRIGGER - 7 < around["distance"][begun - 1] < ec.TRIGGER
 

@@ -18,6 +18,8 @@ from verifai_jax.perception.ground import Ring as Ring
 from verifai_jax.perception.light import Sky as Sky
 from verifai_jax.perception.light import Sun as Sun
 from verifai_jax.perception.light import hsv as hsv
+from verifai_jax.perception.mujoco import mujoco_camera as mujoco_camera
+from verifai_jax.perception.mujoco import mujoco_scene as mujoco_scene
 from verifai_jax.perception.scene import Scene as Scene
 from verifai_jax.perception.solids import Box as Box
 from verifai_jax.perception.solids import Cone as Cone
@@ -55,6 +57,8 @@ __all__ = [
     "hsv",
     "load_detector",
     "losses_of",
+    "mujoco_camera",
+    "mujoco_scene",
     "save_detector",
     "score",
     "train_detector",
