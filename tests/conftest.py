@@ -53,6 +53,7 @@ install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
 
 LONG_FILES = (
+    "test_faults.py",
     "test_estimate_methods.py",
     "test_learning_curves.py",
     "test_mujoco_gradients.py",
