@@ -342,10 +342,14 @@ def _interrupted(*_, **__):
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_signal_ends_a_command_as_ctrl_c_does(call, monkeypatch, name, code):
     number = getattr(signal, name)
-    before = signal.getsignal(number)
     monkeypatch.setattr("verifai_jax.falsification.falsify", lambda *_, **__: _signalled(number))
-    assert call("falsify", "specs/ramp.py:ramp", code=code) == "Error: interrupted\n"
-    assert signal.getsignal(number) == before
+    # Tests that are started by nohup ignore it, and so would the command.
+    before = signal.signal(number, signal.SIG_DFL)
+    try:
+        assert call("falsify", "specs/ramp.py:ramp", code=code) == "Error: interrupted\n"
+        assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
 
 
 def _signalled(number):
