@@ -18,19 +18,24 @@ EVERY = 1.0
 
 @dataclass(frozen=True)
 class Report:
-    """What one run took: `grown` is memory since a fifth of its time, beyond that of its rows."""
+    """What one run took, in seconds and GB.
+
+    - `begun`: resident memory after a fifth of the time.
+    - `most`: the most of it in the second half.
+    - `grown`: the difference, beyond the memory that the rows would take.
+    """
 
     seconds: float
     rows: int
     begun: float
-    ended: float
+    most: float
     grown: float
 
     def __str__(self) -> str:
         return (
             f"{self.rows:,} rows in {self.seconds:.0f} s; {self.begun:.2f} GB resident after a "
-            f"fifth of the time, {self.ended:.2f} GB at the end, {self.grown:.2f} GB of the growth "
-            "beyond that of the rows themselves"
+            f"fifth of the time, at most {self.most:.2f} GB in the second half, "
+            f"{self.grown:.2f} GB of the growth beyond that of the rows themselves"
         )
 
 
