@@ -130,14 +130,15 @@ def test_a_formula_that_looks_beyond_the_trace():
 
 @pytest.mark.thorough
 def test_the_specifications_of_this_project_get_no_false_note():
+    # In a model of an aircraft the heading has no part in the altitude; who knows the distance of
+    # the cones needs no eyes for colours and weather.
+    right = ("feature 'psi' influences no signal", "features 'car_hue', 'car_value'")
     checked = 0
     for file in sorted((ROOT / "specs").glob("**/*.py")):
         if file.stem in ("__init__", "tuning", "hopper", "reacher"):
             continue
         for name, problem in definitions(str(file), vj.Problem).items():
-            # In this model of an aircraft the heading has no part in the altitude.
-            heading = "feature 'psi' influences no signal"
-            found = [note for note in silent_mistakes(problem) if not note.startswith(heading)]
+            found = [note for note in silent_mistakes(problem) if not note.startswith(right)]
             assert not found, f"{file}:{name}: {found}"
             checked += 1
     assert checked > 40
