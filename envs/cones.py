@@ -372,7 +372,7 @@ class Cones(System):
     def __call__(self, features: Features, key: Key[Array, ""] | int | None = None) -> Trace:
         """Simulate once; the signals are those of `cones`."""
         step = PERIOD / SUBSTEPS
-        reaction = jnp.asarray(features["reaction_time"])
+        reaction = jnp.asarray(features.get("reaction_time", 0.0), float)
 
         def move(state: State, time: Scalar) -> tuple[State, Scalar]:
             left, ahead = self.manoeuvre.drive(state, time)
@@ -435,8 +435,8 @@ def cones(
     """Return the loop as a system under test.
 
     **Features:** `distance0` (m, from the camera to the first cone), `cruising_speed` (m/s),
-    `reaction_time` (s); `offset0` (m) and `heading0` (rad); those of `SCENERY` and `WEATHER`,
-    nominal where missing.
+    `reaction_time` (s, before the lane change); `offset0` (m) and `heading0` (rad); those of
+    `SCENERY` and `WEATHER`, nominal where missing.
 
     **Signals:** `cone_gap` (m, between the car and the nearest cone, the least since the last
     image), `x` (m, of the car's middle; the first cone is at 0), `offset` (m, to the left of the

@@ -32,11 +32,13 @@ SPEEDS = {"lanechange": (4.5, 7.2), "aebs": (5.0, 9.0)}
 
 def space(manoeuvre: str) -> vj.FeatureSpace:
     """Return where the car comes from, what stands in its lane, and the weather."""
+    # Brakes act at once.
+    reaction = {"reaction_time": vj.Box(0.7, 1.0)} if manoeuvre == "lanechange" else {}
     return vj.FeatureSpace(
         {
             "distance0": vj.Box(22.0, 30.0),
             "cruising_speed": vj.Box(*SPEEDS[manoeuvre]),
-            "reaction_time": vj.Box(0.7, 1.0),
+            **reaction,
             "offset0": vj.Box(-0.3, 0.3),
             "heading0": vj.Box(-0.04, 0.04),
             **SCENERY,
@@ -55,6 +57,7 @@ def problem(name: str, perception: Perception, manoeuvre: str, about: str) -> vj
         del rules["overshoot"]
     first = [("safe", other) for other in rules if other != "safe"]
     low, high = SPEEDS[manoeuvre]
+    reaction = {"reaction_time": 0.85} if manoeuvre == "lanechange" else {}
     return vj.Problem(
         name,
         space(manoeuvre),
@@ -64,7 +67,7 @@ def problem(name: str, perception: Perception, manoeuvre: str, about: str) -> vj
         nominal={
             "distance0": 26.0,
             "cruising_speed": (low + high) / 2,
-            "reaction_time": 0.85,
+            **reaction,
             "offset0": 0.0,
             "heading0": 0.0,
             **NOMINAL,
