@@ -129,10 +129,7 @@ class Engine:
         - `shared`: what all rows share, for inputs that have such.
         """
         rho, status, features, more = self._run("evaluate", rows, key, first, temperature, shared)
-
-        def holds() -> Bool[np.ndarray, "n formulas"]:
-            return self.holds(rows, key, first, shared)
-
+        holds = partial(self.holds, rows, key, first, shared)
         return Verdicts(rho, status, violations(rho, status, holds), features, **more)
 
     def holds(
@@ -200,7 +197,11 @@ class Engine:
         temperature: ArrayLike,
         shared: PyTree,
     ) -> Any:
-        with in_precision(self.precision):
+        # What is compiled already needs nothing else of the precision, and a batch can take less
+        # than a millisecond.
+        compiled = mode in self._executables
+        x64 = self.precision == "float64"
+        with jax.enable_x64(x64) if compiled else in_precision(self.precision):
             count = len(jax.tree.leaves(rows)[0])
             temperatures = np.asarray(temperature, np.float32)
             if temperatures.ndim:

@@ -108,8 +108,10 @@ def violations(
     **Returns:** for each simulation whether it ended properly and breaks a formula.
     """
     proper = status == Status.OK
-    broken = proper & np.any(rho < 0, axis=1)
-    undecided = proper & ~broken & np.any(rho == 0, axis=1)
+    # A formula without a verdict leaves it to the others.
+    least = rho[:, 0] if rho.shape[1] == 1 else np.fmin.reduce(rho, axis=1)
+    broken = proper & (least < 0)
+    undecided = proper & (least == 0)
     if undecided.any():
         broken |= undecided & ~np.all(holds(), axis=1)
     return broken
