@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from verifai_jax.cli import arguments
 from verifai_jax.cli.doctor import bad_pairs
 from verifai_jax.cli.main import main
-from verifai_jax.falsification.record import sealed
+from verifai_jax.core.seals import sealed
 from verifai_jax.falsification.run import load
 
 ROOT = Path(__file__).parents[2]

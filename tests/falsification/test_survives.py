@@ -17,13 +17,14 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.locks import LOCK, FolderInUse, write_lock
+from verifai_jax.core.seals import sealed
 from verifai_jax.falsification.checkpoint import (
     RECORD_CHECKSUM,
     ROWS_CHECKSUM,
     STATE,
     write_checkpoint,
 )
-from verifai_jax.falsification.record import RECORD, sealed
+from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.tail import TAIL
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}

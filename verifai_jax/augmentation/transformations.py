@@ -11,6 +11,8 @@ Source: Shorten and Khoshgoftaar, A survey on image data augmentation for deep l
 Big Data 6 (2019).
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
@@ -93,14 +95,7 @@ def brightness(most: float) -> Transformation:
 
     **Raises:** `ValueError` for a share out of range.
     """
-    check_fraction("most", most)
-
-    def apply(inputs: Inputs, labels: Labels, key: Key[Array, ""]) -> tuple[Inputs, Labels]:
-        images = _images(inputs)
-        factor = jax.random.uniform(key, images.shape[:1], minval=1 - most, maxval=1 + most)
-        return jnp.clip(images * _each(factor, images), 0.0, 1.0), labels
-
-    return apply
+    return _scaled(most, jnp.zeros_like)
 
 
 def contrast(most: float) -> Transformation:
@@ -112,13 +107,22 @@ def contrast(most: float) -> Transformation:
 
     **Raises:** `ValueError` for a share out of range.
     """
+
+    def mean(images: Array) -> Array:
+        return images.mean(axis=tuple(range(1, images.ndim)), keepdims=True)
+
+    return _scaled(most, mean)
+
+
+def _scaled(most: float, middle: Callable[[Array], Array]) -> Transformation:
+    """Return a transformation that scales images around a middle, and keeps them in [0, 1]."""
     check_fraction("most", most)
 
     def apply(inputs: Inputs, labels: Labels, key: Key[Array, ""]) -> tuple[Inputs, Labels]:
         images = _images(inputs)
         factor = jax.random.uniform(key, images.shape[:1], minval=1 - most, maxval=1 + most)
-        mean = images.mean(axis=tuple(range(1, images.ndim)), keepdims=True)
-        return jnp.clip(mean + (images - mean) * _each(factor, images), 0.0, 1.0), labels
+        around = middle(images)
+        return jnp.clip(around + (images - around) * _each(factor, images), 0.0, 1.0), labels
 
     return apply
 

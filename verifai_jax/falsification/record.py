@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.core.seals import is_intact
 from verifai_jax.core.text import one_line
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED
@@ -89,21 +90,11 @@ def read_record(folder: Path) -> dict[str, Any]:
         if name not in record or not fits(record[name]):
             what = f"has no {name!r}" if name not in record else f"has {name!r} of another form"
             raise ValueError(f"{file} is damaged: it {what}{_rows_beside(folder)}")
-    if record.get("checksum") != _checksum(record):
+    if not is_intact(record):
         raise ValueError(
             f"{file} is damaged: its content has changed since it was written{_rows_beside(folder)}"
         )
     return record
-
-
-def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with the checksum of its content."""
-    return {**record, "checksum": _checksum(record)}
-
-
-def _checksum(record: Mapping[str, Any]) -> int:
-    content = {name: value for name, value in record.items() if name != "checksum"}
-    return zlib.crc32(json.dumps(content, sort_keys=True).encode())
 
 
 def record_checksum(record: Mapping[str, Any]) -> int:

@@ -17,6 +17,7 @@ import numpy as np
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.seals import sealed
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
@@ -35,7 +36,6 @@ from verifai_jax.falsification.record import (
     RECORDED,
     read_record,
     record_checksum,
-    sealed,
 )
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL

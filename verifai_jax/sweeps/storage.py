@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.seals import is_intact, sealed
 from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
@@ -115,9 +116,8 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
             for file in _files(folder, record.rows)
         },
     }
-    data["checksum"] = _checksum(data)
     partial = folder / f"{RECORD}.part"
-    partial.write_text(json.dumps(data, indent=2) + "\n")
+    partial.write_text(json.dumps(sealed(data), indent=2) + "\n")
     partial.replace(folder / RECORD)
 
 
@@ -125,12 +125,6 @@ def _files(folder: Path, rows: int) -> list[Path]:
     """Return the files beside the record; rows may have no policy."""
     policies = (folder / POLICIES / f"{row}.npz" for row in range(rows))
     return [folder / TABLE, folder / FAILING, folder / CURVES, *(p for p in policies if p.exists())]
-
-
-def _checksum(data: Mapping[str, Any]) -> int:
-    """Return the checksum of a record, but for the field that holds it."""
-    rest = {name: value for name, value in data.items() if name != "checksum"}
-    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
 
 def read_description(folder: Path) -> dict[str, Any]:
@@ -152,7 +146,7 @@ def read_description(folder: Path) -> dict[str, Any]:
             f"{file} has format {form!r}, and this verifai_jax reads format {FORMAT}; "
             "read it with the version that wrote it"
         )
-    if data.get("checksum") != _checksum(data):
+    if not is_intact(data):
         raise SweepFileError(f"{file} is damaged: its content has changed since it was written")
     return data
 
