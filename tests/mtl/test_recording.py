@@ -1,6 +1,7 @@
 """Recorded traces: files, gaps, clocks, and what is refused."""
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pytest
 from checked_types import unchecked
@@ -53,6 +54,32 @@ def test_parquet_and_a_given_period(tmp_path):
     trace = read(file, dt=0.5)
     assert trace.dt == 0.5
     assert robustness("X (x > 0)", trace) == 2.0
+
+
+def test_a_data_frame_is_read_as_the_file_of_its_rows(flight):
+    from_file, frame = read(flight), pd.read_csv(flight)
+    moments = frame.assign(time=pd.Timestamp("2026-01-01") + pd.to_timedelta(frame.time, unit="s"))
+    for source in (frame, frame.set_index("time"), moments, moments.set_index("time")):
+        trace = Trace.from_dataframe(source)
+        assert list(trace.signals) == list(from_file.signals)
+        np.testing.assert_allclose(trace.times, from_file.times, rtol=1e-12)
+        for name, values in trace.signals.items():
+            np.testing.assert_array_equal(values, from_file[name])
+    assert Trace.from_dataframe(frame, dt=0.5).dt == 0.5
+
+
+def test_bad_data_frames(flight):
+    frame = pd.read_csv(flight)
+    with pytest.raises(ValueError, match="the data frame has no column 'time' of sample times"):
+        read(frame.drop(columns="time"))
+    with pytest.raises(ValueError, match="the data frame has no rows"):
+        read(frame[:0])
+    with pytest.raises(ValueError, match="column 'label' of the data frame holds no numbers"):
+        read(frame, columns=["label"])
+    with pytest.raises(ValueError, match="the data frame has more than one column 'armed'"):
+        read(frame.rename(columns={"x": "armed"}))
+    with unchecked(), pytest.raises(TypeError, match=r"a file or a pandas\.DataFrame; got a list"):
+        read([1.0])
 
 
 def test_resampling():

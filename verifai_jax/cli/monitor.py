@@ -8,6 +8,7 @@ import click
 
 from verifai_jax.cli.arguments import PLOT, fail_on, split_pairs
 from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+from verifai_jax.cli.monitor_stream import monitor_stream
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
 
 if TYPE_CHECKING:
@@ -50,7 +51,11 @@ def monitor(
     plot: Path | None,
     fail_on: str | None,
 ) -> None:
-    """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet."""
+    """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
+
+    With - as RECORDING, lines of CSV are read from the standard input as they come, until the
+    verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
+    """
     import jax
 
     from verifai_jax import mtl
@@ -59,6 +64,16 @@ def monitor(
         raise click.UsageError("--explain and --plot do not go with --compat")
     numbers = {name: _number(name, value) for name, value in split_pairs("--const", constants)}
     parsed = mtl.parse(formula, numbers, dict(split_pairs("--define", definitions)))
+    if str(recording) == "-":
+        if explain or plot is not None or compat is not None or period is not None or end != "hold":
+            raise click.UsageError(
+                "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
+                "need the whole recording"
+            )
+        holds = monitor_stream(parsed, click.get_text_stream("stdin"), time, dt)
+        if fail_on is not None and not holds:
+            raise fail_gate()
+        return
     trace = _read(recording, time, dt, period, method)
     _check_signals(parsed, trace, recording)
     with jax.enable_x64(True):

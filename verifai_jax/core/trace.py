@@ -3,6 +3,7 @@
     Trace({"x": xs, "theta": thetas}, dt=0.02)
     Trace({"x": xs}, times=ts)                              # a recording, not evenly sampled
     Trace({"x": xs}, dt=0.02, valid=k)                      # ended early: k samples count
+    Trace.from_dataframe(frame)                             # a column `time`, one column a signal
 
 A trace is a pytree, so `jax.vmap` over a system gives a batch of traces.
 """
@@ -11,7 +12,7 @@ import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,11 @@ import numpy as np
 from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
+
+from verifai_jax.core.lazy import late
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Samples: TypeAlias = (
     Real[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
@@ -120,6 +126,26 @@ class Trace:
             if status.ndim == 0 and int(status) not in list(Status):
                 known = ", ".join(f"{code.value} ({code.name})" for code in Status)
                 raise ValueError(f"status must be one of {known}; got {status}")
+
+    @classmethod
+    def from_dataframe(
+        cls, frame: "pd.DataFrame", time: str = "time", dt: float | None = None
+    ) -> "Trace":
+        """Make a trace of a `pandas.DataFrame`, one column a signal, one row a sample.
+
+        Columns `p[0]`, `p[1]`, ... make one vector signal `p`; columns without numbers are left
+        out. `verifai_jax.mtl.read` can also choose columns and resample.
+
+        **Arguments:**
+
+        - `time`: the column of sample times in seconds, or the name of the index; dates and
+          durations become seconds since the first.
+        - `dt`: the sampling period in seconds, instead of a column of times.
+
+        **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
+        that do not increase.
+        """
+        return late("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
 
     @property
     def length(self) -> int:

@@ -18,7 +18,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import simplify
+from verifai_jax.mtl.semantics import Semantics, hard
 
 Leaf = Callable[[Formula, int], Array]
 Cells = dict[str, Any]
@@ -49,6 +50,7 @@ class Online:
 
     formula: Formula
     dt: float
+    kind: Literal["hard", "boolean"] = "hard"
 
     def init(self) -> State:
         """Return the state before any sample."""
@@ -84,16 +86,23 @@ class Online:
         return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(self.init)))
 
 
-def online(formula: Formula | str, dt: float) -> Online:
+def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> Online:
     """Make a monitor of `formula` for samples `dt` seconds apart.
 
-    **Raises:** `IntervalError` for an interval that is not a multiple of `dt`, `ValueError` for an
+    **Arguments:**
+
+    - `semantics`: `hard`, or `boolean`, by which all values are above zero where the formula holds
+      and below where it does not, also where its robustness is exactly zero.
+
+    **Raises:** `ValueError` for smooth semantics, `IntervalError` for an interval that is not a multiple of `dt`, `ValueError` for an
     unbounded future operator within another temporal operator, which no bounded memory can follow.
     """
     formula = simplify(parse(formula) if isinstance(formula, str) else formula)
     if not dt > 0:
         raise ValueError(f"the sampling period dt must be positive; got {dt}")
-    monitor = Online(formula, float(dt))
+    if semantics.kind == "smooth":
+        raise ValueError("an online monitor has hard or boolean semantics; got smooth ones")
+    monitor = Online(formula, float(dt), semantics.kind)
     jax.eval_shape(monitor.init)
     return monitor
 
@@ -109,7 +118,7 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
         name: jnp.where(a, 1.0, -1.0) if a.dtype == bool else a.astype(state.last[0].dtype)
         for name, a in signals.items()
     }
-    evaluator = Evaluator(signals, 1, monitor.dt)
+    evaluator = Evaluator(signals, 1, monitor.dt, kind=monitor.kind)
     last = tuple(
         jnp.asarray(evaluator.value(f, 0, 0)[0], old.dtype)
         for f, old in zip(_leaves(monitor.formula), state.last, strict=True)

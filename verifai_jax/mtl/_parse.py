@@ -19,7 +19,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Expression, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval
 from verifai_jax.mtl.grammar import BINARY, FormulaSyntaxError, Tree, explain_error, parser
-from verifai_jax.mtl.words import FUNCTIONS, NAME
+from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NAME, NUMBERS
 
 _UNITS = {
     "s": Decimal(1),
@@ -267,7 +267,7 @@ class _Builder:
             case "parens":
                 return tree if self._is_arithmetic(tree) else None
             case "name":
-                return tree if str(tree.children[0]) in self.constants else None
+                return tree if str(tree.children[0]) in {**NUMBERS, **self.constants} else None
         return tree
 
     def _is_arithmetic(self, tree: Tree) -> bool:
@@ -427,7 +427,8 @@ class _Builder:
         return _Part(value, *self._span(tree), signs=part.signs + 1)
 
     def _number(self, tree: Tree) -> _Part:
-        return _Part(Number(float(tree.children[0])), *self._span(tree))
+        number, unit = tree.children
+        return _Part(Number(float(number) * ANGLES[str(unit or "rad")]), *self._span(tree))
 
     def _name(self, tree: Tree) -> _Part:
         name = str(tree.children[0])
@@ -435,6 +436,8 @@ class _Builder:
             return _Part(Number(float(self.constants[name])), *self._span(tree))
         if name in self.known:
             return _Part(self.known[name], *self._span(tree))
+        if name in NUMBERS:
+            return _Part(Number(NUMBERS[name]), *self._span(tree))
         if name in FUNCTIONS:
             raise self._fail(
                 f"{name} is a function: write {name}(...), or quote it if it is a signal",

@@ -3,7 +3,7 @@
 import functools
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import NAME, WORDS
+from verifai_jax.mtl.words import ANGLES, NAME, WORDS
 
 UNARY = ("always", "eventually", "historically", "once", "next", "prev", "weak_prev")
 """Operators in front of one operand."""
@@ -102,7 +102,7 @@ def parser() -> Any:
                  | postfix
         ?postfix: atom
                 | atom "[" NUMBER "]" -> component
-        ?atom: NUMBER -> number
+        ?atom: NUMBER [ANGLE] -> number
              | NAME -> name
              | QUOTED -> quoted
              | TRUE -> true
@@ -125,6 +125,7 @@ def parser() -> Any:
         STAR: "*"
         SLASH: "/"
         UNIT.5: /(?:min|ms|us|ns|s)(?!\w)/
+        ANGLE.5: /(?:{"|".join(ANGLES)})(?!\w)/
         NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
         NAME: /{NAME.pattern}/
         QUOTED: /"[^"\n]+"/
@@ -149,6 +150,7 @@ _GROUPS = (
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
     ({"UNIT"}, "a unit (s, ms, us, ns, min)"),
+    ({"ANGLE"}, "a unit of angle (deg, rad)"),
     ({"COMMA"}, "','"),
     ({"COLON"}, "':'"),
     ({"RPAR"}, "')'"),

@@ -1,21 +1,25 @@
 """Recorded signals as a trace: from CSV and Parquet files, and from uneven sample times.
 
 read("flight.csv")                                        # a column `time`
+read(frame, dt=0.02)                                      # a pandas.DataFrame
 read("flight.parquet", dt=0.02)                           # rows 0.02 s apart
 read("flight.csv", resample_to=0.1, method="linear")
 resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.trace import Trace, check_period
 from verifai_jax.mtl.setting import seconds
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Method = Literal["hold", "linear"]
 
@@ -83,7 +87,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
 
 
 def read(
-    path: str | Path,
+    source: "str | Path | pd.DataFrame",
     *,
     time: str = "time",
     dt: float | None = None,
@@ -91,7 +95,7 @@ def read(
     resample_to: float | None = None,
     method: Method | None = None,
 ) -> Trace:
-    """Read a trace from a CSV or Parquet file, one column a signal, one row a sample.
+    """Read a trace from a CSV or Parquet file or a data frame, a column a signal, a row a sample.
 
     Columns `p[0]`, `p[1]`, ... make one vector signal `p`. Columns that hold no numbers are left
     out, unless named in `columns`. In a CSV file commas, semicolons or tabs separate the columns,
@@ -99,8 +103,10 @@ def read(
 
     **Arguments:**
 
-    - `path`: `.csv` (first line: names) or `.parquet`.
-    - `time`: the column of sample times in seconds.
+    - `source`: the path of a `.csv` (first line: names) or `.parquet` file, or a
+      `pandas.DataFrame`, whose index is read as a column if it has a name.
+    - `time`: the column of sample times in seconds; of a data frame also dates or durations, which
+      become seconds since the first.
     - `dt`: the sampling period, instead of a column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
@@ -109,20 +115,23 @@ def read(
     does not exist or holds no numbers, times that do not increase, or `resample_to` without
     `method`.
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no recording {path}")
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
-    table = _columns(path)
+    if isinstance(source, str | Path):
+        path = Path(source)
+        if not path.exists():
+            raise FileNotFoundError(f"there is no recording {path}")
+        name, table = str(path), _file_columns(path)
+    else:
+        name, table = "the data frame", _frame_columns(source, time)
     if time not in table and dt is None:
-        raise TimeColumnError(f"{path} has no column {time!r} of sample times", list(table))
+        raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
     times = table.pop(time, None)
-    signals = _signals(path, table, columns)
+    signals = _signals(name, table, columns)
     if dt is not None:
         trace = Trace(signals, dt=dt)
     else:
-        times = _numbers(path, time, times)
+        times = _numbers(name, time, times)
         _check_increasing(times)
         trace = Trace(signals, times=times)
     if resample_to is not None and method is not None:
@@ -143,7 +152,40 @@ def _check_increasing(times: np.ndarray) -> None:
         )
 
 
-def _columns(path: Path) -> dict[str, Any]:
+def _frame_columns(frame: "pd.DataFrame", time: str) -> dict[str, Any]:
+    """Return the columns of a data frame by name, as Arrow arrays."""
+    import pandas as pd
+    import pyarrow
+
+    if not isinstance(frame, pd.DataFrame):
+        raise TypeError(
+            f"a recording is the path of a file or a pandas.DataFrame; got a {type(frame).__name__}"
+        )
+    if frame.index.name is not None:
+        frame = frame.reset_index()
+    if not len(frame):
+        raise ValueError("the data frame has no rows")
+    names = [str(name) for name in frame.columns]
+    _refuse_repeated("the data frame", names)
+    table = {}
+    for position, name in enumerate(names):
+        column = frame.iloc[:, position]
+        if name == time and pd.api.types.is_datetime64_any_dtype(column):
+            column = column - column.iloc[0]
+        if name == time and pd.api.types.is_timedelta64_dtype(column):
+            column = column.dt.total_seconds()
+        plain = pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column)
+        table[name] = pyarrow.array(column if plain else column.astype(str), from_pandas=True)
+    return table
+
+
+def _refuse_repeated(source: str, names: Sequence[str]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
+
+
+def _file_columns(path: Path) -> dict[str, Any]:
     """Read columns by name, as Arrow arrays."""
     import pyarrow
     from pyarrow import parquet
@@ -161,9 +203,7 @@ def _columns(path: Path) -> dict[str, Any]:
     if table.num_rows == 0:
         raise ValueError(f"{path} has no rows")
     names = table.column_names
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise ValueError(f"{path} has more than one column {', '.join(map(repr, repeated))}")
+    _refuse_repeated(str(path), names)
     return {name: table.column(name) for name in names}
 
 
@@ -210,45 +250,49 @@ def _numeric(column: Any) -> bool:
     return types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)
 
 
-def _numbers(path: Path, name: str, column: Any) -> np.ndarray:
+def _numbers(source: str, name: str, column: Any) -> np.ndarray:
     if not _numeric(column):
         raise ValueError(
-            f"column {name!r} of {path} holds no numbers; it starts with {column[0].as_py()!r}"
+            f"column {name!r} of {source} holds no numbers; it starts with {column[0].as_py()!r}"
         )
-    values = column.to_numpy()
+    chunked = hasattr(column, "chunks")
+    values = column.to_numpy() if chunked else column.to_numpy(zero_copy_only=False)
     # A column of truth values with gaps comes as objects, in which None is a gap.
     return values.astype(float) if values.dtype == object else values
 
 
 def _signals(
-    path: Path, table: dict[str, Any], columns: Sequence[str] | None
+    source: str, table: dict[str, Any], columns: Sequence[str] | None
 ) -> dict[str, np.ndarray]:
     if columns is None:
         table = {name: column for name, column in table.items() if _numeric(column)}
         if not table:
-            raise ValueError(f"{path} has no column of numbers")
-    vectors: dict[str, dict[int, str]] = {}
-    for name in table:
-        stem, bracket, index = name.partition("[")
-        if bracket and index.endswith("]") and index[:-1].isdigit():
-            vectors.setdefault(stem, {})[int(index[:-1])] = name
-    vectors = {
-        stem: parts
-        for stem, parts in vectors.items()
-        if sorted(parts) == list(range(len(parts))) and stem not in table
-    }
-    in_vectors = {name for parts in vectors.values() for name in parts.values()}
+            raise ValueError(f"{source} has no column of numbers")
+    vectors = vector_columns(table)
+    in_vectors = {name for parts in vectors.values() for name in parts}
     scalars = [name for name in table if name not in in_vectors]
     wanted = [*scalars, *vectors] if columns is None else list(columns)
     signals = {}
     for name in wanted:
         if name in vectors:
-            parts = vectors[name]
-            signals[name] = np.stack(
-                [_numbers(path, parts[i], table[parts[i]]) for i in range(len(parts))], axis=1
-            )
+            parts = [_numbers(source, part, table[part]) for part in vectors[name]]
+            signals[name] = np.stack(parts, axis=1)
         elif name in table:
-            signals[name] = _numbers(path, name, table[name])
+            signals[name] = _numbers(source, name, table[name])
         else:
-            raise missing_name(str(path), "column", name, [*scalars, *vectors])
+            raise missing_name(source, "column", name, [*scalars, *vectors])
     return signals
+
+
+def vector_columns(names: Collection[str]) -> dict[str, list[str]]:
+    """Return the vector signals among columns, `{"p": ["p[0]", "p[1]"]}`, in order."""
+    vectors: dict[str, dict[int, str]] = {}
+    for name in names:
+        stem, bracket, index = name.partition("[")
+        if bracket and index.endswith("]") and index[:-1].isdigit():
+            vectors.setdefault(stem, {})[int(index[:-1])] = name
+    return {
+        stem: [parts[i] for i in range(len(parts))]
+        for stem, parts in vectors.items()
+        if sorted(parts) == list(range(len(parts))) and stem not in names
+    }

@@ -6,6 +6,7 @@
 Nothing here knows formulas: they hand over their operator's word and the text of their operands.
 """
 
+import math
 import re
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -15,6 +16,12 @@ NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*")
 
 FUNCTIONS = {"abs": 1, "sqrt": 1, "sin": 1, "cos": 1, "norm": 1, "min": 2, "max": 2}
 """Functions of expressions, by the least number of their arguments."""
+
+NUMBERS = {"pi": math.pi}
+"""Numbers that a text may name without defining them; a signal of that name stands in quotes."""
+
+ANGLES = {"deg": math.pi / 180, "rad": 1.0}
+"""Units that may follow a number in an expression, in rad."""
 
 WORDS: dict[str, tuple[str, ...]] = {
     "always": ("always", "alw", "G", "[]"),
@@ -70,7 +77,8 @@ def number_text(value: float) -> str:
 
 def name_text(name: str) -> str:
     """Return a signal's name, quoted where the grammar would not take it bare."""
-    bare = NAME.fullmatch(name) and name not in RESERVED and name not in FUNCTIONS
+    taken = name in RESERVED or name in FUNCTIONS or name in NUMBERS
+    bare = NAME.fullmatch(name) and not taken
     return name if bare else f'"{name}"'
 
 

@@ -1,0 +1,185 @@
+"""`tail -f log.csv | verifai-jax monitor FORMULA -`: a formula on samples as they come in."""
+
+import csv
+import functools
+import math
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.core.errors import missing_name
+
+if TYPE_CHECKING:
+    from verifai_jax.mtl import Formula
+
+SOURCE = "the standard input"
+EVEN = 1e-3
+"""Share of the sampling period by which the time of a sample may be off."""
+
+
+class Sample(NamedTuple):
+    """One row of the stream: its line, its time (None without a column of times), its signals."""
+
+    line: int
+    time: float | None
+    signals: dict[str, Any]
+
+
+def monitor_stream(
+    formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo
+) -> bool:
+    """Monitor samples until the verdict is certain whatever follows, or until they end.
+
+    **Arguments:**
+
+    - `lines`: of CSV; the first has the names.
+    - `time`: the column of sample times in seconds.
+    - `dt`: the sampling period in seconds, instead of a column of times.
+    - `show`: what prints a line.
+
+    **Returns:** whether the formula holds; with the last sample held, if the samples have ended.
+
+    **Raises:** `ValueError` for lines that are no evenly spaced samples; `CommandError` for a NaN.
+    """
+    import jax
+
+    samples = _samples(lines, formula, None if dt is not None else time)
+    samples, period = _period(samples, dt)
+    with jax.enable_x64(True):
+        step, state, finish = _monitor(formula, period)
+        count, begin = 0, None
+        for count, sample in enumerate(samples, 1):
+            begin = sample.time if begin is None else begin
+            now = (count - 1) * period if begin is None or sample.time is None else sample.time
+            if begin is not None and abs(now - begin - (count - 1) * period) > EVEN * period:
+                raise ValueError(
+                    f"line {sample.line} of {SOURCE} is at {now:g} s, where "
+                    f"{begin + (count - 1) * period:g} s is due: samples of a stream are evenly "
+                    "spaced; record it, and use --resample"
+                )
+            _refuse_nan(sample, now)
+            state, bounds = step(state, sample.signals)
+            low, high, least, most = (float(bound) for bound in bounds)
+            if least > 0 or most < 0:
+                verdict = f"holds, with robustness at least {low:.10g}"
+                if most < 0:
+                    verdict = f"fails, with robustness at most {high:.10g}"
+                show(f"whatever follows {now:.10g} s, it {verdict}")
+                return least > 0
+        rho, holds = (float(value) for value in finish(state))
+    show(
+        f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "
+        f"{'holds' if holds > 0 else 'fails'} with robustness {rho:.10g}"
+    )
+    return holds > 0
+
+
+def _monitor(formula: "Formula", dt: float) -> tuple[Any, Any, Any]:
+    """Return a compiled step, its first state, and what a state means if nothing follows."""
+    import jax
+    import jax.numpy as jnp
+
+    from verifai_jax import mtl
+
+    monitors = [mtl.online(formula, dt, semantics) for semantics in (mtl.hard, mtl.boolean)]
+
+    @jax.jit
+    def step(states: Any, sample: dict[str, Any]) -> Any:
+        states = [m.step(s, sample) for m, s in zip(monitors, states, strict=True)]
+        bounds = [m.interval(s) for m, s in zip(monitors, states, strict=True)]
+        return states, jnp.concatenate([jnp.stack(pair) for pair in bounds])
+
+    @jax.jit
+    def finish(states: Any) -> Any:
+        return jnp.stack([m.finish(s) for m, s in zip(monitors, states, strict=True)])
+
+    return step, [monitor.init() for monitor in monitors], finish
+
+
+def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sample], float]:
+    """Return the samples and their period, which is the first step where it is not given."""
+    import itertools
+
+    if dt is not None:
+        return samples, dt
+    first = list(itertools.islice(samples, 2))
+    if len(first) < 2:
+        raise ValueError(
+            f"{SOURCE} has {len(first)} sample{'s' * (len(first) != 1)}, of which no sampling "
+            "period follows: give it, --dt SECONDS"
+        )
+    before, after = (sample.time for sample in first)
+    assert before is not None and after is not None
+    if not 0 < after - before < math.inf:
+        raise ValueError(
+            f"sample times must increase; line {first[0].line} of {SOURCE} has {before:g} s and "
+            f"line {first[1].line} {after:g} s"
+        )
+    return itertools.chain(first, samples), after - before
+
+
+def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iterator[Sample]:
+    """Read samples one by one, no line before it is needed."""
+    lines = iter(lines)
+    header = next(lines, "")
+    if not header.strip():
+        raise ValueError(f"{SOURCE} is empty; its first line has the names of the columns")
+    separator = max((",", ";", "\t"), key=header.count)
+    names = [name.strip() for name in next(csv.reader([header], delimiter=separator))]
+    if time is not None and time not in names:
+        raise ValueError(
+            f"{SOURCE} has no column {time!r} of sample times. Give the sampling period, --dt "
+            f"SECONDS, or the name of the column, --time NAME. It has: {', '.join(names)}"
+        )
+    columns = _columns(names, formula)
+    rows = csv.reader(lines, delimiter=separator)
+    for row in rows:
+        if not row:
+            continue
+        line = rows.line_num + 1
+        if len(row) != len(names):
+            raise ValueError(
+                f"line {line} of {SOURCE} has {len(row)} cells, and the first has {len(names)}"
+            )
+        number = functools.partial(_number, dict(zip(names, row, strict=True)), line, separator)
+        signals = {
+            name: [number(part) for part in parts] if isinstance(parts, list) else number(parts)
+            for name, parts in columns.items()
+        }
+        yield Sample(line, None if time is None else number(time), signals)
+
+
+def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]:
+    """Return the column of each signal of the formula, or the columns of a vector."""
+    from verifai_jax.mtl.recording import vector_columns
+
+    vectors = vector_columns(names)
+    columns: dict[str, str | list[str]] = {}
+    for name in formula.signals():
+        if name not in names and name not in vectors:
+            raise missing_name(SOURCE, "column", name, [*names, *vectors])
+        columns[name] = vectors[name] if name in vectors else name
+    return columns
+
+
+def _number(cells: dict[str, str], line: int, separator: str, name: str) -> float:
+    text = cells[name].strip()
+    truths = {"true": 1.0, "false": -1.0, "": math.nan}
+    if text.lower() in truths:
+        return truths[text.lower()]
+    try:
+        return float(text.replace(",", ".") if separator == ";" else text)
+    except ValueError:
+        raise ValueError(
+            f"line {line} of {SOURCE} has {text!r} in column {name!r}, which is no number"
+        ) from None
+
+
+def _refuse_nan(sample: Sample, now: float) -> None:
+    for name, value in sample.signals.items():
+        values = value if isinstance(value, list) else [value]
+        if any(math.isnan(v) for v in values):
+            message = f"no verdict: signal {name!r} is NaN at {now:g} s"
+            raise CommandError(message, BROKEN)
