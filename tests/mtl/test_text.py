@@ -69,8 +69,8 @@ X, Y, A, B = signal("x"), signal("y"), signal("a"), signal("b")
         ("s > 1 & ms < 2", (signal("s") > 1) & (signal("ms") < 2)),
         ("Gain > 0 & untilted", (signal("Gain") > 0) & signal("untilted")),
         ("1e-3 < x & .5e1 > y", parse("0.001 < x & 5 > y")),
-        ("x < 90deg & deg > 1 deg", (X < math.pi / 2) & (signal("deg") > math.pi / 180)),
-        ("x < 2 * pi", X < 2 * expression(math.pi)),
+        ("x < 90deg & deg > 1 deg", (math.pi / 2 > X) & (signal("deg") > math.pi / 180)),
+        ("2 * pi > x", 2 * expression(math.pi) > X),
         ('"pi" > 2rad', signal("pi") > 2.0),
     ],
 )

@@ -1,6 +1,7 @@
 """`verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv`: a formula on a recording."""
 
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -70,7 +71,7 @@ def monitor(
                 "a stream goes with --dt, --time, --const, --define and --fail-on; other options "
                 "need the whole recording"
             )
-        holds = monitor_stream(parsed, click.get_text_stream("stdin"), time, dt)
+        holds = monitor_stream(parsed, sys.stdin, time, dt)
         if fail_on is not None and not holds:
             raise fail_gate()
         return

@@ -111,7 +111,8 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
             "period follows: give it, --dt SECONDS"
         )
     before, after = (sample.time for sample in first)
-    assert before is not None and after is not None
+    assert before is not None
+    assert after is not None
     if not 0 < after - before < math.inf:
         raise ValueError(
             f"sample times must increase; line {first[0].line} of {SOURCE} has {before:g} s and "
@@ -160,7 +161,7 @@ def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]
     for name in formula.signals():
         if name not in names and name not in vectors:
             raise missing_name(SOURCE, "column", name, [*names, *vectors])
-        columns[name] = vectors[name] if name in vectors else name
+        columns[name] = vectors.get(name, name)
     return columns
 
 

@@ -94,8 +94,9 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     - `semantics`: `hard`, or `boolean`, by which all values are above zero where the formula holds
       and below where it does not, also where its robustness is exactly zero.
 
-    **Raises:** `ValueError` for smooth semantics, `IntervalError` for an interval that is not a multiple of `dt`, `ValueError` for an
-    unbounded future operator within another temporal operator, which no bounded memory can follow.
+    **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
+    smooth semantics, and for an unbounded future operator within another temporal operator, which
+    no bounded memory can follow.
     """
     formula = simplify(parse(formula) if isinstance(formula, str) else formula)
     if not dt > 0:
