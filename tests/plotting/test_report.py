@@ -1,5 +1,7 @@
 """Pictures: that they are drawn at all for odd tables, and what they say of known ones."""
 
+import base64
+
 import jax.numpy as jnp
 import pytest
 from PIL import Image
@@ -57,6 +59,35 @@ def test_the_decisive_instant_is_marked():
     assert any(text.startswith("x = 2.") and text.endswith("at 1 s") for text in texts)
 
 
+def pushed(features, key):
+    """Nine signals of which y is the integral of the input."""
+    clock = jnp.arange(5) * 0.25
+    wind = features["air"]["wind"](clock)
+    return vj.Trace({f"s{k}": k * clock for k in range(7)} | {"x": wind, "y": clock}, dt=0.25)
+
+
+@pytest.mark.thorough
+def test_a_replay_shows_inputs_and_the_bounds_of_all_formulas(tmp_path):
+    wind = vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)
+    specs = {"low": "always (x > 0.5 & abs(y) < 0.5)", "high": "always (9 > x & x < 8 & x < 7)"}
+    problem = vj.Problem("p", {"air": vj.Struct({"wind": wind})}, pushed, specs)
+    replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
+    figure = replay.plot()
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["x", "y", "air.wind (input)", "s0", "s1", "s2"]
+    assert "and 4 more, not drawn: s3, s4, s5, s6" in figure.axes[-1].get_xlabel()
+    x, drawn = figure.axes[0], figure.axes[2].lines[0]
+    assert [text.get_text() for text in x.texts] == ["9 > x", "x < 8", "x < 7", "x > 0.5"]
+    assert len({text.xyann for text in x.texts}) == 4
+    assert {line.get_ydata()[0] for line in x.lines[1:-1]} <= {0.5, 7, 8, 9}
+    clock = jnp.arange(5) * 0.25
+    assert jnp.allclose(drawn.get_ydata(), replay.features["air"]["wind"](clock))
+    chosen = replay.plot(tmp_path / "two.png", signals=["air.wind", "s5"])
+    assert [axes.get_ylabel() for axes in chosen.axes] == ["air.wind (input)", "s5"]
+    with pytest.raises(ValueError, match=r"unknown signal .air\.wnd.; did you mean .air\.wind."):
+        replay.plot(signals=["air.wnd"])
+
+
 @pytest.mark.thorough
 def test_animation(tmp_path):
     drawn = []
@@ -67,9 +98,11 @@ def test_animation(tmp_path):
 
     problem = vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1", draw=draw)
     replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
-    from verifai_jax.plotting import animate
-
-    with Image.open(animate(replay, tmp_path / "new" / "it.gif")) as image:
+    file = tmp_path / "new" / "it.gif"
+    animation = replay.animate(file)
+    assert animation.gif == file.read_bytes()
+    assert animation.gif == base64.b64decode(animation._repr_mimebundle_()["image/gif"])
+    with Image.open(file) as image:
         shown = []
         for frame in range(image.n_frames):
             image.seek(frame)
@@ -80,7 +113,7 @@ def test_animation(tmp_path):
     assert sum(shown) == 40 * (len(drawn) - 1) + 1500
     silent = vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1")
     with pytest.raises(ValueError, match="cannot be animated"):
-        animate(vj.falsify(silent, "uniform", 4, batch=4).replay(0), tmp_path / "no.gif")
+        vj.falsify(silent, "uniform", 4, batch=4).replay(0).animate()
 
 
 @pytest.mark.thorough

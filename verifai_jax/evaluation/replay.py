@@ -3,7 +3,7 @@
 replay(problem, row, key, number).trace             # the trace behind a row of a table
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,9 +96,28 @@ class Replay:
         verb = "violates" if self.violated else "keeps"
         return f"{verb} the property, robustness {min(self.rho.values()):.4g}"
 
-    def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the signals with the violated bound and instant marked; returns the figure."""
-        return late("verifai_jax.plotting.replay", "plot_replay")(self, path)
+    def plot(self, path: str | Path | None = None, signals: Sequence[str] | None = None) -> Any:
+        """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
+
+        **Arguments:**
+
+        - `path`: of a picture to write; none when left out.
+        - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
+
+        **Raises:** `UnknownNameError` for a signal that there is not.
+        """
+        return late("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
+
+    def animate(self, path: str | Path | None = None) -> Any:
+        """Draw the simulation as an animated GIF, which a notebook shows.
+
+        **Arguments:**
+
+        - `path`: of a file to write too; none when left out.
+
+        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        """
+        return late("verifai_jax.plotting.animation", "animate")(self, path)
 
 
 def replay(

@@ -1,7 +1,11 @@
 """A simulation as an animated GIF: MuJoCo's picture of it, or what the problem draws itself."""
 
+import base64
+import io
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,8 +19,25 @@ MOST_FRAMES = 150
 """Frames at most; a longer simulation is played faster."""
 
 
-def animate(replay: Replay, path: str | Path) -> Path:
-    """Write a simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
+@dataclass(frozen=True)
+class Animation:
+    """An animated GIF, which shows itself in a notebook; `gif` is the content of its file."""
+
+    gif: bytes = field(repr=False)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the file, and the folders that it needs; returns the path."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(self.gif)
+        return path
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return {"image/gif": base64.b64encode(self.gif).decode(), "text/plain": repr(self)}
+
+
+def animate(replay: Replay, path: str | Path | None = None) -> Animation:
+    """Draw a simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
     system that is a MuJoCo model.
@@ -24,21 +45,30 @@ def animate(replay: Replay, path: str | Path) -> Path:
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
-    - `path`: of the file; folders are made.
-
-    **Returns:** the path.
+    - `path`: of a file to write too; folders are made.
 
     **Raises:** `ValueError` for any other problem without `draw`; `mujoco_scene.NoRenderer` where
     MuJoCo cannot draw.
     """
     draw = replay.problem.draw
-    if draw is None and can_draw(replay.problem.system):
-        return film(record(replay), path)
-    if draw is None:
+    if draw is not None:
+        animation = Animation(_drawn(replay, draw))
+    elif can_draw(replay.problem.system):
+        with TemporaryDirectory() as folder:
+            file = film(record(replay), Path(folder) / "animation.gif")
+            animation = Animation(file.read_bytes())
+    else:
         raise ValueError(
             f"problem {replay.problem.name!r} cannot be animated: it has no draw function "
             "(axes, trace, sample, features)"
         )
+    if path is not None:
+        animation.save(path)
+    return animation
+
+
+def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
+    """Return the GIF of what the problem draws itself."""
     from PIL import Image
 
     clock = np.asarray(replay.trace.clock())
@@ -50,11 +80,10 @@ def animate(replay: Replay, path: str | Path) -> Path:
     frames = [_frame(replay, draw, int(sample)) for sample in samples]
     # The last instant is the one that matters: it stays for a while.
     shown = [1000 / FRAMES_PER_SECOND] * (count - 1) + [1500]
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     images = [Image.fromarray(frame).quantize(colors=32) for frame in frames]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=shown, loop=0)
-    return path
+    file = io.BytesIO()
+    images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=shown, loop=0)
+    return file.getvalue()
 
 
 def _frame(

@@ -56,7 +56,7 @@ def write_replay_pictures(
     paths = [folder / f"{name}.png"]
     plot_replay(replay, paths[0])
     if replay.problem.draw is not None:
-        paths.append(animate(replay, folder / f"{name}.gif"))
+        paths.append(animate(replay).save(folder / f"{name}.gif"))
     elif can_draw(replay.problem.system):
         try:
             motion = record(replay)

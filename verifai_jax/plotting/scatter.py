@@ -21,6 +21,10 @@ from verifai_jax.plotting.style import (
 
 DOTS = 3000
 """Rows drawn of each verdict."""
+MANY = 500
+"""Rows of a verdict that are seen as a cloud; dots of fewer are larger."""
+LARGE = 30
+"""Area of a dot, in points squared, from which it has an edge."""
 
 
 def plot_features(
@@ -71,6 +75,10 @@ def plot_features(
         )
         if len(part)
     ]
+    groups = [
+        (label, part, color, size if color == SAFE else _visible_size(size, len(part)), marker)
+        for label, part, color, size, marker in groups
+    ]
     for axes, (across, up) in zip(panels, pairs, strict=False):
         for label, part, color, size, marker in groups:
             shown = part.iloc[np.unique(np.linspace(0, len(part) - 1, DOTS).astype(int))]
@@ -80,8 +88,9 @@ def plot_features(
                 c=color,
                 s=size,
                 marker=marker,
-                alpha=0.55,
-                linewidths=0.8 if marker == "x" else 0,
+                alpha=0.9 if size >= LARGE else 0.55,
+                linewidths=0.8 if marker == "x" or size >= LARGE else 0,
+                edgecolors=None if marker == "x" else "white",
                 label=label,
             )
         axes.set_xlabel(across)
@@ -132,6 +141,11 @@ def distinguishing_features(run: Run) -> list[str]:
 
     ranked = sorted(numeric, key=score, reverse=True)
     return ranked or list(run.table.features)
+
+
+def _visible_size(size: float, count: int) -> float:
+    """Return the area of a dot, larger where there are so few that one would be overlooked."""
+    return size * float(np.clip(np.sqrt(MANY / count), 1.0, 6.0))
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:

@@ -11,6 +11,7 @@ FAILING = "#d1495b"
 WITHOUT_VERDICT = "#7f7f7f"
 NOT_CLAIMED = "#e0a030"
 BOUND = "#30323d"
+INPUT = "#4f6d9c"
 DPI = 110
 
 
