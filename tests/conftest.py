@@ -27,6 +27,7 @@ CHECKED_ROOMS: list[str] = [
     "core.waveform",
     "counterexamples",
     "estimation",
+    "events",
     "falsification",
     "features",
     "mtl._explain",

@@ -28,7 +28,8 @@ MOST_ENTRIES = 4
 def format_features(features: Mapping[str, object], labels: Mapping[str, str] | None = None) -> str:
     """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
 
-    Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written.
+    Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written; parts of
+    items that there are not, such as `cars[3].x`, are left out.
 
     **Arguments:**
 
@@ -38,6 +39,8 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     labels = labels or {}
     entries: dict[str, list[tuple[str, object]]] = {}
     for name, value in features.items():
+        if "]." in name and (value is None or value != value):
+            continue
         stem = name.partition("[")[0] if name.endswith("]") and _is_real(value) else name
         entries.setdefault(stem, []).append((name, value))
     parts = []

@@ -3,6 +3,7 @@
 from verifai_jax.features.arrays import Array as Array
 from verifai_jax.features.arrays import Items as Items
 from verifai_jax.features.arrays import VariableArray as VariableArray
+from verifai_jax.features.automaton import Automaton as Automaton
 from verifai_jax.features.box import Box as Box
 from verifai_jax.features.box import DiscreteBox as DiscreteBox
 from verifai_jax.features.choice import Categorical as Categorical
@@ -15,3 +16,4 @@ from verifai_jax.features.distributions import TruncatedNormal as TruncatedNorma
 from verifai_jax.features.domain import Domain as Domain
 from verifai_jax.features.signal import Signal as Signal
 from verifai_jax.features.space import FeatureSpace as FeatureSpace
+from verifai_jax.features.transitions import Past as Past

@@ -269,6 +269,33 @@ class VariableArray(Domain):
         ]
         return Items(_stacked(items), jnp.asarray(length, jnp.int32))
 
+    @property
+    def items(self) -> int:
+        return self.most * self._varies
+
+    def without(
+        self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
+    ) -> Float[jax.Array, " size"]:
+        if not self._varies:
+            return u
+        length = self.least + cell(u[0], self.levels[0])
+        stays = (jnp.arange(self.most) < length) & ~drop
+        order = jnp.argsort(~stays, stable=True)
+        units = u[1:].reshape(self.most, self.domain.size)[order]
+        fewer = jnp.maximum(jnp.sum(stays), self.least)
+        place = centre(fewer - self.least, self.levels[0]).astype(u.dtype)
+        return self.settled(jnp.concatenate([place, jnp.ravel(units)]))
+
+    def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
+        if not self._varies:
+            return u
+        length = self.least + cell(u[0], self.levels[0])
+        units = u[1:].reshape(self.most, self.domain.size)
+        present = jnp.arange(self.most)[:, None] < length
+        own = jax.vmap(self.domain.settled, axis_size=self.most)(units)
+        absent = self._absent_unit.astype(u.dtype)
+        return jnp.concatenate([u[:1], jnp.ravel(jnp.where(present, own, absent))])
+
     def refined(self, factor: int) -> "VariableArray":
         return VariableArray(self.domain.refined(factor), self.least, self.most)
 

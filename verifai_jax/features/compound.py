@@ -8,7 +8,7 @@ from itertools import groupby
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import Bool, Float, Int, PyTree
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.features.box import Box
@@ -142,6 +142,39 @@ class Struct(Domain):
         return {
             field: domain.from_columns(row, dotted(name, field)) for field, domain in self.fields
         }
+
+    @property
+    def items(self) -> int:
+        return sum(domain.items for _, domain in self.fields)
+
+    def without(
+        self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
+    ) -> Float[jax.Array, " size"]:
+        parts, start, first = [u[:0]], 0, 0
+        for _, domain in self.fields:
+            own, gone = u[start : start + domain.size], drop[first : first + domain.items]
+            parts.append(domain.without(own, gone))
+            start, first = start + domain.size, first + domain.items
+        return jnp.concatenate(parts)
+
+    def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
+        parts, start = [u[:0]], 0
+        for _, domain in self.fields:
+            parts.append(domain.settled(u[start : start + domain.size]))
+            start += domain.size
+        return jnp.concatenate(parts)
+
+    @property
+    def mark_count(self) -> int:
+        return sum(domain.mark_count for _, domain in self.fields)
+
+    def marks(self, value: Mapping[str, PyTree]) -> Int[jax.Array, " marks"]:
+        parts, start = [jnp.zeros(0, jnp.int32)], 0
+        for name, domain in self.fields:
+            own = domain.marks(value[name])
+            parts.append(jnp.where(own >= 0, own + start, own))
+            start += domain.mark_count
+        return jnp.concatenate(parts)
 
     def refined(self, factor: int) -> "Struct":
         return Struct({name: domain.refined(factor) for name, domain in self.fields})

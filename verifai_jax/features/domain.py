@@ -7,6 +7,7 @@
     Array(Box(0, 50), length=(1, 3))                                        # arrays.py
     Normal(0, 1), TruncatedNormal(0, 1, -2, 2), LogUniform(0.05, 0.5)       # distributions.py
     Signal(Box(-1, 1), knots=16, hold="linear")                             # signal.py
+    Automaton("idle", {("idle", "gust"): dict(wait=Box(1, 5))}, most=3)     # automaton.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.
 """
@@ -19,7 +20,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 MOST_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
@@ -131,6 +132,38 @@ class Domain(abc.ABC):
     def signals(self) -> tuple[tuple[int, ...], ...]:
         """The unit coordinates of each function of time, in the order of its control points."""
         return ()
+
+    @property
+    def nominal(self) -> PyTree:
+        """A value that is ordinary whatever the system is, such as no events; None without one."""
+        return None
+
+    @property
+    def items(self) -> int:
+        """Number of items at most that `without` can take away."""
+        return 0
+
+    def without(
+        self, u: Float[Array, " size"], drop: Bool[Array, " items"]
+    ) -> Float[Array, " size"]:
+        """Return the coordinates of the value without some of its items, those behind closed up.
+
+        Items that cannot be without those that go, go too.
+        """
+        return u
+
+    def settled(self, u: Float[Array, " size"]) -> Float[Array, " size"]:
+        """Return coordinates of the same value, those without a meaning in it at one place."""
+        return u
+
+    @property
+    def mark_count(self) -> int:
+        """Number of things that values can cover, such as transitions of an automaton."""
+        return 0
+
+    def marks(self, value: PyTree) -> Int[Array, " marks"]:
+        """Return the numbers of what a value covers, below `mark_count`; -1 for nothing."""
+        return jnp.zeros(0, jnp.int32)
 
     def coordinates(self, name: str) -> tuple[str, ...]:
         """Return the names of the unit coordinates of the feature called `name`."""

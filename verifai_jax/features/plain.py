@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
+from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant
 from verifai_jax.features.compound import Struct
@@ -55,6 +56,8 @@ def to_plain(domain: Domain) -> dict[str, Any]:
             return {"kind": "Fixed", "domain": to_plain(domain.domain), "row": row}
         case Distribution():
             return {"kind": "Distribution", "name": domain.name}
+        case Automaton():
+            return _automaton_to_plain(domain)
     if type(domain) not in FIELDS:
         raise ValueError(f"{domain!r} is a domain of your own, which JSON cannot describe")
     data: dict[str, Any] = {"kind": type(domain).__name__}
@@ -112,8 +115,10 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
                     "not hold; give it: from_json(data, distributions={...})"
                 )
             return distributions[data["name"]]
+        case "Automaton":
+            return _automaton_from_plain(data, distributions)
     if kind not in KINDS:
-        others = ("Struct", "Categorical", "Fixed", "Distribution")
+        others = ("Struct", "Categorical", "Fixed", "Distribution", "Automaton")
         raise unknown_name("kind of domain", kind, (*KINDS, *others))
     arguments = {
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
@@ -122,6 +127,31 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
     if kind == "Box" and "closed" in data:
         arguments["closed"] = data["closed"]
     return KINDS[kind](**arguments)
+
+
+def _automaton_to_plain(domain: Automaton) -> dict[str, Any]:
+    events = []
+    for each in domain.transitions:
+        if each.guard is not None:
+            raise ValueError(f"the guard of {each.label} is code, which JSON cannot describe")
+        options = {"to": each.to, "weight": each.weight, "after": list(each.after)}
+        domains = [[name, to_plain(part)] for name, part in each.parameters]
+        event = {**options, "at_most": each.at_most, "wait": to_plain(each.wait)}
+        events.append([each.source, each.name, {**event, "parameters": domains}])
+    ends = {"least": domain.least, "most": domain.most}
+    return {"kind": "Automaton", "start": domain.start, "events": events, **ends}
+
+
+def _automaton_from_plain(
+    data: Mapping[str, Any], distributions: Mapping[str, Distribution]
+) -> Automaton:
+    events: dict[tuple[str, str], dict[str, Any]] = {}
+    for source, name, event in data["events"]:
+        options = {key: event[key] for key in ("to", "weight", "after", "at_most")}
+        options["wait"] = from_plain(event["wait"], distributions)
+        parameters = {key: from_plain(part, distributions) for key, part in event["parameters"]}
+        events[source, name] = {**options, **parameters}
+    return Automaton(data["start"], events, data["most"], data["least"])
 
 
 def _lists(value: PyTree) -> PyTree:

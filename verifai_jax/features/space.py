@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
@@ -147,7 +147,7 @@ class FeatureSpace:
 
         **Arguments:**
 
-        - `features`: by name; constant and fixed ones may be left out.
+        - `features`: by name; constant, fixed ones and events may be left out.
 
         **Returns:** the point, `[dim]`.
         """
@@ -212,8 +212,8 @@ class FeatureSpace:
 
         **Arguments:**
 
-        - `features`: numbers, lists, choices, dictionaries by name; constant and fixed ones may be
-          left out.
+        - `features`: numbers, lists, choices, dictionaries by name; constant, fixed ones and events
+          may be left out.
 
         **Returns:** the features as `unflatten` gives them.
 
@@ -223,7 +223,7 @@ class FeatureSpace:
         return self.root.coerce(self._completed(features))
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features; constant and fixed ones may be left out.
+        """Check concrete features; constant, fixed ones and events may be left out.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, and for features that break the constraint.
@@ -243,6 +243,26 @@ class FeatureSpace:
     def accepts_points(self) -> Callable[[Numbers], Bool[Array, " n"]]:
         """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
         return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
+
+    @property
+    def items(self) -> int:
+        """Number of items at most that `without_items` can take away, such as events."""
+        return self.root.items
+
+    @cached_property
+    def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
+        """Take items away from points `[n, dim]`, which say the places `[n, items]`; compiled."""
+        return jax.jit(jax.vmap(self.root.without))
+
+    @cached_property
+    def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
+        """Move coordinates of points `[n, dim]` that mean nothing to one place; compiled."""
+        return jax.jit(jax.vmap(self.root.settled))
+
+    @cached_property
+    def marks_at(self) -> Callable[[Numbers], Int[Array, "n marks"]]:
+        """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
+        return jax.jit(jax.vmap(lambda u: self.root.marks(self.unflatten(u))))
 
     @property
     def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:
@@ -302,8 +322,8 @@ class FeatureSpace:
         **Arguments:**
 
         - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
-          lists, choices, dictionaries by name; constant and fixed ones may be left out), or rows of
-          a table.
+          lists, choices, dictionaries by name; constant, fixed ones and events may be left out), or
+          rows of a table.
 
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, for values that a person wrote.
@@ -451,8 +471,9 @@ class FeatureSpace:
     def _completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
         if not isinstance(features, Mapping):
             return features
-        constants = {n: d.value for n, d in self.root.fields if isinstance(d, Constant | Fixed)}
-        return {**constants, **features}
+        known = {n: d.value for n, d in self.root.fields if isinstance(d, Constant | Fixed)}
+        known |= {n: d.nominal for n, d in self.root.fields if d.nominal is not None}
+        return {**known, **features}
 
     def __getitem__(self, name: str) -> Domain:
         return self.root[name]

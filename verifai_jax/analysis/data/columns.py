@@ -14,6 +14,7 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.falsification.table import RESERVED
 from verifai_jax.features import (
     Array,
+    Automaton,
     Box,
     Categorical,
     DiscreteBox,
@@ -147,6 +148,8 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
         for item in indexed(name, getattr(domain, count)):
             found |= _of_domain(domain.domain, item)
         return found
+    if isinstance(domain, Automaton):
+        return _of_automaton(domain, name)
     if isinstance(domain, Categorical):
         count, weights = len(domain.choices), domain.weights[0]
         prior = tuple(float(weight) for weight in weights) if weights else (1 / count,) * count
@@ -170,6 +173,31 @@ def _of_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:
             for column, end in zip(domain.columns(name), ends, strict=True)
         }
     return _of_other_domain(domain, name)
+
+
+def _of_automaton(domain: Automaton, name: str) -> dict[str, dict[str, Any]]:
+    """Return what is known of the events' columns: kinds, and bounds over all kinds of events."""
+    found = {f"{name}.length": {**_integers(0, domain.most), "length": True}}
+    for item in indexed(name, domain.most):
+        found[f"{item}.kind"] = {"ordered": False, "choices": domain.names}
+        for each in domain.transitions:
+            for part, own in (("wait", each.wait), *each.parameters):
+                for column, known in _of_domain(own, f"{item}.{part}").items():
+                    found[column] = _both(found.get(column), known)
+    return found
+
+
+def _both(one: dict[str, Any] | None, other: dict[str, Any]) -> dict[str, Any]:
+    """Return what is known of a column that has one of two domains."""
+    if one is None or one == other:
+        return other
+    if not (one["ordered"] and other["ordered"]):
+        return {"ordered": False}
+    joined: dict[str, Any] = {"ordered": True, "integer": one["integer"] and other["integer"]}
+    for ends in ("bounds", "range"):
+        (a, b), (c, d) = one[ends], other[ends]
+        joined[ends] = (min(a, c), max(b, d))
+    return joined
 
 
 def _of_other_domain(domain: Domain, name: str) -> dict[str, dict[str, Any]]:

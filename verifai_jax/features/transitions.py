@@ -1,0 +1,217 @@
+"""The graph of an automaton, with guards unfolded: who follows whom, by which probability.
+
+    graph = unfold("cruise", transitions, most=6)
+    graph.edges[node]                                   # cumulative probabilities of transitions
+    graph.pairs                                         # all that can follow each other
+
+Guards look at what has happened before. They are asked here, once for each state and past that can
+be reached, so that a simulation only looks up tables, and what can be covered is counted exactly.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.features.domain import Domain
+
+MOST_NODES = 50_000
+"""States, with the pasts that guards tell apart, of an automaton at most."""
+
+LEAST_SHARE = 2.0**-20
+"""Least probability of a transition: a narrower interval is no distinct one in float32."""
+
+
+@dataclass(frozen=True)
+class Past:
+    """The events before the one that a guard decides about.
+
+    - `counts`: how often each event has happened, by name; those that have not are missing.
+    - `last`: name of the latest one; None at the start.
+    """
+
+    counts: tuple[tuple[str, int], ...] = ()
+    last: str | None = None
+
+    def count(self, name: str) -> int:
+        """Return how often this event has happened."""
+        return dict(self.counts).get(name, 0)
+
+    def __len__(self) -> int:
+        return sum(count for _, count in self.counts)
+
+    def then(self, name: str) -> "Past":
+        """Return the past after one more event."""
+        counts = Counter(dict(self.counts))
+        counts[name] += 1
+        return Past(tuple(sorted(counts.items())), name)
+
+
+@dataclass(frozen=True)
+class Transition:
+    """An event that may happen in a state.
+
+    - `source` and `to`: the states before and after it.
+    - `name`: of the event.
+    - `wait`: domain of the seconds since the event before.
+    - `parameters`: domains by name.
+    - `weight`: relative probability among the transitions that are enabled.
+    - `after`: names of events that must have happened before.
+    - `at_most`: times that an event of this name may happen; any number if None.
+    - `guard`: function of the `Past` that must be true; none if None.
+    """
+
+    source: str
+    name: str
+    to: str
+    wait: Domain
+    parameters: tuple[tuple[str, Domain], ...] = ()
+    weight: float = 1.0
+    after: tuple[str, ...] = ()
+    at_most: int | None = None
+    guard: Callable[[Past], bool] | None = None
+
+    @property
+    def guarded(self) -> bool:
+        """True where the past decides whether it is enabled."""
+        return bool(self.after) or self.at_most is not None or self.guard is not None
+
+    def enabled(self, past: Past) -> bool:
+        """Return whether it may happen after this past, in its state."""
+        if any(not past.count(name) for name in self.after):
+            return False
+        if self.at_most is not None and past.count(self.name) >= self.at_most:
+            return False
+        return self.guard is None or bool(self.guard(past))
+
+    @property
+    def label(self) -> str:
+        """The transition in words, such as `cruise -cut_in-> crowded`."""
+        return f"{self.source} -{self.name}-> {self.to}"
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """The nodes that can be reached, node 0 first, and the transitions from each.
+
+    - `states`: the state of each node.
+    - `edges`: cumulative probabilities of the transitions from each node; those that are not
+      enabled have an interval of width zero.
+    - `following`: the node after each transition; 0 where it is not enabled.
+    - `enabled`: whether it is.
+    - `last`: the last transition that is enabled at each node; -1 where none is.
+    - `reachable_states`, `transitions`: names and numbers of those that a sequence can contain.
+    - `pairs`: pairs of transitions of which the second can come right after the first.
+    """
+
+    states: tuple[str, ...]
+    edges: Float[np.ndarray, "nodes transitions"]
+    following: Int[np.ndarray, "nodes transitions"]
+    enabled: Bool[np.ndarray, "nodes transitions"]
+    last: Int[np.ndarray, " nodes"]
+    reachable_states: tuple[str, ...]
+    transitions: tuple[int, ...]
+    pairs: tuple[tuple[int, int], ...]
+
+
+def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:
+    """Return the graph of all sequences of at most `most` events.
+
+    **Raises:** `ValueError` for guards that tell too many pasts apart, weights too unequal, or a
+    start that no event can leave.
+    """
+    guarded = any(each.guarded for each in transitions)
+    nodes: dict[tuple[str, Past], int] = {(start, Past()): 0}
+    following: list[dict[int, int]] = []
+    frontier = [(start, Past())]
+    taken: set[int] = set()
+    pairs: set[tuple[int, int]] = set()
+    # Breadth first, so that a node is met at the least number of events that lead to it.
+    for depth in range(most + 1):
+        found: list[tuple[str, Past]] = []
+        for state, past in frontier:
+            node = nodes[state, past]
+            ways: dict[int, int] = {}
+            for number, each in enumerate(transitions):
+                if each.source != state or not each.enabled(past):
+                    continue
+                target = (each.to, past.then(each.name) if guarded else Past())
+                if target not in nodes:
+                    if depth == most:
+                        ways[number] = 0
+                        continue
+                    nodes[target] = len(nodes)
+                    found.append(target)
+                    if len(nodes) > MOST_NODES:
+                        raise ValueError(
+                            f"the guards tell more than {MOST_NODES} pasts of at most {most} "
+                            "events apart; allow fewer events, or let fewer have guards"
+                        )
+                ways[number] = nodes[target]
+            following.append(ways)
+        frontier = found
+    depths = _least_depths(following)
+    for node, ways in enumerate(following):
+        for number, target in ways.items():
+            if depths[node] < most:
+                taken.add(number)
+                if depths[node] < most - 1:
+                    pairs |= {(number, second) for second in following[target]}
+    names = list(nodes)
+    if not following[0]:
+        raise ValueError(f"no event is possible in the start, {start!r}")
+    return _tables(names, transitions, following, taken, pairs)
+
+
+def _least_depths(following: list[dict[int, int]]) -> list[int]:
+    depths = [0] + [len(following) + 1] * (len(following) - 1)
+    frontier = [0]
+    while frontier:
+        found = []
+        for node in frontier:
+            for target in following[node].values():
+                if target and depths[target] > depths[node] + 1:
+                    depths[target] = depths[node] + 1
+                    found.append(target)
+        frontier = found
+    return depths
+
+
+def _tables(
+    nodes: list[tuple[str, Past]],
+    transitions: tuple[Transition, ...],
+    following: list[dict[int, int]],
+    taken: set[int],
+    pairs: set[tuple[int, int]],
+) -> Graph:
+    shape = (len(nodes), len(transitions))
+    enabled, target = np.zeros(shape, bool), np.zeros(shape, np.int32)
+    for node, ways in enumerate(following):
+        for number, to in ways.items():
+            enabled[node, number], target[node, number] = True, to
+    weights = np.where(enabled, [each.weight for each in transitions], 0.0)
+    total = weights.sum(axis=1, keepdims=True)
+    shares = weights / np.where(total > 0, total, 1.0)
+    if enabled.any() and shares[enabled].min() < LEAST_SHARE:
+        node, number = (int(i) for i in np.argwhere(enabled & (shares < LEAST_SHARE))[0])
+        raise ValueError(
+            f"the weight of {transitions[number].label}, {transitions[number].weight:g}, is too "
+            f"small beside the others of its state: its probability must be at least "
+            f"{LEAST_SHARE:.1g}; leave out what never happens"
+        )
+    last = np.where(
+        enabled.any(axis=1), shape[1] - 1 - np.argmax(enabled[:, ::-1], axis=1), -1
+    ).astype(np.int32)
+    states = {nodes[0][0]} | {transitions[number].to for number in taken}
+    return Graph(
+        states=tuple(state for state, _ in nodes),
+        edges=np.cumsum(shares, axis=1).astype(np.float32),
+        following=target,
+        enabled=enabled,
+        last=last,
+        reachable_states=tuple(sorted(states)),
+        transitions=tuple(sorted(taken)),
+        pairs=tuple(sorted(pairs)),
+    )
