@@ -13,6 +13,7 @@ from verifai_jax.rl import PPO, Continuous, Discrete, Policy, Task, train
 from verifai_jax.rl.policy import new_layers
 from verifai_jax.rl.task.mjx import mjx_task
 from verifai_jax.rl.task.ode import ode_task
+from verifai_jax.sweeps import Trainer
 from verifai_jax.systems.ode import ode
 
 KEY = jax.random.key(5)
@@ -317,6 +318,41 @@ def test_ode_task_is_the_loop_under_the_same_controls():
 
 def pendulum(time, state, torque, features):
     return {"angle": state["rate"], "rate": features["pull"] * jnp.sin(state["angle"]) + torque}
+
+
+def test_weights_of_a_reward_are_fields_that_a_sweep_may_vary():
+    loop = ode(pendulum, lambda f, key: {"angle": 0.1, "rate": 0.0}, dt=0.05, steps=40)
+
+    def reward(time, state, torque, after, effort, bonus):
+        return bonus - effort * torque**2
+
+    def make(**weights):
+        return ode_task(
+            loop,
+            Continuous(-1.0, 1.0),
+            reward=reward,
+            features={"pull": 9.8},
+            weights={"effort": 0.5, "bonus": 1.0} | weights,
+        )
+
+    task = make()
+    assert isinstance(task, Task)
+    assert jax.tree.leaves(task) == [0.5, 1.0]
+    start = task.reset(KEY)
+    changed = replace(task, effort=2.0)
+    earned = jax.jit(lambda task: task.step(KEY, start, jnp.asarray([0.5]))[1])
+    assert float(earned(task)) == pytest.approx(1 - 0.5 * 0.25)
+    assert float(earned(changed)) == pytest.approx(1 - 2.0 * 0.25)
+    assert jax.tree.structure(task) == jax.tree.structure(changed)
+    assert earned._cache_size() == 1
+    trainer = Trainer(task, PPO())
+    assert {"effort", "bonus"} <= set(trainer.names)
+    assert trainer.configuration({"effort": 3}).task.effort == 3.0
+    for name, message in (("loop", "cannot be a weight"), ("a b", "identifier of its own")):
+        with pytest.raises(ValueError, match=message):
+            make(**{name: 1.0})
+    with unchecked(), pytest.raises(ValueError, match="weight effort must be a number; got 'x'"):
+        make(effort="x")
 
 
 def test_ode_task_of_choices_and_what_it_refuses():

@@ -216,11 +216,17 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
         monkeypatch.setattr(Stopped, "after", after)
         some = sweep(study, folder=tmp_path / str(after), **how)
         assert not some.record.complete
+        assert "from the cache" not in str(some)
         assert len(some.table) <= len(through.table)
         monkeypatch.setattr(Stopped, "after", 10**9)
         again = sweep(study, folder=tmp_path / str(after), **how)
         assert again.record.complete
         same_tables(again, through)
+        trained, trainings = again.reuse["train"]
+        assert 0 < trained <= trainings
+        assert sum(used for _, used in again.reuse.values()) == pieces
+        assert sum(cached for cached, _ in again.reuse.values()) >= min(after, pieces)
+        assert f"  from the cache  {again.reuse['certify'][0]} of " in str(again)
     # Nothing is trained again: all is remembered, with the seconds that it took.
     monkeypatch.setattr(training_runs.BatchedTraining, "advance", None)
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())

@@ -61,6 +61,8 @@ class Cache:
         self.path = None if path is None else cache_file(Path(path), kind)
         self.computed = 0
         """Entries that this process computed."""
+        self._own: set[str] = set()
+        self._reused: set[str] = set()
         if self.path is not None:
             _refuse_other_files(self.path, kind)
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -165,15 +167,19 @@ class Cache:
         if row is None:
             return None
         try:
-            return self._decode(name, *row)
+            arrays = self._decode(name, *row)
         except CacheError as error:
             log.warning("%s; it is computed anew", error)
             return None
+        if name not in self._own:
+            self._reused.add(name)
+        return arrays
 
     def put(self, work: Mapping[str, Arrays]) -> None:
         """Store finished computations, all or none of them."""
         rows = [(name, *_encode(name, arrays)) for name, arrays in work.items()]
         self.computed += len(rows)
+        self._own.update(work)
         with self._transaction():
             self._base.executemany("INSERT OR REPLACE INTO work VALUES (?, ?, ?, ?)", rows)
 
@@ -186,6 +192,18 @@ class Cache:
             # Decoded as when it is read back, so that both ways give the same arrays.
             arrays = self._decode(name, *_encode(name, computed))
         return arrays
+
+    def reuse(self) -> dict[str, tuple[int, int]]:
+        """Count the entries that were here before this process, of all that it used, by kind.
+
+        The kind of an entry is its name up to the first slash.
+        """
+        kinds: dict[str, tuple[int, int]] = {}
+        for name in sorted(self._reused | self._own):
+            kind = name.partition("/")[0]
+            reused, used = kinds.get(kind, (0, 0))
+            kinds[kind] = (reused + (name not in self._own), used + 1)
+        return kinds
 
     def names(self) -> list[str]:
         """Return the names of all finished computations."""

@@ -145,7 +145,7 @@ def sweep(
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = _RunningSweep(study, options, cache, clock, halving, attack)
-        return Sweep(running.run(proposer), study)
+        return Sweep(running.run(proposer), study, reuse=cache.reuse())
 
 
 @dataclass(eq=False)

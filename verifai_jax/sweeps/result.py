@@ -62,6 +62,8 @@ class Sweep:
     - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
       certificates.
     - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
+    - `reuse`: how much was cached before: by kind of work (`"train"`, `"return"`, `"certify"`) the
+      number of entries that were, and of all; empty for a loaded sweep.
     """
 
     record: SweepRecord
@@ -70,6 +72,7 @@ class Sweep:
     folder: Path | None = None
     failing: "Mapping[int, pd.DataFrame]" = field(default_factory=dict, repr=False)
     used: Mapping[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
+    reuse: Mapping[str, tuple[int, int]] = field(default_factory=dict, repr=False)
     _problems: dict[int, Problem] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -305,7 +308,7 @@ class Sweep:
     @property
     def findings(self) -> Findings:
         """Data that the summary is written from."""
-        return Findings(self.record, self.table, self.configurations, self.used, self.p)
+        return Findings(self.record, self.table, self.configurations, self.used, self.p, self.reuse)
 
     @property
     def headline(self) -> str:

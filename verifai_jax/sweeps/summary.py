@@ -1,6 +1,6 @@
 """The summary of a sweep in words, and as a table for a notebook.
 
-findings = Findings(record, table, configurations, used, p)
+findings = Findings(record, table, configurations, used, p, reuse)
 format_headline(findings)
 print(format_summary(findings))
 """
@@ -29,6 +29,12 @@ MOST_ROWS = 8
 """Rows that a notebook shows."""
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
 """Views of the result that the summary points to."""
+_WORK = {
+    "train": "training checkpoint",
+    "return": "nominal return",
+    "certify": "block of simulations",
+}
+"""Kinds of cached work, in words."""
 _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 """Colours of verdicts in a notebook, those of the pictures; others are grey."""
 
@@ -41,6 +47,7 @@ class Findings(NamedTuple):
     - `configurations`: one row for each configuration.
     - `used`: names of the hyper-parameters of each algorithm; empty where all have all.
     - `p`: failure probability below which a policy is safe, where it is known.
+    - `reuse`: entries that were cached before, and all, by kind of work.
     """
 
     record: SweepRecord
@@ -48,6 +55,7 @@ class Findings(NamedTuple):
     configurations: "pd.DataFrame"
     used: Mapping[str, Sequence[str]]
     p: float | None
+    reuse: Mapping[str, tuple[int, int]]
 
 
 def format_summary(findings: Findings) -> str:
@@ -84,6 +92,8 @@ def format_summary(findings: Findings) -> str:
         )
     if evidence := _evidence(findings):
         lines.append(f"  evidence        {evidence}")
+    if reused := _reuse(findings.reuse):
+        lines.append(f"  from the cache  {reused}")
     if seconds := _seconds(record.seconds):
         lines.append(f"  time            {seconds}")
     lines.append(f"  see             {_VIEWS}")
@@ -250,6 +260,16 @@ def _evidence(findings: Findings) -> str:
     return text
 
 
+def _reuse(reuse: Mapping[str, tuple[int, int]]) -> str:
+    """Write how much of the work was cached before; nothing where none was."""
+    if not any(cached for cached, _ in reuse.values()):
+        return ""
+    return ", ".join(
+        f"{cached:,} of {_plural(used, _WORK.get(kind, kind))}"
+        for kind, (cached, used) in reuse.items()
+    )
+
+
 def _seconds(seconds: Mapping[str, float]) -> str:
     parts = [f"{value:.1f} s {stage}" for stage, value in seconds.items() if value >= 0.05]
     return ", ".join(parts)
@@ -262,4 +282,5 @@ def _format_return(value: float) -> str:
 
 def _plural(count: int, noun: str) -> str:
     """Write a count with its noun: `1 configuration`, `2 configurations`."""
-    return f"{count:,} {noun}{'s' * (count != 1)}"
+    noun, of, rest = noun.partition(" of ")
+    return f"{count:,} {noun}{'s' * (count != 1)}{of}{rest}"

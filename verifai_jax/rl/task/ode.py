@@ -2,18 +2,23 @@
 
 loop = ode(dynamics, initial, dt=0.02, duration=4.0, terminate=fallen)
 task = ode_task(loop, Continuous(-10.0, 10.0), reward=lambda time, state, force, after: 1.0)
+task = ode_task(..., reward=lambda time, state, force, after, effort: 1.0 - effort * force**2,
+                weights={"effort": 0.01})                   # task.effort, which a sweep may vary
 tested = replace(loop, controller=lambda time, state, features: trained.policy.act(...)[0])
 """
 
+import dataclasses
+import functools
+import keyword
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
-from verifai_jax.core.checks import check_count
+from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.waveform import within_step
 from verifai_jax.rl.task.stepping import abstract_action
@@ -23,8 +28,8 @@ from verifai_jax.systems.ode.integrators import Derivative, Time, integrator
 from verifai_jax.systems.pytree_checks import as_floating, outline
 
 Tree = TypeVar("Tree")
-Reward = Callable[[Array, PyTree, PyTree, PyTree], ArrayLike]
-"""`(time, state, control, after) -> number`"""
+Reward = Callable[..., ArrayLike]
+"""`(time, state, control, after, **weights) -> number`"""
 Control = Callable[[Array], PyTree]
 """`action -> control`"""
 Observe = Callable[[PyTree], ArrayLike]
@@ -48,7 +53,12 @@ class OdeState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OdeTask:
-    """A task of a system made by `ode`; made by `ode_task`, which describes its parts."""
+    """A task of a system made by `ode`; made by `ode_task`, which describes its parts.
+
+    One whose reward has weights also has a field for each of them, and is a pytree of these.
+    """
+
+    weights: ClassVar[tuple[str, ...]] = ()
 
     loop: Ode
     action: Action
@@ -92,7 +102,9 @@ class OdeTask:
             # Each sample of a trace may be its last.
             time, now = _where(over, (time, now), (time + loop.dt, after))
             over = over | ended(now)
-        reward = jnp.asarray(self.reward(start.time, start.state, control, now), jnp.float32)
+        weights = {name: getattr(self, name) for name in self.weights}
+        earned = self.reward(start.time, start.state, control, now, **weights)
+        reward = jnp.asarray(earned, jnp.float32)
         return OdeState(time, now, start.features), reward.reshape(()), over
 
     def observe(self, state: OdeState) -> Float[Array, " k"]:
@@ -110,6 +122,7 @@ def ode_task(
     observe: Observe | None = None,
     features: Mapping[str, ArrayLike] | DrawFeatures | None = None,
     time_limit: int | None = None,
+    weights: Mapping[str, float] | None = None,
 ) -> OdeTask:
     """Make a `Task` of an `ode`: its start, dynamics, step, control period and end.
 
@@ -127,11 +140,14 @@ def ode_task(
     - `features`: what dynamics and start are given, or a function `key -> features` that draws
       them for each episode (domain randomisation). None at all when left out.
     - `time_limit`: in control periods; the loop's duration when left out.
+    - `weights`: numbers that `reward` is given by name, such as `{"effort": 0.01}`. They are fields
+      of the task, so that `dataclasses.replace` changes them and a sweep may vary them: all values
+      share one compiled training.
 
     **Returns:** a task; its states are `OdeState`.
 
-    **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`, and
-    functions that do not fit together.
+    **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`,
+    weights that are no numbers or whose names are taken, and functions that do not fit together.
     """
     if not isinstance(loop, Ode):
         raise ValueError(f"loop must be made by ode(...); got {outline(loop)}")
@@ -148,7 +164,10 @@ def ode_task(
     limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit
     check_count("time_limit", limit)
     draw = features if callable(features) else _constant(dict(features or {}))
-    task = OdeTask(loop, action, limit, reward, control, observe or _all_numbers, draw)
+    weights = dict(weights or {})
+    _check_weights(weights)
+    kind = _with_weights(tuple(weights)) if weights else OdeTask
+    task = kind(loop, action, limit, reward, control, observe or _all_numbers, draw, **weights)
     key = jax.eval_shape(lambda: jax.random.key(0))
     start = jax.eval_shape(task.reset, key)
     after, _, _ = jax.eval_shape(task.step, key, start, abstract_action(action))
@@ -156,6 +175,32 @@ def ode_task(
         raise ValueError(f"dynamics must return the derivative of {outline(start)}")
     jax.eval_shape(task.observe, start)
     return task
+
+
+def _check_weights(weights: Mapping[str, float]) -> None:
+    taken = [field.name for field in dataclasses.fields(OdeTask)]
+    for name, value in weights.items():
+        if not name.isidentifier() or keyword.iskeyword(name) or hasattr(OdeTask, name):
+            raise ValueError(f"a weight's name must be an identifier of its own; got {name!r}")
+        if name in taken:
+            raise ValueError(f"{name!r} cannot be a weight; taken are {', '.join(taken)}")
+        if not is_number(value):
+            raise ValueError(f"weight {name} must be a number; got {value!r}")
+
+
+@functools.cache
+def _with_weights(names: tuple[str, ...]) -> type[OdeTask]:
+    """Return a kind of task with a field for each weight: its leaves as a pytree."""
+    static = [field.name for field in dataclasses.fields(OdeTask)]
+    made = dataclasses.make_dataclass(
+        "OdeTask",
+        [(name, float) for name in names],
+        bases=(OdeTask,),
+        namespace={"weights": names, "__module__": __name__},
+        frozen=True,
+        eq=False,
+    )
+    return jax.tree_util.register_dataclass(made, data_fields=list(names), meta_fields=static)
 
 
 def _action_itself(action: Float[Array, " size"]) -> Float[Array, "..."]:
