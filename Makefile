@@ -34,6 +34,15 @@ help:
 	fi
 	@touch $@
 
+# Scenic brings 700 MB, which the quick tests do without.
+.venv/scenic: .venv/installed
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic]'; \
+	else \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic]'; \
+	fi
+	@touch $@
+
 falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
@@ -45,7 +54,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 test: .venv/installed
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
 
-test-slow: .venv/installed
+test-slow: .venv/scenic
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST) -m "thorough and not slow"
 	$(PYTEST) -m slow
 
@@ -69,7 +78,7 @@ notebooks-update: .venv/installed
 	.venv-bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]'
 	@touch $@
 
-bench: .venv-bench/installed .venv/installed
+bench: .venv-bench/installed .venv/scenic
 	.venv-bench/bin/python benchmarks/throughput.py
 	.venv-bench/bin/python benchmarks/search_quality.py landscapes
 	.venv-bench/bin/python benchmarks/search_quality.py cartpole
@@ -81,6 +90,7 @@ bench: .venv-bench/installed .venv/installed
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/perception.py frames
 	$(BIN)/python benchmarks/perception.py loop
+	$(BIN)/python benchmarks/scenic.py
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole
