@@ -14,7 +14,7 @@ PACKAGE = ROOT / "verifai_jax"
 LAYERS = (
     {"core", "statistics", "_version"},
     {"features", "mtl", "systems", "search"},
-    {"rl", "problem", "perception", "events"},
+    {"rl", "problem", "perception", "events", "scenes"},
     {"evaluation"},
     {"falsification"},
     {"counterexamples", "estimation", "synthesis", "certification", "analysis"},

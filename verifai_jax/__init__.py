@@ -62,6 +62,9 @@ if TYPE_CHECKING:
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
+    from verifai_jax.scenes import ProgramError as ProgramError
+    from verifai_jax.scenes import ScenicProgram as ScenicProgram
+    from verifai_jax.scenes import scenic as scenic
     from verifai_jax.statistics.binomial import Rate as Rate
     from verifai_jax.statistics.binomial import clopper_pearson as clopper_pearson
     from verifai_jax.statistics.binomial import (
@@ -165,6 +168,11 @@ _NAMES = {
         "Problem",
         "ProblemError",
         "Rulebook",
+    ),
+    "scenes": (
+        "ProgramError",
+        "ScenicProgram",
+        "scenic",
     ),
     "statistics.binomial": (
         "Rate",

@@ -1,0 +1,114 @@
+"""`scenic`: a Scenic program as a feature space and a function of JAX."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.features import Categorical, FeatureSpace
+from verifai_jax.features.domain import Domain
+from verifai_jax.scenes.compilation import ProgramError
+from verifai_jax.scenes.outputs import Outputs
+from verifai_jax.scenes.program import ScenicProgram
+from verifai_jax.scenes.recipe import Recipe
+from verifai_jax.scenes.requirements import Constraint
+from verifai_jax.scenes.sampling import Sampling
+
+LEAST = 2e-6
+"""Probability of a soft requirement to be off, or on, at least."""
+
+FAST, SLOW = 16_384, 1024
+"""Points from which the weights of soft requirements are fitted, compiled and in Python."""
+
+ROUNDS = 200
+"""Rounds of that fit at most."""
+
+
+@suggests_options
+def scenic(
+    program: str | Path,
+    *,
+    mode2D: bool = True,
+    params: Mapping[str, Any] | None = None,
+    model: str | None = None,
+    scenario: str | None = None,
+) -> ScenicProgram:
+    """Compile a Scenic program to a feature space and a function of JAX.
+
+        scene = vj.scenic("cones.scenic", params={"weather": "rain"})
+        vj.Problem("cones", space=scene.space, system=scene.system(simulate), spec="always gap > 1")
+
+    Each random value becomes a feature by the inverse of its cumulative distribution, with the name
+    of the property or parameter that it feeds. What has no inverse (mutations, points in regions
+    that are random or no polygons, distributions of one's own) shares a coordinate `seed`. A soft
+    requirement, `require[p]`, is a feature that is on or off; it is on with probability p among the
+    scenes that are accepted, as in Scenic.
+
+    **Arguments:**
+
+    - `program`: path of a `.scenic` file, or the code of a program.
+    - `mode2D`: Scenic's planar mode. In three dimensions features are the same, but Scenic computes
+      every scene, in Python.
+    - `params`: global parameters to override.
+    - `model`: Scenic module to use as world model.
+    - `scenario`: name of the modular scenario to compile, where there are several.
+
+    **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not compile,
+    with Scenic's message, file and line, and for one that draws nothing at random.
+    """
+    recipe = Recipe.of(program, mode2D, params or {}, model, scenario)
+    compiled, sampling = recipe.compiled()
+    if not sampling.domains:
+        raise ProgramError(
+            f"{compiled.filename} draws nothing at random, so it has one scene and no feature"
+        )
+    constraint = Constraint(sampling, compiled, mode2D)
+    outputs = Outputs(sampling, mode2D)
+    domains = dict(sampling.domains)
+    if sampling.soft:
+        domains.update(_soft_domains(domains, constraint, sampling))
+    constrained = bool(constraint.compiled or constraint.by_scenic or constraint.draws)
+    return ScenicProgram(
+        space=FeatureSpace(domains, constraint if constrained else None),
+        objects=outputs.objects,
+        seeded=tuple(sampling.seeded.values()),
+        in_python=outputs.in_python,
+        by_scenic=constraint.by_scenic,
+        scenario=compiled.scenario,
+        _recipe=recipe,
+        _sampling=sampling,
+        _outputs=outputs,
+        _constraint=constraint,
+    )
+
+
+def _soft_domains(
+    domains: Mapping[str, Domain], constraint: Constraint, sampling: Sampling
+) -> dict[str, Domain]:
+    """Return the features of soft requirements, weighted so that each is on with Scenic's share.
+
+    Scenic switches them once a scene, before it refuses anything. Where a point with its switches
+    is refused as a whole, a requirement that is on would come too rarely: its weight makes up for
+    it. The weights are fitted on samples (iterative proportional fitting of the switches).
+    """
+    names = list(sampling.soft)
+    even = {**domains, **{name: Categorical(False, True) for name in names}}
+    space = FeatureSpace(even, constraint)
+    count = SLOW if constraint.by_scenic or constraint.draws else FAST
+    u = np.random.default_rng(0).random((count, space.dim), np.float32)
+    accepted = np.asarray(space.accepts_points(u))
+    features = space.features_at(u)
+    on = np.stack([np.asarray(features[name]) for name in names], axis=1)[accepted]
+    wanted = np.clip([float(sampling.soft[name].prob) for name in names], LEAST, 1 - LEAST)
+    weights = wanted.copy()
+    for _ in range(ROUNDS if len(on) else 0):
+        mass = np.prod(np.where(on, weights, 1 - weights), axis=1)
+        share = np.clip((mass[:, None] * on).sum(0) / mass.sum(), LEAST, 1 - LEAST)
+        odds = weights / (1 - weights) * (wanted / (1 - wanted)) / (share / (1 - share))
+        weights = np.clip(odds / (1 + odds), LEAST, 1 - LEAST)
+    return {
+        name: Categorical(False, True, weights=[float(1 - weight), float(weight)])
+        for name, weight in zip(names, weights, strict=True)
+    }
