@@ -3,6 +3,8 @@
     python benchmarks/perception.py frames [--rounds 5]
     MUJOCO_GL=egl python benchmarks/perception.py mujoco
     python benchmarks/perception.py loop [--simulations 2000]
+    python benchmarks/perception.py compositional [--seeds 20]
+    python benchmarks/perception.py gradient [--seeds 8]
 
 Frames and gradients are counted by CPU time, as on one core; the loop by wall time on all cores,
 compilation apart. Rates have Clopper-Pearson intervals of 95 %.
@@ -135,6 +137,112 @@ def loop(simulations: int) -> None:
             print(f"| {name} | {rate[0]:,.0f} | {rate[1]:,.0f} | {formula} | {' | '.join(cells)} |")
 
 
+COLLISIONS = vj.Problem(
+    "collisions of the wide network",
+    specs.space("lanechange"),
+    cones.cones(cones.neural("wide")),
+    specs.SAFE,
+)
+
+
+def compositional(seeds: int) -> None:
+    """Print the rendered images until the first collision that the wide network causes.
+
+    `uniform` and `cross_entropy` simulate the loop, up to the failing row; the compositional
+    analysis looks for single images by either search, and counts its simulations too.
+    """
+    per = round(8 * cones.FRAME_RATE) + 1
+    counts: dict[str, list[int]] = {}
+    for seed in range(seeds):
+        for search in ("uniform", "cross_entropy"):
+            run = vj.falsify(
+                COLLISIONS, search, 50_000, seed=seed, batch=64, stop_after=1, confirm=False
+            )
+            counts.setdefault(search, []).append(per * (first_failure(run) + 1))
+        for search in ("uniform", "cross_entropy"):
+            result = vj.perception.abstract(
+                COLLISIONS, abstraction, COLLISIONS.system.frame, ERROR,
+                search=search, seed=seed, budget=50_000,
+            )  # fmt: skip
+            assert len(result.confirmed) == 1
+            counts.setdefault(f"compositional, {search}", []).append(result.frames["total"])
+        print(seed, {name: values[-1] for name, values in counts.items()}, flush=True)
+    print("| | median | quartiles | extremes | fewer than uniform |\n|---|---|---|---|---|")
+    for name, values in counts.items():
+        least, first, median, third, most = np.quantile(values, [0, 0.25, 0.5, 0.75, 1])
+        fewer = np.median(np.array(counts["uniform"]) / np.array(values))
+        print(
+            f"| {name} | {median:,.0f} | {first:,.0f} to {third:,.0f} | {least:,.0f} to "
+            f"{most:,.0f} | {np.median(counts['uniform']) / median:.3g} (of pairs: {fewer:.3g}) |"
+        )
+
+
+ERROR = "distance < 15 and (estimate > 15 or logit < 0)"
+
+
+def abstraction(severity):
+    """The loop without images, which sees cones late."""
+    return cones.cones(cones.late(severity))
+
+
+def first_failure(run: vj.Run) -> int:
+    """Return the number of the first row that violates the property."""
+    failing = run.table.counterexamples
+    assert len(failing), f"{run.search} found nothing in {run.simulations} simulations"
+    return int(failing.index.min())
+
+
+MARGIN = "always (distance < 12 -> reading < 15 and logit > 0)"
+"""`seen` by what the network computes, which does not saturate, in place of what it decides."""
+
+
+def one_image(features, key=None):
+    """One image of cones that are nearer than 12 m."""
+    pose = cones.Pose(-features["ahead"], features["offset"], features["heading"])
+    distance = cones.distance_of_nearest(features, pose)
+    logit, reading = WIDE(features, pose)
+    signals = {"distance": distance, "reading": reading, "logit": logit}
+    return vj.Trace({name: value[None] for name, value in signals.items()}, dt=1.0)
+
+
+WIDE = cones.neural("wide")
+one_image.lanes = 8
+
+
+def gradient(seeds: int) -> None:
+    """Print simulations and seconds until the first failure, by searches with slopes or without."""
+    space = specs.space("lanechange")
+    road = {"ahead": vj.Box(4.0, 12.0), "offset": vj.Box(-0.5, 0.5), "heading": vj.Box(-0.08, 0.08)}
+    images = vj.FeatureSpace({**cones.SCENERY, **cones.WEATHER, **road})
+    problems = [
+        vj.Problem("one image", images, one_image, MARGIN),
+        vj.Problem("loop, margin", space, cones.cones(WIDE), MARGIN),
+        vj.Problem("loop, decision", space, cones.cones(WIDE), specs.SEEN),
+        COLLISIONS,
+    ]
+    print("| problem | search | found | simulations | s | compile s |")
+    print("|---|---|---|---|---|---|")
+    for problem in problems:
+        for search in ("uniform", "cross_entropy", "gradient"):
+            spent, seconds, compiled, found = [], [], 0.0, 0
+            for seed in range(seeds):
+                run = vj.falsify(
+                    problem, search, BUDGET, seed=seed, batch=16, stop_after=1, confirm=False
+                )
+                compiled = max(compiled, run.compile_seconds)
+                found += len(run.table.counterexamples) > 0
+                spent.append(run.simulations)
+                seconds.append(run.run_seconds)
+            print(
+                f"| {problem.name} | {search} | {found} of {seeds} | {np.median(spent):,.0f} | "
+                f"{np.median(seconds):.2g} | {compiled:.0f} |",
+                flush=True,
+            )
+
+
+BUDGET = 4096
+
+
 def rate_text(fails: np.ndarray) -> str:
     """Return a rate in percent, its interval and its counts."""
     rate = vj.clopper_pearson(int(fails.sum()), len(fails))
@@ -149,13 +257,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("what", choices=("frames", "mujoco", "loop"))
+    parser.add_argument("what", choices=("frames", "mujoco", "loop", "compositional", "gradient"))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--simulations", type=int, default=2000)
+    parser.add_argument("--seeds", type=int)
     chosen = parser.parse_args()
     enable_compile_cache()
     if chosen.what == "loop":
         loop(chosen.simulations)
+    elif chosen.what == "compositional":
+        compositional(chosen.seeds or 20)
+    elif chosen.what == "gradient":
+        gradient(chosen.seeds or 8)
     else:
         {"frames": frames, "mujoco": mujoco_frames}[chosen.what](chosen.rounds)
 

@@ -60,6 +60,8 @@ CONE_RADIUS, CONE_HEIGHT = 0.25, 0.75
 NOTHING = 60.0
 """The distance when no cone is seen."""
 TRIGGER = 15.0
+LATEST = 9.0
+"""The distance at which a perception sees cones at the latest, where its error is abstracted."""
 CLEARANCE = 2.2
 DECELERATION = 4.0
 ORANGE = 0.13
@@ -257,6 +259,22 @@ def perfect() -> Perception:
     return perceive
 
 
+def late(severity: Scalar | float) -> Perception:
+    """Return a perception that sees cones late: the abstract error of the networks.
+
+    **Arguments:**
+
+    - `severity`: 0 sees them `TRIGGER` away, as soon as it matters; 1 not before `LATEST`.
+    """
+    reach = TRIGGER - (TRIGGER - LATEST) * jnp.asarray(severity, float)
+
+    def perceive(features: Features, pose: Pose) -> tuple[Scalar, Scalar]:
+        distance = distance_of_nearest(features, pose)
+        return jnp.where(distance < reach, 10.0, -10.0), distance
+
+    return perceive
+
+
 def neural(network: Detector | str = "wide") -> Perception:
     """Return the perception of a network, or of one of those that are shipped.
 
@@ -389,7 +407,7 @@ class Cones(System):
             state, gap = carry
             time = number * PERIOD
             logit, estimate = self.perception(features, state.pose)
-            estimate = jnp.where(logit > 0, estimate, NOTHING)
+            reading, estimate = estimate, jnp.where(logit > 0, estimate, NOTHING)
             distance = distance_of_nearest(features, state.pose)
             waiting = time < state.begun
             sample = {
@@ -401,6 +419,8 @@ class Cones(System):
                 "distance": jnp.where(waiting, distance, NOTHING),
                 "estimate": estimate,
                 "presence": jax.nn.sigmoid(logit),
+                "logit": logit,
+                "reading": reading,
             }
             state = self.manoeuvre.decide(state, time, logit, estimate, reaction)
             gaps = []
@@ -419,6 +439,20 @@ class Cones(System):
         """Return what the camera saw in a simulation, from its trace."""
         poses = Pose(*(jnp.asarray(trace[name]) for name in ("x", "offset", "heading")))
         return jax.jit(lambda at: jax.lax.map(lambda pose: render(features, pose), at))(poses)
+
+    def frame(self, features: Features, sample: Mapping[str, Scalar]) -> dict[str, Scalar]:
+        """Look once, from where the car is in one sample of a trace.
+
+        **Returns:** `distance`, `estimate`, `logit` and `reading`, as in a trace.
+        """
+        pose = Pose(sample["x"], sample["offset"], sample["heading"])
+        logit, reading = self.perception(features, pose)
+        return {
+            "distance": sample["distance"],
+            "estimate": jnp.where(logit > 0, reading, NOTHING),
+            "logit": logit,
+            "reading": reading,
+        }
 
     def _start(self, features: Features) -> State:
         speed = jnp.asarray(features["cruising_speed"], float)
@@ -442,7 +476,8 @@ def cones(
     image), `x` (m, of the car's middle; the first cone is at 0), `offset` (m, to the left of the
     lane's middle), `heading` (rad), `speed` (m/s), `distance` (m, to the nearest cone in sight; 60
     without any, and once the manoeuvre has begun), `estimate` (m; 60 where nothing is seen),
-    `presence` (probability).
+    `presence` (probability), `logit` (its logit, which does not saturate) and `reading` (m, the
+    estimate whether anything is seen or not).
 
     **Arguments:**
 

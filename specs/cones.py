@@ -23,7 +23,9 @@ from envs.cones import (
 )
 
 SAFE = "always cone_gap > 0.1"
-OVERSHOOT = "always offset < 4"
+SWERVE = "always heading < 0.53"
+"""The lane change is no swerve. Its duration follows from the estimate, 1.63 s or more where that
+is right, so that the heading is atan(15/8 * 3.5 m / 1.63 s / 7.2 m/s) = 0.509 at most."""
 SEEN = "always (distance < 12 -> estimate < 15)"
 
 SPEEDS = {"lanechange": (4.5, 7.2), "aebs": (5.0, 9.0)}
@@ -52,9 +54,9 @@ def problem(name: str, perception: Perception, manoeuvre: str, about: str) -> vj
     reactions: dict[str, Manoeuvre] = {"lanechange": lanechange(), "aebs": aebs()}
     # At the least speed, the time to pass the cones.
     duration = {"lanechange": 8.0, "aebs": 7.0}[manoeuvre]
-    rules = {"safe": SAFE, "overshoot": OVERSHOOT, "seen": SEEN}
+    rules = {"safe": SAFE, "swerve": SWERVE, "seen": SEEN}
     if manoeuvre == "aebs":
-        del rules["overshoot"]
+        del rules["swerve"]
     first = [("safe", other) for other in rules if other != "safe"]
     low, high = SPEEDS[manoeuvre]
     reaction = {"reaction_time": 0.85} if manoeuvre == "lanechange" else {}

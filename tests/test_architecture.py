@@ -17,7 +17,7 @@ LAYERS = (
     {"rl", "problem", "perception", "events", "scenes"},
     {"evaluation"},
     {"falsification"},
-    {"counterexamples", "estimation", "synthesis", "certification", "analysis"},
+    {"counterexamples", "estimation", "synthesis", "certification", "analysis", "compositional"},
     {"sweeps", "augmentation"},
     {"plotting"},
     {"cli"},

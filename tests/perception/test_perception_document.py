@@ -14,6 +14,7 @@ SMALLER = {
     "budget=1000": "budget=8",
     "length=36": "length=33",
     "Camera(24, 24,": "Camera(8, 8,",
+    'frame, "logit < 0"': 'frame, "logit < 0", budget=60, samples=64',
 }
 
 
@@ -30,6 +31,8 @@ def test_the_landing_pad_trains_and_is_falsified(tmp_path, monkeypatch, capsys):
     assert np.isfinite(names["worst"]["rho"])
     assert names["network"].shape == (8, 8)
     assert "8 images: precision" in capsys.readouterr().out
+    assert 0 < names["result"].frames["total"] <= 60
+    assert (tmp_path / "region.png").exists()
 
 
 def test_the_controller_for_webots_is_python():

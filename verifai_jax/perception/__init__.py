@@ -1,5 +1,12 @@
-"""A differentiable camera, and small networks that look through it."""
+"""A differentiable camera, and small networks that look through it.
 
+`abstract` falsifies a loop with such a network compositionally. It stands on `vj.falsify`, so it
+lies in the room `compositional`, above this one, and is imported when it is first used.
+"""
+
+from typing import Any
+
+from verifai_jax.core.lazy import late
 from verifai_jax.perception._detector import Detection as Detection
 from verifai_jax.perception._detector import Detector as Detector
 from verifai_jax.perception._detector import DetectorFileError as DetectorFileError
@@ -34,6 +41,7 @@ from verifai_jax.perception.training import train_detector as train_detector
 __all__ = [
     "Box",
     "Camera",
+    "Compositional",
     "Conditions",
     "Cone",
     "Cross",
@@ -52,6 +60,7 @@ __all__ = [
     "Sky",
     "Sphere",
     "Sun",
+    "abstract",
     "detector",
     "facing",
     "hsv",
@@ -63,6 +72,16 @@ __all__ = [
     "score",
     "train_detector",
 ]
+
+# Given by `__getattr__`.
+Compositional: Any
+abstract: Any
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("Compositional", "abstract"):
+        return late("verifai_jax.compositional", name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
