@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, standard_normal
+from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 
 MOST_CELLS = 8
 """Ordered cells up to which a coordinate is discrete; more are stepped over as if continuous."""
@@ -116,8 +116,8 @@ class Annealing(Search[AnnealingState]):
     ) -> tuple[Float[Array, "batch d"], AnnealingState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k, chains = cube.dim, len(cube.discrete), len(state.energy)
-        # One call for all random numbers: each costs a good part of a second to compile.
-        random = jax.random.uniform(key, (batch, 6 + 3 * d + 2 * k), jnp.float32)
+        # One call for all random numbers: each takes a while to compile.
+        random = draw_uniform(key, (batch, 6 + 3 * d + 2 * k))
         row, prior, noise, move, cell, way = jnp.split(
             random, 6 + np.array([0, d, 2 * d, 3 * d, 3 * d + k]), axis=1
         )
@@ -156,7 +156,7 @@ class Annealing(Search[AnnealingState]):
         coldness = self._coldness(chains) / jnp.where(spread > 0, spread, 1.0)
         sweeps = len(_matchings(chains))
         key = jax.random.fold_in(jax.random.fold_in(state.key, state.tells), 1)
-        chance = jnp.log(jax.random.uniform(key, (batch + sweeps * chains,), jnp.float32))
+        chance = jnp.log(draw_uniform(key, (batch + sweeps * chains,)))
 
         rise = jnp.where(jnp.isinf(before), 0.0, coldness[turn] * (new - before))
         accepted = usable & (jnp.isinf(before) | (coldness[turn] == 0) | (chance[:batch] < -rise))

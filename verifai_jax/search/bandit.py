@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Observations, Search, draw_uniform
 
 BISECTIONS = 20
 """Halvings of the interval that holds the common level of the bounds."""
@@ -93,7 +93,7 @@ class Bandit(Search[BanditState]):
         self, state: BanditState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], BanditState]:
         key = jax.random.fold_in(state.key, state.round)
-        random = jax.random.uniform(key, (batch, 1 + 2 * cube.dim), jnp.float32)
+        random = draw_uniform(key, (batch, 1 + 2 * cube.dim))
         chance, order, prior = jnp.split(random, [1, 1 + cube.dim], axis=1)
         # A Latin hypercube: in each coordinate one row in each of `batch` equal parts.
         even = (jnp.argsort(order, axis=0) + prior) / batch

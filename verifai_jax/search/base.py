@@ -9,8 +9,10 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 """
 
 import abc
+import math
 from typing import ClassVar, Generic, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
@@ -124,6 +126,16 @@ class Search(abc.ABC, Generic[State]):
     def temperature(self, state: State) -> Float[Array, ""]:
         """Return the temperature of the smooth robustness; only where `wants_gradient`."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
+
+
+def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
+    """Draw uniform numbers in `[0, 1)`: those of `jax.random.uniform`, compiled much sooner.
+
+    XLA spends seconds on the generator in more than one dimension, and again in each of its uses
+    where it is not kept.
+    """
+    flat = jax.random.uniform(key, (math.prod(shape),), jnp.float32)
+    return jax.lax.optimization_barrier(flat).reshape(shape)
 
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Observations, Search, draw_uniform
 
 MOST_COMBINATIONS = 1024
 """Combinations of the lengths of arrays at most."""
@@ -93,7 +93,7 @@ class CECompat(Search[CECompatState]):
         self, state: CECompatState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], CECompatState]:
         key = jax.random.fold_in(state.key, state.round)
-        pick, inside = jax.random.uniform(key, (2, batch, cube.dim), jnp.float32)
+        pick, inside = draw_uniform(key, (2, batch, cube.dim))
         after = state._replace(round=state.round + 1)
         if cube.dim == 0:
             return pick, after

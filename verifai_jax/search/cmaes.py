@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, standard_normal
+from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 from verifai_jax.search.evolution import Evolution, recombination
 from verifai_jax.search.halton import halton_points
 
@@ -180,8 +180,7 @@ class CMAES(Search[CMAESState]):
         """Draw points of the Gaussian, and of the choices."""
         plain, codes = _plain(cube), _codes(cube)
         sizes = [batch * len(plain), batch * len(codes)]
-        # Drawn flat and kept: to compile it takes a fifth of the time.
-        random = jax.lax.optimization_barrier(jax.random.uniform(key, (sum(sizes),), jnp.float32))
+        random = draw_uniform(key, (sum(sizes),))
         normal, draw = jnp.split(random, [sizes[0]])
         normal = standard_normal(normal).reshape(batch, len(plain))
         u = jnp.full((batch, cube.dim), 0.5, jnp.float32)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, standard_normal
+from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 from verifai_jax.search.halton import halton_points
 
 MOST_CELLS = 32
@@ -128,8 +128,8 @@ class CrossEntropy(Search[CrossEntropyState]):
             [j for j, i in enumerate(cube.discrete) if cube.levels[i] <= MOST_CELLS], np.int32
         )
         cells = cube.discrete[narrow]
-        # One call for all random numbers: each costs a good part of a second to compile.
-        random = jax.random.uniform(key, (batch, 1 + cube.dim + 2 * len(cells)), jnp.float32)
+        # One call for all random numbers: each takes a while to compile.
+        random = draw_uniform(key, (batch, 1 + cube.dim + 2 * len(cells)))
         pick, noise, draw, inherit = jnp.split(
             random, [1, 1 + cube.dim, 1 + cube.dim + len(cells)], axis=1
         )

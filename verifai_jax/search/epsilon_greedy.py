@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, standard_normal
+from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 
 # More ordered cells than this are moved by noise, as if continuous.
 MOST_CELLS = 8
@@ -101,8 +101,8 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     ) -> tuple[Float[Array, "batch d"], EpsilonGreedyState]:
         key = jax.random.fold_in(state.key, state.asks)
         d, k = cube.dim, len(cube.discrete)
-        # One call for all random numbers: each costs a good part of a second to compile.
-        random = jax.random.uniform(key, (batch, 5 + 4 * d + k), jnp.float32)
+        # One call for all random numbers: each takes a while to compile.
+        random = draw_uniform(key, (batch, 5 + 4 * d + k))
         row, prior, noise, inherit, move, choice = jnp.split(
             random, 5 + np.array([0, d, 2 * d, 3 * d, 4 * d]), axis=1
         )

@@ -10,14 +10,13 @@ the base.
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.base import Observations, Search, draw_uniform
 
 BITS = 32
 """Bits of the index of a point."""
@@ -158,7 +157,7 @@ def _digit_maps(
     key: Key[Array, ""], bases: UInt32[np.ndarray, " d"], digits: int
 ) -> tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]]:
     """Draw factors in `[1, base)` and shifts in `[0, base)` for every digit of every base."""
-    factor, shift = jax.random.uniform(key, (2, digits, len(bases)), jnp.float32)
+    factor, shift = draw_uniform(key, (2, digits, len(bases)))
     return (
         1 + (factor * (bases - 1)).astype(jnp.uint32),
         (shift * bases).astype(jnp.uint32),

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Search, standard_normal
+from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 
 PARENTS = 4
 """Best points that are mutated; each half as often as the one before."""
@@ -103,8 +103,8 @@ class Mutation(Search[MutationState]):
     ) -> tuple[Float[Array, "batch d"], MutationState]:
         d = cube.dim
         key = jax.random.fold_in(state.key, state.round)
-        # One call for all random numbers: each costs a good part of a second to compile.
-        random = jax.random.uniform(key, (batch, 16 + 4 * d), jnp.float32)
+        # One call for all random numbers: each takes a while to compile.
+        random = draw_uniform(key, (batch, 16 + 4 * d))
         coins, values, cuts, masks, noise = jnp.split(
             random, [16, 16 + d, 16 + 2 * d, 16 + 3 * d], 1
         )

@@ -71,7 +71,9 @@ class Sobol(Search[SobolState]):
         directions = jnp.asarray(direction_numbers(cube.dim))
         shift = jnp.zeros(cube.dim, jnp.uint32)
         if self.scramble:
-            random = jax.random.bits(key, (BITS + 1, cube.dim), jnp.uint32)
+            # Drawn flat, which compiles ten times as fast.
+            random = jax.random.bits(key, ((BITS + 1) * cube.dim,), jnp.uint32)
+            random = random.reshape(BITS + 1, cube.dim)
             directions, shift = _scramble(directions, random[1:]), random[0]
         return SobolState(directions, shift, jnp.uint32(0))
 
