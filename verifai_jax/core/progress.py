@@ -16,7 +16,8 @@ from typing import IO, TYPE_CHECKING, Any, cast
 from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress, Task, TaskID
+    from rich.text import Text
 
 
 class _Stream:
@@ -57,11 +58,20 @@ class ProgressBar:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+            from verifai_jax.core.compilation import describe_compilation
+
+            class Figures(TextColumn):
+                """The figures of a stage, or what is being compiled and for how long so far."""
+
+                def render(self, task: "Task") -> "Text":
+                    task.fields["shown"] = describe_compilation() or task.fields["figures"]
+                    return super().render(task)
+
             self._display = Progress(
                 TextColumn("{task.description}"),
                 BarColumn(),
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f} {task.fields[unit]}"),
-                TextColumn("{task.fields[figures]}"),
+                Figures("{task.fields[shown]}"),
                 TimeRemainingColumn(),
                 console=Console(file=cast("IO[str]", _Stream())),
                 transient=True,
@@ -76,7 +86,7 @@ class ProgressBar:
     def begin(self, name: str, total: float, unit: str) -> None:
         """Begin a stage of `total` units of work."""
         if self._display is not None:
-            self._stage = self._display.add_task(name, total=total, unit=unit, figures="compiling")
+            self._stage = self._display.add_task(name, total=total, unit=unit, figures="")
 
     def end(self) -> None:
         """End the present stage."""

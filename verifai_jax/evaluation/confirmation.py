@@ -182,6 +182,8 @@ class Confirmer:
     ) -> "_Decision":
         features: dict[str, Any] = {}
         found = {}
+        for check in plan.checks.values():
+            check.replays.begin_compiling(check.factor, len(numbers))
         for name, check in plan.checks.items():
             if check.precision not in features:
                 features[check.precision] = self.problem.space.features_of(rows, check.precision)

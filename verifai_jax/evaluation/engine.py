@@ -21,8 +21,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
-from verifai_jax.core.keys import IMPLEMENTATION, simulation_key
+from verifai_jax.core.compilation import Compilation, compile_soon, tracing
+from verifai_jax.core.devices import spread_over_devices
+from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
@@ -101,7 +102,13 @@ class Engine:
         self._derivative = Derivative(self.inputs.dim, problem.system.forward_up_to)
         self._packing: dict[Mode, Packing] = {}
         self._traced: dict[Mode, jax.stages.Traced] = {}
+        self._compiling: dict[Mode, Compilation] = {}
         self._executables: dict[Mode, jax.stages.Compiled] = {}
+
+    def begin_compiling(self) -> None:
+        """Trace now and compile in the background, beside whatever else is compiled."""
+        with in_precision(self.precision):
+            self._begin("evaluate")
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
@@ -168,7 +175,7 @@ class Engine:
 
         Traces the program, and raises what that raises.
         """
-        with in_precision(self.precision):
+        with tracing(), in_precision(self.precision):
             program = self._trace("evaluate").jaxpr.jaxpr
         used = program.invars[len(jax.tree.leaves(self.inputs.row_form))]
         return any(used is value for step in program.eqns for value in step.invars)
@@ -208,23 +215,34 @@ class Engine:
                 temperatures = _pad(temperatures, self.padded)
             else:
                 temperatures = np.full(self.padded, temperatures)
-            rows = jax.tree.map(lambda leaf: _pad(leaf, self.padded), rows)
-            number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
+            # In NumPy: of an array of JAX each first use of this kind compiles a program.
+            rows = jax.tree.map(lambda leaf: _pad(np.asarray(leaf), self.padded), rows)
             if self.alone:
-                one = jax.tree.map(lambda leaf: leaf[0], (rows, number, temperatures))
-                packed = self._executable(mode)(*one, shared)
-                packed = jax.tree.map(lambda leaf: leaf[None], packed)
+                one = jax.tree.map(lambda leaf: leaf[0], rows)
+                packed = self._executable(mode)(one, _one_key(key), temperatures[0], shared)
+                packed = jax.tree.map(lambda leaf: np.asarray(leaf)[None], packed)
             else:
+                number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
                 packed = self._executable(mode)(rows, number, temperatures, shared)
             return self._packing[mode].unpack(packed, count)
 
     def _executable(self, mode: Mode) -> jax.stages.Compiled:
         if mode not in self._executables:
-            enable_compile_cache()
+            self._begin(mode)
             started = time.perf_counter()
-            self._executables[mode] = self._trace(mode).lower().compile()
+            self._executables[mode] = self._compiling.pop(mode).result()
             self.compile_seconds += time.perf_counter() - started
         return self._executables[mode]
+
+    def _begin(self, mode: Mode) -> None:
+        if mode in self._executables or mode in self._compiling:
+            return
+        started = time.perf_counter()
+        differentiates = self.gradient and mode == "evaluate"
+        name = "gradients" if differentiates else self.inputs.purpose
+        with tracing():
+            self._compiling[mode] = compile_soon(name, self._trace(mode).lower())
+        self.compile_seconds += time.perf_counter() - started
 
     def _trace(self, mode: Mode) -> jax.stages.Traced:
         if mode in self._traced:
@@ -356,19 +374,21 @@ class Engine:
         return boolean_semantics(self.problem, system(features, key))
 
 
-def _pad(rows: np.ndarray | Array, count: int) -> np.ndarray | Array:
+def _pad(rows: np.ndarray, count: int) -> np.ndarray:
     if len(rows) == count:
         return rows
-    # In NumPy: JAX would compile a program for each number of missing rows.
-    rows = np.asarray(rows)
     return np.concatenate([rows, np.broadcast_to(rows[-1:], (count - len(rows), *rows.shape[1:]))])
 
 
 def _pad_keys(keys: Key[Array, " lanes"], count: int) -> Key[Array, " count"]:
     if len(keys) == count:
         return keys
-    data = jnp.asarray(_pad(np.asarray(jax.random.key_data(keys)), count))
-    return jax.random.wrap_key_data(data, impl=IMPLEMENTATION)
+    return as_key(_pad(np.asarray(jax.random.key_data(keys)), count))
+
+
+def _one_key(keys: Key[Array, "*lanes"]) -> Key[Array, ""]:
+    """Return a key, or the only one of several; nothing compiles."""
+    return keys if keys.ndim == 0 else as_key(np.asarray(jax.random.key_data(keys))[0])
 
 
 class EngineMode(NamedTuple):

@@ -65,6 +65,10 @@ class Evaluator:
         """Decisions of the engine that a user may not expect."""
         return self.engine.notes
 
+    def begin_compiling(self) -> None:
+        """Trace now and compile in the background, beside whatever else is compiled."""
+        self.engine.begin_compiling()
+
     def compile(self) -> None:
         """Compile now, so that calls only run."""
         self.engine.compile()

@@ -90,6 +90,9 @@ class HostEngine:
         self.notes: tuple[str, ...] = ()
         self._prepare = jax.jit(self._prepared)
 
+    def begin_compiling(self) -> None:
+        """Do nothing, as `compile`."""
+
     def compile(self) -> None:
         """Do nothing: monitors compile when the first trace shows its length."""
 

@@ -31,6 +31,8 @@ class Inputs(abc.ABC):
     """Whether the simulated features are part of the results."""
     streaming: bool = False
     """Whether the monitor may travel with the rollout, where the system allows it."""
+    purpose: str = "the simulation"
+    """What is simulated, for people who wait until it is compiled."""
 
     @abc.abstractmethod
     def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
@@ -71,6 +73,8 @@ class TableRows(Inputs):
     - `form`: the features of one row, as `jax.ShapeDtypeStruct`s in the engine's precision.
     - `system_at`: the system for the shared number, a `factor` of refinement.
     """
+
+    purpose = "closer replays"
 
     def __init__(self, form: PyTree, system_at: Callable[[Any], Callable[..., Any]]) -> None:
         self.row_form, self.system_at = form, system_at

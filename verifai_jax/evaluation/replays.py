@@ -11,6 +11,7 @@ by JAX, and one program replays at every step.
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache, partial
 
 import jax
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.core.keys import simulation_key
+from verifai_jax.core.keys import as_key, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.text import format_error
@@ -86,7 +87,8 @@ class Replays:
         self.refiner = Refiner(problem.system)
         self.compile_seconds = 0.0
         self._make_keys = jax.jit(jax.vmap(partial(simulation_key, key)))
-        self._any_keys = cache(lambda count: jnp.repeat(key[None], count))
+        data = np.asarray(jax.random.key_data(key))
+        self._any_keys = cache(lambda count: as_key(np.broadcast_to(data, (count, 2))))
         self._form = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), features
         )
@@ -123,6 +125,15 @@ class Replays:
         self.compile_seconds += engine.compile_seconds - compiled
         return Verdicts.concatenate([part._replace(features=None) for part in parts])
 
+    def begin_compiling(self, factor: int, count: int) -> None:
+        """Compile what replays so many rows in the background, beside whatever else is compiled."""
+        engine = self._engine(factor, self._together(count))
+        compiled = engine.compile_seconds
+        # What cannot be traced is told when it is replayed.
+        with suppress(Exception):
+            engine.begin_compiling()
+        self.compile_seconds += engine.compile_seconds - compiled
+
     @staticmethod
     def _together(count: int) -> int:
         """Return how many of so many rows are replayed in one call."""
@@ -134,7 +145,7 @@ class Replays:
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:
             # Any keys will do.
-            return self.key[None] if together == 1 else self._any_keys(together)
+            return self._any_keys(together)
         # Always as many, so that one program makes the keys.
         many = numbers[np.minimum(np.arange(together), len(numbers) - 1)]
         return self._make_keys(jnp.asarray(many, jnp.int32))
@@ -178,6 +189,9 @@ class HostReplays:
         self.refiner = Refiner(problem.system)
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
+
+    def begin_compiling(self, factor: int, count: int) -> None:
+        """Do nothing: a black box is not compiled."""
 
     def __call__(self, factor: int, features: PyTree, numbers: Int[np.ndarray, " n"]) -> Verdicts:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""

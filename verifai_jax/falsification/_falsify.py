@@ -15,6 +15,7 @@ import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
+from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import check_names, suggests_options
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
@@ -146,9 +147,10 @@ def falsify(
     )  # fmt: skip
     problem = choice.problem
     check_gradient(problem, search)
-    problem.check()
-    search, notes = adapt_search(problem, search)
-    notes += notes_before(problem, search)
+    with tracing():
+        problem.check()
+        search, notes = adapt_search(problem, search)
+        notes += notes_before(problem, search)
     if diverse:
         search = searches.Diverse(search, capacity=max(256, stop_after or 0))
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
@@ -393,7 +395,8 @@ def _run_rounds(
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
-            rounds.compile()
+            with tracing():
+                rounds.compile(resumed)
             if not resumed:
                 notes = (*notes, *nominal_note(problem, rounds.evaluate, search))
             for note in notes:

@@ -23,7 +23,7 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Diverse, Search
-from verifai_jax.search.proposals import Proposals
+from verifai_jax.search.proposals import Proposals, compiled_search
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,15 +93,20 @@ class Rounds:
         self._proposals: Any = None
         self._saved = time.perf_counter()
 
-    def compile(self) -> None:
-        """Compile the engine and the search."""
+    def compile(self, resumed: bool = False) -> None:
+        """Compile the engine and the search, side by side.
+
+        - `resumed`: whether the first round is one of any kind; a new run begins with gradients
+          where the search wants those of clauses.
+        """
+        space = self.problem.space
+        compiled_search(self.search, space.cube, self.batch)
+        self.evaluate.begin_compiling()
+        if self._differentiate is not None and not resumed:
+            self._differentiate.begin_compiling()
         self.evaluate.compile()
         self._proposals = Proposals(
-            self.search,
-            self.problem.space.cube,
-            self.batch,
-            self.search_key,
-            self.problem.space.constraint,
+            self.search, space.cube, self.batch, self.search_key, space.constraint
         )
         self._keep()
 

@@ -10,6 +10,7 @@ Each is a sentence that is true of the run, for its `notes` and so for its summa
 import math
 from collections.abc import Mapping
 
+import jax
 import numpy as np
 
 from verifai_jax.core.programs import Slot
@@ -81,7 +82,8 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     space = problem.space
     nominal = problem.nominal or {}
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
-    u = np.asarray(space.point_of(space.coerce(varied)), np.float32)
+    # One program for it, where each step on its own would compile another.
+    u = np.asarray(jax.jit(lambda: space.flatten(varied))(), np.float32)
     verdict = engine.evaluate(u[None], evaluate.key, 0)
     if not verdict.violated[0]:
         return ()

@@ -113,6 +113,11 @@ class FeatureSpace:
         """Number of unit coordinates."""
         return len(self.levels)
 
+    @property
+    def point_form(self) -> jax.ShapeDtypeStruct:
+        """Shape and type of a point of the unit cube, for abstract evaluation."""
+        return jax.ShapeDtypeStruct((self.dim,), jnp.result_type(float))
+
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""

@@ -25,18 +25,18 @@ def has_gradient(problem: Problem) -> bool:
 
 @truncate_silently()
 def _depends(problem: Problem) -> bool:
-    key = jax.random.key(0)
+    key = jax.eval_shape(lambda: jax.random.key(0))
 
-    def signals(u: Array) -> list[Array]:
+    def signals(u: Array, key: Array) -> list[Array]:
         trace = problem.system(problem.space.unflatten(u), key)
         found = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
         return [signal for signal in found if jnp.issubdtype(signal.dtype, jnp.inexact)]
 
-    def along(u: Array, direction: Array) -> list[Array]:
-        return jax.jvp(signals, (u,), (direction,))[1]
+    def along(u: Array, direction: Array, key: Array) -> list[Array]:
+        return jax.jvp(lambda u: signals(u, key), (u,), (direction,))[1]
 
-    u = jnp.zeros(problem.space.dim)
-    program = jax.make_jaxpr(along)(u, u).jaxpr
+    u = problem.space.point_form
+    program = jax.make_jaxpr(along)(u, u, key).jaxpr
     # Which values depend on the direction: a forward sweep over the steps of the program.
     moved = {program.invars[1]}
     for step in program.eqns:

@@ -12,7 +12,6 @@ from itertools import pairwise
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
@@ -135,7 +134,7 @@ class Problem:
         """
         if self.black_box:
             return False
-        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
         key = jax.eval_shape(lambda: jax.random.key(0))
         program = jax.make_jaxpr(lambda key, features: self.system(features, key))(key, features)
         drawn = program.jaxpr.invars[0]
@@ -178,7 +177,7 @@ class Problem:
         returns no `Trace`; what the monitor says for a formula over a signal that the system does
         not produce.
         """
-        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
         try:
             self.system.check(features)
         except ValueError:
@@ -208,7 +207,7 @@ class Problem:
 
     @truncate_silently()
     def _form(self) -> Trace | None:
-        features = jax.eval_shape(self.space.unflatten, jnp.zeros(self.space.dim))
+        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
         try:
             trace = self.system.abstract(features)
         except Exception as error:

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jax.interpreters import partial_eval
@@ -104,7 +103,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
     """Yield what two tracings of the system show; nothing for one that is not quick to trace."""
     if problem.black_box or not traced_by_default(problem.system):
         return
-    features = jax.eval_shape(problem.space.unflatten, jnp.zeros(problem.space.dim))
+    features = jax.eval_shape(problem.space.unflatten, problem.space.point_form)
     key = jax.eval_shape(lambda: jax.random.key(0))
     started = time.perf_counter()
     program = _program(problem, features, key)

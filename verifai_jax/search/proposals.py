@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.compilation import Compilation, compile_soon, tracing
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Diverse, Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_own
@@ -55,7 +56,7 @@ class Proposals:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
-        self._program = _program(search, self.cube, batch)
+        self._program = compiled_search(search, self.cube, batch)
         self._checked = is_own(search)
         self._accepts = accepts
         if self._accepts is not None:
@@ -280,7 +281,7 @@ class Proposals:
         )
 
 
-class _Program(NamedTuple):
+class SearchProgram(NamedTuple):
     """Compiled functions of a search."""
 
     init: Callable[..., PyTree]
@@ -291,12 +292,15 @@ class _Program(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _program(search: Search, cube: Cube, batch: int) -> _Program:
-    """Compile `init / ask / tell` of one search on one cube."""
+@tracing()
+def compiled_search(search: Search, cube: Cube, batch: int) -> SearchProgram:
+    """Compile `init / ask / tell` of one search on one cube, in the background, side by side."""
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
-    init = jax.jit(lambda key: search.init(key, cube, batch)).lower(key).compile()
-    state = jax.eval_shape(lambda key: search.init(key, cube, batch), key)
-    ask = jax.jit(lambda state: search.ask(state, cube, batch)).lower(state).compile()
+    begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
+    state: Any = begun.out_info
+    # What takes longest to compile begins first.
+    ask = _compiled(lambda state: search.ask(state, cube, batch), state)
+    init = compile_soon("the search", begun.lower())
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
@@ -307,12 +311,15 @@ def _program(search: Search, cube: Cube, batch: int) -> _Program:
             clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
             clause_gradients=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
         )
-        plan = jax.jit(lambda state: search.plan(state, cube, batch)).lower(state).compile()
+        plan = _compiled(lambda state: search.plan(state, cube, batch), state)
     tell: Any = None
     if search.learns:
-        tell = jax.jit(lambda state, rows: search.tell(state, cube, rows))
-        tell = tell.lower(state, observations).compile()
+        tell = _compiled(lambda state, rows: search.tell(state, cube, rows), state, observations)
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants_gradient:
-        temperature = jax.jit(search.temperature).lower(state).compile()
-    return _Program(init, ask, tell, temperature, plan)
+        temperature = _compiled(search.temperature, state)
+    return SearchProgram(init, ask, tell, temperature, plan)
+
+
+def _compiled(function: Callable[..., Any], *arguments: PyTree) -> Compilation:
+    return compile_soon("the search", jax.jit(function).lower(*arguments))
