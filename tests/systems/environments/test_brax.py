@@ -369,6 +369,25 @@ def test_names_in_the_environments_of_brax():
 
 
 @pytest.mark.thorough
+def test_friction_of_a_geom_and_gear_of_an_actuator():
+    def hop(**features):
+        return brax("hopper", lambda o: jnp.zeros(3), steps=3, backend="mjx", features=features)
+
+    places = hop(rough="geom_friction[floor, 0]", gear="actuator_gear[1, 0]").features
+    assert [str(place) for place in places.values()] == [
+        "geom_friction[0, 0]",
+        "actuator_gear[1, 0]",
+    ]
+    # The advice must not be what was given.
+    with pytest.raises(ValueError, match=r"name one entry, as in 'geom_friction\[0, 0\]'"):
+        jax.eval_shape(hop(rough="geom_friction[floor]"), {"rough": 1.0}, KEY)
+    with pytest.raises(ValueError, match=r"has shape \[5, 3\], and \[floor, 0, 0\] names 3 ind"):
+        hop(rough="geom_friction[floor, 0, 0]")
+    with pytest.raises(ValueError, match="geom_friction of hopper has 3 entries; got the number 3"):
+        hop(rough="geom_friction[floor, 3]")
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("backend", "path"), [("spring", "link.inertia.mass[pole]"), ("mjx", "body_mass[pole]")]
 )

@@ -25,6 +25,11 @@ from verifai_jax.systems.environments.episode import (
 KEY = jax.random.key(1)
 
 
+def without_features(policy):
+    decide = policy_function(policy)
+    return lambda time, observation, memory, key: decide(observation, memory, key, {})
+
+
 def tank(level, **changes):
     """A tank that empties (Torricelli) and is over when it is empty; below that its rate is NaN."""
 
@@ -36,7 +41,7 @@ def tank(level, **changes):
         "name": "tank",
         "start": lambda key: Moment(level, level[None], 0, False),
         "step": step,
-        "decide": policy_function(lambda observation: 0.0),
+        "decide": without_features(lambda observation: 0.0),
         "memory": None,
         "signals": lambda time, moment, action: {"level": moment.state, "time": time},
         "steps": 30,
@@ -134,7 +139,7 @@ def test_random_policies_get_a_key_of_each_step():
     def signals(time, moment, action):
         return {"action": action}
 
-    decide = policy_function(lambda observation, key: jax.random.normal(key))
+    decide = without_features(lambda observation, key: jax.random.normal(key))
     trace = rollout(tank(jnp.float32(9.0), decide=decide, signals=signals), KEY)
     for k in range(31):
         seen.append(jax.random.normal(jax.random.fold_in(episode_keys(KEY).decide, k)))
@@ -153,14 +158,17 @@ class Actor:
 
 def test_forms_of_a_policy():
     seen, key = jnp.array([2.0]), KEY
-    assert policy_function(Actor())(seen, None, key) == (2.0, None)
-    assert policy_function(jax.jit(lambda o: o[0]))(seen, None, key)[0] == 2.0
-    assert policy_function(functools.partial(lambda a, o: a, 3.0))(seen, None, key)[0] == 3.0
-    assert policy_function(lambda *a: len(a))(seen, None, key)[0] == 1
-    assert policy_function(lambda o, scale=2: scale * o[0])(seen, None, key)[0] == 4.0
-    assert policy_function(lambda o, k: k is key)(seen, None, key)[0] is True
-    assert policy_function(lambda o, m: (o[0], m + 1), 0)(seen, 5, key) == (2.0, 6)
-    assert policy_function(lambda o, m, k: (k is key, m), 0)(seen, 5, key) == (True, 5)
+    assert policy_function(Actor())(seen, None, key, {}) == (2.0, None)
+    assert policy_function(jax.jit(lambda o: o[0]))(seen, None, key, {})[0] == 2.0
+    assert policy_function(functools.partial(lambda a, o: a, 3.0))(seen, None, key, {})[0] == 3.0
+    assert policy_function(lambda *a: len(a))(seen, None, key, {})[0] == 1
+    assert policy_function(lambda o, scale=2: scale * o[0])(seen, None, key, {})[0] == 4.0
+    assert policy_function(lambda o, k: k is key)(seen, None, key, {})[0] is True
+    assert policy_function(lambda o, m: (o[0], m + 1), 0)(seen, 5, key, {}) == (2.0, 6)
+    assert policy_function(lambda o, m, k: (k is key, m), 0)(seen, 5, key, {}) == (True, 5)
+    gain = {"gain": 4.0}
+    assert policy_function(lambda o, features: features["gain"])(seen, None, key, gain)[0] == 4.0
+    assert policy_function(lambda o, k, *, features: k is key)(seen, None, key, gain)[0] is True
     with pytest.raises(ValueError, match=r"\(observation, memory\) or .*; got one of 1 arguments"):
         policy_function(lambda o: o, 0)
 

@@ -38,6 +38,7 @@ from verifai_jax.systems.environments.brax_model import (
     with_system,
     with_value,
 )
+from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -48,6 +49,7 @@ from verifai_jax.systems.environments.episode import (
     fold,
     has_waveforms,
     policy_function,
+    policy_that_sees,
     read_signals,
     rollout,
     sampling_period,
@@ -79,6 +81,8 @@ class Brax(System):
     initial: Mapping[str, Place] | Callable[..., Any] | None
     signals: Any
     exact_step: bool = True
+    observation_delay: Delay = NO_DELAY
+    action_delay: Delay = NO_DELAY
 
     @property
     def duration(self) -> float:
@@ -158,12 +162,23 @@ class Brax(System):
 
         decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
 
-        def decide_checked(observation: PyTree, memory: PyTree, key: Key[Array, ""]) -> Any:
-            action, memory = decide(observation, memory, key)
+        def decide_checked(
+            time: Time, observation: PyTree, memory: PyTree, key: Key[Array, ""]
+        ) -> Any:
+            now = features_at(features, time)
+            action, memory = decide(observation, memory, key, now)
             return vector_action(action, size, self.name), memory
 
         return Episode(
-            self.name, start, step, decide_checked, self.policy_memory, sample, self.steps, self.dt
+            self.name,
+            start,
+            step,
+            decide_checked,
+            self.policy_memory,
+            sample,
+            self.steps,
+            self.dt,
+            Delays.under(self.observation_delay, self.action_delay, features),
         )
 
     def _configure(self, features: Features, time: Time) -> Any:
@@ -198,10 +213,11 @@ class Brax(System):
         **Raises:** `UnknownNameError`, `ValueError`.
         """
         starts = self.initial if isinstance(self.initial, Mapping) else {}
+        delays = (*self.observation_delay.features, *self.action_delay.features)
         check_features(
             features,
-            [*self.features, *starts],
-            (self.configure, self.signals, self.initial),
+            [*self.features, *starts, *delays],
+            (self.configure, self.signals, self.initial, policy_that_sees(self.policy)),
             self.name,
             "features={feature: part of the system} or initial={feature: 'q[0]'}",
         )
@@ -223,6 +239,8 @@ def brax(
     policy_memory: PyTree = None,
     options: Mapping[str, object] | None = None,
     exact_step: bool = True,
+    observation_delay: DelayOption = 0,
+    action_delay: DelayOption = 0,
 ) -> Brax:
     """Make a system `(features, key) -> Trace` from an environment of Brax and a policy.
 
@@ -230,7 +248,8 @@ def brax(
 
     - `env`: the name of an environment, or an `Env` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
-      function, or an object with a method `act`, such as an `rl.Policy`.
+      function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
+      gets the features of the instant.
     - `steps`: of the episode at most, or `duration` in seconds. The trace has a sample after the
       reset and after each step, and its last valid sample is the one at which the environment is
       done.
@@ -239,7 +258,9 @@ def brax(
     - `features`: which feature sets which part of the environment's `sys`, by attributes joined by
       dots: `{"gravity": "opt.gravity[2]", "mass": "link.inertia.mass[pole]"}`. An entry is named by
       its number; of a link (`link...`) or of MuJoCo's arrays (`body_...`, `geom_...`) also by the
-      name that the model gives it. Nothing that was once derived from it is computed again.
+      name that the model gives it, and of an array of rows by two: `geom_friction[floor, 0]` is how
+      rough the floor is, `actuator_gear[knee, 0]` a gear (backend mjx). Nothing that was once
+      derived from it is computed again.
     - `configure(sys, features) -> sys`: for anything else; for an environment without `sys`,
       `(env, features) -> env`, with a copy of it.
     - `initial`: which feature sets which entry of the initial position or velocity, by number or by
@@ -257,6 +278,9 @@ def brax(
       confirmed against in double precision and under rounding. False to take the step for an
       approximation of continuous bodies: counterexamples are then also replayed at a half and a
       quarter of it (backends generalized and mjx).
+    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
+      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
+      feature says. Before that it sees the first observation, and no action is zeros.
 
     A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
 
@@ -310,6 +334,8 @@ def brax(
         initial=starts,  # pyright: ignore[reportArgumentType]
         signals=signals,
         exact_step=exact_step,
+        observation_delay=as_delay(observation_delay, "observation_delay"),
+        action_delay=as_delay(action_delay, "action_delay"),
     )
 
 

@@ -8,6 +8,7 @@
 One trace is one episode: it is never reset within.
 """
 
+import copy
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +22,12 @@ from verifai_jax.core.errors import check_names, require, suggests_options, unkn
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
+from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_signals_option,
+    features_at,
+    policy_that_sees,
     read_signals,
     sampling_period,
 )
@@ -57,6 +61,8 @@ class EpisodeFunction:
     configure: Callable[..., None] | None
     reset: Callable[..., Any] | None
     dt: float | None
+    observation_delay: Delay = NO_DELAY
+    action_delay: Delay = NO_DELAY
 
     def __post_init__(self) -> None:
         self._env: Any = None
@@ -84,8 +90,14 @@ class EpisodeFunction:
             self.policy.reset()
         changes = any(is_waveform(features[name]) for name in self.features)
         reward, over, rows = 0.0, False, []
+        wait, lag = (self._delay(d, features) for d in (self.observation_delay, self.action_delay))
+        observations, actions = [], [_no_action(env.action_space)] * lag
         for k in range(self.steps + 1):
-            action = self._act(env, observation)
+            # Copied: an environment may write its next observation into the same array.
+            observations.append(copy.deepcopy(observation) if wait else observation)
+            observed = observations[max(0, k - wait)]
+            actions.append(self._act(env, observed, features, k * dt))
+            action = actions[k]
             rows.append(self._sample(env, observation, action, reward, features))
             if over or k == self.steps:
                 break
@@ -109,7 +121,8 @@ class EpisodeFunction:
 
         **Raises:** `UnknownNameError`.
         """
-        check_names(f"feature that sets {self.name}", self.features, features)
+        delays = (*self.observation_delay.features, *self.action_delay.features)
+        check_names(f"feature that sets {self.name}", (*self.features, *delays), features)
         known = [name for name in vars(self.environment.unwrapped) if not name.startswith("_")]
         check_names(f"attribute of {self.name}", self.features.values(), known)
 
@@ -165,10 +178,25 @@ class EpisodeFunction:
             )
         return started
 
-    def _act(self, env: Env, observation: object) -> Any:
+    def _delay(self, delay: Delay, features: Mapping[str, Any]) -> int:
+        """Return a delay in steps.
+
+        **Raises:** `ValueError` for a feature that says none.
+        """
+        steps = np.asarray(delay.steps(features))
+        if steps.shape != () or not bool(delay.valid(features)):
+            raise ValueError(
+                f"feature {delay.feature!r} of {self.name} must be a whole number of steps from 0 "
+                f"to {delay.most}; got {steps}"
+            )
+        return int(steps)
+
+    def _act(self, env: Env, observation: object, features: Mapping[str, Any], time: float) -> Any:
         if self._decide is None:
             self._decide = _policy_function(self.policy)
-        action, space = self._decide(observation), env.action_space
+        sees = policy_that_sees(self.policy) is not None
+        options = {"features": features_at(features, time)} if sees else {}
+        action, space = self._decide(observation, **options), env.action_space
         array = np.asarray(action)
         if hasattr(space, "n"):
             if array.shape != () or array != np.floor(array):
@@ -213,6 +241,8 @@ def gymnasium(
     workers: int | None = None,
     timeout: float | None = None,
     retries: int = 1,
+    observation_delay: DelayOption = 0,
+    action_delay: DelayOption = 0,
 ) -> BlackBox | PooledBlackBox:
     """Make a black box from an environment of Gymnasium and a policy.
 
@@ -221,7 +251,8 @@ def gymnasium(
     - `env`: the id of a registered environment, or a function that makes one; it is called once in
       each process.
     - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
-      `rl.Policy`. One that remembers something has a method `reset()`, called before each episode.
+      `rl.Policy`. An argument `features` gets the features of the instant. One that remembers
+      something has a method `reset()`, called before each episode.
     - `steps`: of the episode at most. The trace has a sample after the reset and after each step;
       the last valid one is that at which the environment terminates or is truncated (by its own
       time limit, too). Each sample has the action that is taken there, and the reward of the step
@@ -238,6 +269,9 @@ def gymnasium(
       the features say; `env.reset(seed=seed)` when left out.
     - `dt`: seconds of a step; the environment's attribute `dt` or `tau` when left out, or 1.
     - `workers`, `timeout`, `retries`: see `blackbox`.
+    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
+      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
+      feature says. Before that it sees the first observation, and no action is zeros.
 
     **Returns:** a black box, with `workers` one in processes of its own; one episode is one
     simulation.
@@ -257,10 +291,24 @@ def gymnasium(
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
     seconds = None if dt is None else sampling_period(dt)
     episode = EpisodeFunction(
-        env, policy, steps, signals, dict(bindings), configure, reset, seconds
+        env,
+        policy,
+        steps,
+        signals,
+        dict(bindings),
+        configure,
+        reset,
+        seconds,
+        as_delay(observation_delay, "observation_delay"),
+        as_delay(action_delay, "action_delay"),
     )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
+
+
+def _no_action(space: Any) -> Any:
+    """Return what an environment does before the first action has arrived."""
+    return 0 if hasattr(space, "n") else np.zeros(space.shape, space.dtype)
 
 
 def _arrays(observation: object) -> Any:
@@ -269,7 +317,7 @@ def _arrays(observation: object) -> Any:
     return np.asarray(observation)
 
 
-def _policy_function(policy: object, compiled: bool = True) -> Callable[[Any], Any]:
+def _policy_function(policy: object, compiled: bool = True) -> Callable[..., Any]:
     act = getattr(policy, "act", None)
     function = act if callable(act) else policy
     if not callable(function):

@@ -27,6 +27,7 @@ from verifai_jax.core.errors import (
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -37,6 +38,7 @@ from verifai_jax.systems.environments.episode import (
     fold,
     has_waveforms,
     policy_function,
+    policy_that_sees,
     read_signals,
     rollout,
     sampling_period,
@@ -81,6 +83,8 @@ class Gymnax(System):
     initial: Mapping[str, str] | Callable[..., Any] | None
     signals: Any
     truncate: bool
+    observation_delay: Delay = NO_DELAY
+    action_delay: Delay = NO_DELAY
 
     @property
     def duration(self) -> float:
@@ -138,8 +142,11 @@ class Gymnax(System):
 
         decide = policy_function(self.policy, self.policy_memory)
 
-        def decide_checked(observation: PyTree, memory: PyTree, key: Key[Array, ""]) -> Any:
-            action, memory = decide(observation, memory, key)
+        def decide_checked(
+            time: Time, observation: PyTree, memory: PyTree, key: Key[Array, ""]
+        ) -> Any:
+            now = features_at(features, time)
+            action, memory = decide(observation, memory, key, now)
             return _as_action(action, self.env.action_space(self.params), self.env.name), memory
 
         return Episode(
@@ -151,6 +158,7 @@ class Gymnax(System):
             sample,
             self.steps,
             self.dt,
+            Delays.under(self.observation_delay, self.action_delay, features),
         )
 
     def _configure(self, features: Features, time: Time) -> Any:
@@ -191,10 +199,11 @@ class Gymnax(System):
         **Raises:** `UnknownNameError`, `ValueError`.
         """
         starts = self.initial if isinstance(self.initial, Mapping) else {}
+        delays = (*self.observation_delay.features, *self.action_delay.features)
         check_features(
             features,
-            [*self.features, *starts],
-            (self.configure, self.signals, self.initial),
+            [*self.features, *starts, *delays],
+            (self.configure, self.signals, self.initial, policy_that_sees(self.policy)),
             self.env.name,
             "features={feature: parameter} or initial={feature: part of the state}",
         )
@@ -215,6 +224,8 @@ def gymnax(
     params: Params | None = None,
     policy_memory: PyTree = None,
     truncate: bool = False,
+    observation_delay: DelayOption = 0,
+    action_delay: DelayOption = 0,
 ) -> Gymnax:
     """Make a system `(features, key) -> Trace` from an environment of gymnax and a policy.
 
@@ -222,7 +233,8 @@ def gymnax(
 
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
-      function, or an object with a method `act`, such as an `rl.Policy`.
+      function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
+      gets the features of the instant.
     - `steps`: of the episode at most, or `duration` in seconds; the environment's own
       `max_steps_in_episode` when left out. The trace has a sample after the reset and after each
       step, and its last valid sample is the one at which the environment is over.
@@ -240,6 +252,9 @@ def gymnax(
     - `policy_memory`: what a policy with memory remembers at first. It is then called
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
     - `truncate`: end also where the environment's time limit would cut the episode off.
+    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
+      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
+      feature says. Before that it sees the first observation, and no action is zeros.
 
     A `Signal` feature reaches parameters and functions as its value at the beginning of the step.
     Environments that support gradients are asked for them; differentiating any other raises.
@@ -303,6 +318,8 @@ def gymnax(
         initial=initial,
         signals=signals,
         truncate=truncate,
+        observation_delay=as_delay(observation_delay, "observation_delay"),
+        action_delay=as_delay(action_delay, "action_delay"),
     )
 
 

@@ -38,13 +38,14 @@ _ROWS = {
 
 
 class Place(NamedTuple):
-    """An array somewhere in a Brax system, or one entry of it."""
+    """An array somewhere in a Brax system, or a row or one entry of it."""
 
     parts: tuple[str, ...]
-    index: int | None
+    index: tuple[int, ...] | None
 
     def __str__(self) -> str:
-        return ".".join(self.parts) + ("" if self.index is None else f"[{self.index}]")
+        index = "" if self.index is None else f"[{', '.join(map(str, self.index))}]"
+        return ".".join(self.parts) + index
 
 
 @contextlib.contextmanager
@@ -69,7 +70,7 @@ def explain_errors(env: Env, name: str, what: str, backend: str | None = None) -
 
 
 def system_place(env: Env, path: str, name: str) -> Place:
-    """Return the place of a path such as `link.inertia.mass[pole]`.
+    """Return the place of a path such as `link.inertia.mass[pole]` or `geom_friction[floor, 0]`.
 
     **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
     environment without `sys`, or a part that holds no numbers.
@@ -101,7 +102,16 @@ def system_place(env: Env, path: str, name: str) -> Place:
         return Place(parts, None)
     if np.ndim(leaf) == 0:
         raise ValueError(f"{'.'.join(parts)} of {name} is one number and has no entry {text!r}")
-    return Place(parts, _row(text, parts, np.shape(leaf)[0], _row_names(sys, parts), name))
+    row, *columns = (entry.strip() for entry in text.split(","))
+    if len(columns) >= np.ndim(leaf):
+        raise ValueError(
+            f"{'.'.join(parts)} of {name} has shape {list(np.shape(leaf))}, and [{text}] names "
+            f"{len(columns) + 1} indices"
+        )
+    index = [_row(row, parts, np.shape(leaf)[0], _row_names(sys, parts), name)]
+    for axis, column in enumerate(columns, 1):
+        index.append(_row(column, parts, np.shape(leaf)[axis], {}, name))
+    return Place(parts, tuple(index))
 
 
 def _paths(sys: BraxSystem) -> list[str]:
@@ -157,7 +167,7 @@ def joint_place(env: Env, path: str, name: str) -> Place:
         for i in range(model.njnt):
             if int(model.jnt_type[i]) in single:
                 named[mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, i)] = int(first[i])
-    return Place((part,), _row(match.group(2), (part,), length, named, name))
+    return Place((part,), (_row(match.group(2), (part,), length, named, name),))
 
 
 def with_value(sys: BraxSystem, place: Place, value: ArrayLike, feature: str) -> Any:
@@ -168,9 +178,10 @@ def with_value(sys: BraxSystem, place: Place, value: ArrayLike, feature: str) ->
     old = jnp.asarray(old)
     target = old if place.index is None else old[place.index]
     if jnp.shape(value) != target.shape:
+        entry = (*(place.index or ()), *[0] * target.ndim)
         raise ValueError(
             f"feature {feature!r} has shape {list(jnp.shape(value))} and {place} has "
-            f"{list(target.shape)}; name one entry, as in '{'.'.join(place.parts)}[0]', or use "
+            f"{list(target.shape)}; name one entry, as in '{Place(place.parts, entry)}', or use "
             "configure=(sys, features) -> sys"
         )
     new = jnp.asarray(value, jnp.result_type(old, value))

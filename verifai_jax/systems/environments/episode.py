@@ -23,12 +23,13 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.checkpointing import checkpointed_scan
+from verifai_jax.systems.environments.delays import NO_DELAYS, Delays, Line, through
 from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 
 Time: TypeAlias = Float[Array, ""] | float
 """Seconds since the start of an episode."""
-Decide: TypeAlias = Callable[[PyTree, PyTree, Key[Array, ""]], tuple[PyTree, PyTree]]
-"""A function `(observation, memory, key) -> (action, memory)`."""
+Decide: TypeAlias = Callable[[PyTree, PyTree, Key[Array, ""], Features], tuple[PyTree, PyTree]]
+"""A function `(observation, memory, key, features) -> (action, memory)`."""
 SignalsOption: TypeAlias = (
     Mapping[str, int | str] | Sequence[str] | Callable[..., Mapping[str, Any]] | None
 )
@@ -50,19 +51,21 @@ class Episode:
 
     - `start(key) -> Moment`
     - `step(time, state, action, key) -> Moment`: from the sample at `time` seconds to the next.
-    - `decide(observation, memory, key) -> (action, memory)`: see `policy_function`.
+    - `decide(time, observation, memory, key) -> (action, memory)`: see `policy_function`.
     - `signals(time, moment, action) -> dict`: the samples of the signals.
     - `steps`, `dt`: how many at most, and seconds between two samples.
+    - `delays`: of observations and actions.
     """
 
     name: str
     start: Callable[..., Moment]
     step: Callable[..., Moment]
-    decide: Decide
+    decide: Callable[..., tuple[PyTree, PyTree]]
     memory: Any
     signals: Callable[..., dict[str, Array]]
     steps: int
     dt: float
+    delays: Delays = NO_DELAYS
 
     def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
         """Return the moment after a step, `over` as a truth value."""
@@ -88,12 +91,13 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
     The reward of a sample is that of the step which led to it. The first sample at which the
     episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
-    NaN, or in an observation that is not finite.
+    NaN, or in an observation that is not finite, and `ERROR` if a delay is none that it may be.
 
     **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
     """
     last, age, _, samples = _run(episode, key, None, lambda _, sample: (None, sample))
-    return Trace(samples, dt=episode.dt, valid=age + 1, status=_status(last), held=True)
+    status = _status(last, episode.delays.valid)
+    return Trace(samples, dt=episode.dt, valid=age + 1, status=status, held=True)
 
 
 def fold(
@@ -107,7 +111,7 @@ def fold(
     Behind the end the last valid sample comes again. **Returns:** the last carry, and the status.
     """
     last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
-    return carry, _status(last)
+    return carry, _status(last, episode.delays.valid)
 
 
 def _run(
@@ -118,42 +122,50 @@ def _run(
 ) -> tuple[Moment, Any, Any, Any]:
     """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
-    first, memory = _first_moment(episode, episode.start(keys.start), keys)
+    first, memory, lines = _first_moment(episode, episode.start(keys.start), keys)
+    delays = episode.delays
 
     def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
-        (moment, memory, age), collected = carry
+        (moment, memory, (observations, actions), age), collected = carry
         frozen = (k >= episode.steps) | moment.over
         # Time, and with it randomness, stops with the state: the samples behind the end repeat.
         time = age.astype(float) * episode.dt
         decide_key, step_key = (jax.random.fold_in(k, age) for k in (keys.decide, keys.step))
-        action, after = episode.decide(moment.observation, memory, decide_key)
+        observed, observations = through(observations, moment.observation, delays.observation)
+        action, after = episode.decide(time, observed, memory, decide_key)
+        action, actions = through(actions, action, delays.action)
         collected, output = collect(collected, episode.signals(time, moment, action))
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.next_moment(time, state, action, step_key), moment)
-        return (_where(frozen, carry[0], (following, after, age + 1)), collected), output
+        onwards = (following, after, (observations, actions), age + 1)
+        return (_where(frozen, carry[0], onwards), collected), output
 
     # One iteration more than there are steps samples the end and moves nothing.
-    ((last, _, age), collected), outputs = checkpointed_scan(
-        sample, ((first, memory, jnp.int32(0)), collected), episode.steps + 1
+    ((last, _, _, age), collected), outputs = checkpointed_scan(
+        sample, ((first, memory, lines, jnp.int32(0)), collected), episode.steps + 1
     )
     return last, age, collected, outputs
 
 
-def _status(last: Moment) -> Int[Array, ""]:
+def _status(last: Moment, valid: Bool[Array, ""] | bool) -> Int[Array, ""]:
     sound = jnp.array(True)
     for leaf in _floats(last):
         sound &= ~jnp.any(jnp.isnan(leaf))
     for leaf in _floats((last.observation, last.reward)):
         sound &= jnp.all(jnp.isfinite(leaf))
-    return jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+    status = jnp.where(sound, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+    return jnp.where(valid, status, jnp.int32(Status.ERROR))
 
 
-def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment, Any]:
-    """Return the first moment and memory in the types that they keep, checked to fit together."""
+def _first_moment(
+    episode: Episode, first: Moment, keys: _Keys
+) -> tuple[Moment, Any, tuple[Line | None, Line | None]]:
+    """Return the first moment, memory and delay lines in the types that they keep, checked."""
     first = jax.tree.map(jnp.asarray, first._replace(over=jnp.asarray(first.over, bool)))
     memory = jax.tree.map(jnp.asarray, episode.memory)
-    action, after = jax.eval_shape(episode.decide, first.observation, memory, keys.decide)
+    now = jnp.zeros(())
+    action, after = jax.eval_shape(episode.decide, now, first.observation, memory, keys.decide)
     check_like(after, memory, "policy", "(action, memory), its memory in the form of policy_memory")
     following = jax.eval_shape(episode.next_moment, jnp.zeros(()), first.state, action, keys.step)
     if jax.tree.structure(first) != jax.tree.structure(following):
@@ -178,17 +190,23 @@ def _first_moment(episode: Episode, first: Moment, keys: _Keys) -> tuple[Moment,
             f"{episode.name}: the reward must be one number; got {outline(first.reward)}"
         )
     check_signals(jax.eval_shape(episode.signals, jnp.zeros(()), first, action))
-    return first, memory
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), action)
+    delays = episode.delays
+    lines = (
+        Line.of(first.observation, delays.most_observation),
+        Line.of(nothing, delays.most_action),
+    )
+    return first, memory, lines
 
 
 def policy_function(policy: object, memory: PyTree = None) -> Decide:
-    """Return a user's policy as `decide(observation, memory, key) -> (action, memory)`.
+    """Return a user's policy as `decide(observation, memory, key, features) -> (action, memory)`.
 
     **Arguments:**
 
     - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
       object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
-      arguments have no default.
+      arguments have no default, and the features of the instant if one is called `features`.
     - `memory`: of a policy with memory at first. It is then called with `(observation, memory)` or
       `(observation, memory, key)` and returns `(action, memory)`.
 
@@ -203,13 +221,16 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     needed = _count_required(function)
     if needed is not None and not len(given) <= needed <= len(given) + 1:
         raise ValueError(f"policy must be a function of {forms}; got one of {needed} arguments")
-    random = needed == len(given) + 1
+    random, sees = needed == len(given) + 1, sees_features(function)
 
-    def decide(observation: PyTree, remembered: PyTree, key: Key[Array, ""]) -> tuple[Any, Any]:
+    def decide(
+        observation: PyTree, remembered: PyTree, key: Key[Array, ""], features: Features
+    ) -> tuple[Any, Any]:
         last = (key,) if random else ()
+        options = {"features": features} if sees else {}
         if memory is None:
-            return function(observation, *last), remembered
-        decided = function(observation, remembered, *last)
+            return function(observation, *last, **options), remembered
+        decided = function(observation, remembered, *last, **options)
         if not (isinstance(decided, tuple) and len(decided) == 2):
             raise ValueError(f"policy must return (action, memory); got {outline(decided)}")
         return decided
@@ -217,8 +238,23 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
     return decide
 
 
+def policy_that_sees(policy: object) -> Callable[..., Any] | None:
+    """Return the function of a policy that is given features; None for one that is not."""
+    act = getattr(policy, "act", None)
+    function = act if callable(act) else policy
+    return function if callable(function) and sees_features(function) else None
+
+
+def sees_features(function: Callable[..., Any]) -> bool:
+    """Return whether a policy has an argument `features`."""
+    try:
+        return "features" in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return False
+
+
 def _count_required(function: Callable[..., Any]) -> int | None:
-    """Count the arguments without a default; None for any number, or an unknown one."""
+    """Count the arguments without a default but `features`; None for any or an unknown number."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -226,7 +262,9 @@ def _count_required(function: Callable[..., Any]) -> int | None:
     if any(p.kind is p.VAR_POSITIONAL for p in parameters):
         return None
     places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return sum(p.kind in places and p.default is p.empty for p in parameters)
+    return sum(
+        p.kind in places and p.default is p.empty and p.name != "features" for p in parameters
+    )
 
 
 def vector_action(action: ArrayLike, size: int, name: str) -> Float[Array, " size"]:

@@ -1,0 +1,122 @@
+"""Delays between an environment and its policy, in whole steps, fixed or by a feature.
+
+brax("hopper", policy, action_delay=2)
+brax("hopper", policy, observation_delay={"latency": 5})    # the feature `latency`, at most 5
+
+A policy decides on the observation of so many steps ago, the first one until there is one of then;
+an action takes effect so many steps after its decision, and until the first one does the
+environment gets zeros (the first of its choices).
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
+
+from verifai_jax.systems.base import Features
+
+DelayOption: TypeAlias = int | Mapping[str, int]
+"""The option of a delay: a number of steps, or `{feature: greatest number of steps}`."""
+
+
+class Delay(NamedTuple):
+    """A delay: of `most` steps, or of as many as `feature` says, `most` at most."""
+
+    most: int = 0
+    feature: str | None = None
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the features that it reads."""
+        return () if self.feature is None else (self.feature,)
+
+    def steps(self, features: Features) -> Any:
+        """Return the number of steps in one simulation; traced where the feature is."""
+        return self.most if self.feature is None else features[self.feature]
+
+    def valid(self, features: Features) -> Any:
+        """Return whether the feature's value is a whole number from 0 to the greatest."""
+        steps = self.steps(features)
+        return (steps >= 0) & (steps <= self.most) & (steps % 1 == 0)
+
+
+NO_DELAY = Delay()
+"""An observation that is seen at once, an action that takes effect at once."""
+
+
+def as_delay(option: DelayOption, name: str) -> Delay:
+    """Read the option `name`.
+
+    **Raises:** `ValueError` for anything but a number of steps or `{feature: greatest number}`.
+    """
+    delay = Delay(option) if isinstance(option, int) else None  # pyright: ignore[reportArgumentType]
+    if isinstance(option, Mapping) and len(option) == 1:
+        ((feature, most),) = option.items()
+        delay = Delay(most, feature)
+    whole = delay is not None and isinstance(delay.most, int) and not isinstance(delay.most, bool)
+    if delay is None or not whole or delay.most < 0 or not isinstance(delay.feature, str | None):
+        raise ValueError(
+            f"{name} must be a number of steps, or one feature with the greatest number of steps "
+            f"that it may say, {{'latency': 5}}; got {option!r}"
+        )
+    return delay
+
+
+class Line(NamedTuple):
+    """The last values of something, the newest first: `[most + 1, ...]` in each leaf."""
+
+    values: PyTree
+
+    @classmethod
+    def of(cls, first: PyTree, most: int) -> "Line | None":
+        """Return a line that holds `first` everywhere; None for no delay, which costs nothing."""
+        if not most:
+            return None
+        repeat = lambda leaf: jnp.repeat(jnp.asarray(leaf)[None], most + 1, axis=0)  # noqa: E731
+        return cls(jax.tree.map(repeat, first))
+
+
+def through(line: Line | None, value: PyTree, steps: Any) -> tuple[PyTree, Line | None]:
+    """Put a value into a line; return the one of `steps` steps ago, and the line after it."""
+    if line is None:
+        return value, None
+
+    def push(values: Array, new: Array) -> Array:
+        return jnp.concatenate([jnp.asarray(new, values.dtype)[None], values[:-1]])
+
+    values = jax.tree.map(push, line.values, value)
+    length = jax.tree.leaves(values)[0].shape[0]
+    index = jnp.clip(jnp.asarray(steps).astype(jnp.int32), 0, length - 1)
+    return jax.tree.map(lambda leaf: leaf[index], values), Line(values)
+
+
+class Delays(NamedTuple):
+    """The delays of one simulation.
+
+    - `observation`, `action`: in steps; traced where a feature says them.
+    - `most_observation`, `most_action`: the greatest that they may be.
+    - `valid`: whether they are within these.
+    """
+
+    observation: Any = 0
+    action: Any = 0
+    most_observation: int = 0
+    most_action: int = 0
+    valid: Bool[Array, ""] | bool = True
+
+    @classmethod
+    def under(cls, observation: Delay, action: Delay, features: Features) -> "Delays":
+        """Return two delays as the features of a simulation have them."""
+        return cls(
+            observation.steps(features),
+            action.steps(features),
+            observation.most,
+            action.most,
+            observation.valid(features) & action.valid(features),
+        )
+
+
+NO_DELAYS = Delays()
+"""Nothing is late."""
