@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.mtl import robustness, satisfied
+from verifai_jax.mtl import hard, robustness, satisfied
+from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
 
 
@@ -118,9 +119,9 @@ def violations(
 
 
 def trace_verdict(
-    problem: Problem, trace: Trace
+    problem: Problem, trace: Trace, semantics: Semantics = hard
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
-    """Return the hard robustness of each formula on one trace, and the status; traced by JAX.
+    """Return the robustness of each formula on one trace, and the status; traced by JAX.
 
     A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN;
     one whose `valid` is no number of its samples, or whose status is none, has status `ERROR`.
@@ -128,7 +129,10 @@ def trace_verdict(
     counted = _counted(trace)
     trace = trace.hold()
     rho = jnp.stack(
-        [robustness(formula, trace, end=problem.end) for formula in problem.formulas.values()]
+        [
+            robustness(formula, trace, semantics, problem.end)
+            for formula in problem.formulas.values()
+        ]
     )
     finite = jnp.array(True)
     for name in problem.monitored:

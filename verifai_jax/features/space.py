@@ -227,6 +227,26 @@ class FeatureSpace:
         self.check(features)
         return self.root.coerce(self._completed(features))
 
+    def convert(self, features: Mapping[str, Any]) -> dict[str, Any]:
+        """Convert features that a person wrote to those that a system sees; pure JAX.
+
+        Their names are checked, and their values are not: JAX may trace them.
+
+        **Arguments:**
+
+        - `features`: as in `coerce`.
+
+        **Returns:** the features as `unflatten` gives them.
+
+        **Raises:** `ValueError` that names the first feature which is unknown or missing.
+        """
+        complete = self._completed(features)
+        check_names("feature", complete, self.domains)
+        missing = [name for name in self.domains if name not in complete]
+        if missing:
+            raise ValueError(f"feature {missing[0]!r} is missing; got {', '.join(features)}")
+        return self.root.coerce(complete)
+
     def check(self, features: Mapping[str, Any]) -> None:
         """Check concrete features; constant, fixed ones and events may be left out.
 

@@ -12,14 +12,17 @@ from itertools import pairwise
 from typing import Any
 
 import jax
+from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import defined_at, explain_user_error, user_line
 from verifai_jax.features import Domain, FeatureSpace
-from verifai_jax.mtl import Formula, parse, robustness
+from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.systems.base import System, as_system
 
@@ -164,6 +167,36 @@ class Problem:
         fixed = {**(self.nominal or {}), **(nominal or {})}
         own = None if self.nominal is None else fixed
         return replace(self, space=self.space.only(*features, nominal=fixed), nominal=own)
+
+    def objective(
+        self,
+        semantics: Semantics = hard,
+        of: str = "unit",
+        key: Key[Array, ""] | None = None,
+        formula: str | None = None,
+    ) -> Callable[..., Float[Array, ""]]:
+        """Return the robustness of one simulation as a pure function, for JAX to transform.
+
+        `jax.grad(problem.objective(mtl.smooth(0.1)))(u)` is its gradient at a point of the unit
+        cube; `jax.vmap` and `jax.jit` work as usual.
+
+        **Arguments:**
+
+        - `semantics`: `mtl.hard`, the margin of the verdict, or `mtl.smooth(temperature)`.
+        - `of`: what it is a function of: `"unit"`, a point `[dim]` of the unit cube, or
+          `"features"`, a dictionary by name.
+        - `key`: random key of the simulation; `jax.random.key(0)` when left out.
+        - `formula`: name of the one formula to evaluate; the least over all when left out.
+
+        **Returns:** a function `(point, key=key)` to a scalar: positive where the property holds,
+        NaN where the simulation has no verdict. Whether a point lies in its domains, and keeps the
+        constraint of the space, is not checked.
+
+        **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
+        `of` or a formula that there is not; what `check` raises.
+        """
+        function = late("verifai_jax.evaluation.objective", "objective")
+        return function(self, semantics, of, key, formula)
 
     @truncate_silently()
     def check(self) -> None:

@@ -1,0 +1,62 @@
+"""The code of the pages runs as it stands there, block after block, in an empty folder.
+
+A comment before a block says where it cannot: `<!-- needs PACKAGE -->` runs it where the package is
+installed, `<!-- not run: why -->` compiles it only.
+"""
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = ("robustness_function",)
+BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
+
+
+class Block(NamedTuple):
+    """A block of code, the number of its first line, and what stands before it."""
+
+    code: str
+    line: int
+    mark: str | None
+    about: str | None
+
+    @property
+    def runs(self) -> bool:
+        """True where the block is to be executed here."""
+        if self.mark == "needs":
+            return importlib.util.find_spec(str(self.about)) is not None
+        return self.mark is None
+
+
+def blocks(page: str) -> list[Block]:
+    """Return the blocks of Python on a page."""
+    text = (DOCS / f"{page}.md").read_text()
+    return [
+        Block(found[3], text.count("\n", 0, found.start(3)), found[1], found[2])
+        for found in BLOCK.finditer(text)
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_is_python(page):
+    found = blocks(page)
+    assert found
+    assert len(found) == (DOCS / f"{page}.md").read_text().count("```python")
+    for block in found:
+        compile(block.code, page, "exec")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", PAGES)
+def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {"__name__": page}
+    for block in blocks(page):
+        if block.runs:
+            # Lines of an error are those of the page.
+            code = "\n" * block.line + block.code
+            exec(compile(code, str(DOCS / f"{page}.md"), "exec"), names)
