@@ -68,32 +68,71 @@ class Waveform:
     """A function of time by its control points: the form in which a `Signal` feature arrives.
 
     `wind(time)`, in seconds; `wind.over(4.0)(time)` where the feature has no duration. With `hold`
-    `"linear"` the first control point is the value at 0 and the last that at the end; with
-    `"constant"` each is held for an equal part of the duration.
+    `"linear"` and `"pchip"` (a monotone cubic) the first control point is the value at 0 and the
+    last that at the end; with `"constant"` each is held for an equal part of the duration, with
+    `"pulse"` for `width` seconds of it, and the value is 0 for the rest. `times` are those of the
+    control points, where they are not at equal distances.
     """
 
     def __init__(
-        self, knots: Sequence[float] | np.ndarray, hold: str, duration: float | None
+        self,
+        knots: Sequence[float] | np.ndarray,
+        hold: str,
+        duration: float | None,
+        times: Sequence[float] | None = None,
+        width: float | None = None,
     ) -> None:
         self.knots, self.hold, self.duration = np.asarray(knots, np.float64), hold, duration
+        self.times, self.width = times, width
 
     def over(self, duration: float) -> "Waveform":
         """Return the same control points over so many seconds."""
-        return Waveform(self.knots, self.hold, float(duration))
+        return Waveform(self.knots, self.hold, float(duration), self.times, self.width)
 
     def __call__(self, time: float) -> Any:
         """Return the value at a time in seconds; the first and the last hold beyond the ends."""
-        if self.duration is None:
+        if self.duration is None and self.times is None:
             raise ValueError("this signal has no duration: call features[...].over(seconds)(time)")
-        count = len(self.knots)
-        place = time / self.duration
-        if self.hold == "constant" or count == 1:
-            return self.knots[min(max(int(np.floor(place * count + 1e-5)), 0), count - 1)]
-        place = min(max(place, 0.0), 1.0) * (count - 1)
-        left = min(int(place), count - 2)
-        begin, end, share = self.knots[left], self.knots[left + 1], place - left
+        count, held = len(self.knots), self.hold in ("constant", "pulse")
+        if self.times is not None:
+            times = np.asarray(self.times, float)
+        else:
+            times = np.linspace(0, self.duration, count + held)[:count]  # pyright: ignore[reportArgumentType, reportCallIssue]
+        gaps = np.diff(times)
+        if held:
+            shortest = gaps.min() if count > 1 else self.duration or 1.0
+            late = time + 1e-5 * shortest
+            piece = max(int(np.searchsorted(times, late, side="right")) - 1, 0)
+            width = shortest / 2 if self.width is None else self.width
+            on = self.hold == "constant" or 0 <= late - times[piece] < width
+            return self.knots[piece] if on else 0 * self.knots[piece]
+        if count == 1:
+            return self.knots[0]
+        left = min(max(int(np.searchsorted(times, time, side="right")) - 1, 0), count - 2)
+        share = min(max((time - times[left]) / gaps[left], 0.0), 1.0)
+        begin, end = self.knots[left], self.knots[left + 1]
         value = begin * (1 - share) + end * share
+        if self.hold == "pchip" and count > 2:
+            first, last = self._slope(gaps, left), self._slope(gaps, left + 1)
+            value = begin * (1 + 2 * share) * (1 - share) ** 2 + end * share**2 * (3 - 2 * share)
+            bent = first * (1 - share) - last * share
+            value = value + gaps[left] * share * (1 - share) * bent
         return np.clip(value, np.minimum(begin, end), np.maximum(begin, end))
+
+    def _slope(self, gaps: np.ndarray, i: int) -> Any:
+        """Return the slope of the cubic at a control point, as MATLAB's and SciPy's `pchip`."""
+        secants = np.diff(self.knots, axis=0) / gaps.reshape(-1, *[1] * (self.knots.ndim - 1))
+        if 0 < i < len(gaps):
+            (h0, h1), (d0, d1) = gaps[i - 1 : i + 1], secants[i - 1 : i + 1]
+            same = d0 * d1 > 0
+            below = np.where(same, (2 * h1 + h0) * d1 + (h1 + 2 * h0) * d0, 1)
+            return np.where(same, 3 * (h0 + h1) * d0 * d1 / below, 0)
+        j, k = (0, 1) if i == 0 else (-1, -2)
+        h0, h1, d0, d1 = gaps[j], gaps[k], secants[j], secants[k]
+        slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+        steep = (np.sign(d0) != np.sign(d1)) & (abs(slope) > 3 * abs(d0))
+        slope = np.where(steep, 3 * d0, slope)
+        return np.where(np.sign(slope) == np.sign(d0), slope, 0)
 
 
 def serve(
@@ -388,7 +427,8 @@ def described(error: BaseException) -> str:
 def features_of(value: object) -> Any:
     """Return features from JSON: lists as arrays, objects of control points as `Waveform`s."""
     if isinstance(value, dict):
-        if value.keys() == {"knots", "hold", "duration"}:
+        needed = {"knots", "hold", "duration"}
+        if needed <= value.keys() <= needed | {"times", "width"}:
             return Waveform(**value)
         return {name: features_of(inner) for name, inner in value.items()}
     return np.asarray(value) if isinstance(value, list) else value

@@ -7,8 +7,10 @@ import pytest
 from checked_types import unchecked
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
 
 from verifai_jax.core.waveform import Waveform, set_durations
+from verifai_jax.remote_client import Waveform as ClientWaveform
 
 KNOTS = np.float32([1, -2, 0.5, 4, 4])
 LINEAR = Waveform(jnp.asarray(KNOTS), "linear", 2.0)
@@ -82,6 +84,15 @@ def test_a_duration_is_needed_and_can_be_given():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (
+            lambda: Waveform(KNOTS, times=(0, 2, 1, 3, 4)),
+            r"increase.*got \[0, 2, 1, 3, 4",
+        ),
+        (lambda: Waveform(KNOTS, times=(-1, 2)), "begin at 0 or later"),
+        (lambda: Waveform(KNOTS, times="now"), "a list of numbers, in seconds; got 'now'"),
+        (lambda: Waveform(KNOTS, "pulse", times=(1.0,)), "needs a width in seconds"),
+        (lambda: Waveform(KNOTS, width=1.0), "only pulses have a width; got width=1.0"),
+        (lambda: Waveform(KNOTS, "pulse", width=-1.0), "positive number of seconds; got -1.0"),
         (lambda: Waveform(KNOTS, "linaer"), "unknown hold 'linaer'; did you mean 'linear'"),
         (lambda: LINEAR.over(0), "duration must be a positive number of seconds; got 0"),
         (lambda: LINEAR.over(float("nan")), "positive number of seconds; got nan"),
@@ -102,6 +113,108 @@ def test_on_the_host_it_is_the_same_function_in_numpy(hold, knots):
         value = host(time)
         assert isinstance(value, np.ndarray | np.float32)
         np.testing.assert_allclose(value, traced(time), rtol=1e-6)
+
+
+UNEVEN = (0.0, 0.3, 1.0, 1.1, 2.0)
+
+
+@pytest.mark.parametrize(("times", "count"), [(None, 5), (UNEVEN, 3), (None, 2), (UNEVEN, 5)])
+def test_pchip_is_that_of_scipy(times, count):
+    """On the host, traced, and by the client that simulators elsewhere copy."""
+    rng = np.random.default_rng(count)
+    where = np.linspace(0, 2, count) if times is None else np.asarray(times[:count])
+    clock, times = np.linspace(-0.5, 2.5, 121), None if times is None else times[:count]
+    for knots in (rng.normal(size=count), rng.integers(0, 2, count), rng.normal(size=(count, 2))):
+        knots = np.asarray(knots, np.float32)
+        oracle = PchipInterpolator(where, knots)(np.clip(clock, where[0], where[-1]))
+        wave = Waveform(knots, "pchip", 2.0, times)
+        np.testing.assert_allclose([wave(float(t)) for t in clock], oracle, atol=1e-5)
+        if count != 5 or knots.ndim == 2:
+            traced = jax.jit(jax.vmap(Waveform(knots, "pchip", 2.0, times)))(jnp.asarray(clock))
+            np.testing.assert_allclose(traced, oracle, atol=1e-5)
+        client = ClientWaveform(knots, "pchip", 2.0, times)
+        np.testing.assert_allclose([client(float(t)) for t in clock], oracle, atol=1e-6)
+
+
+@given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=6), st.floats(0, 2))
+@settings(max_examples=100, deadline=None)
+def test_pchip_never_leaves_what_it_joins(knots, time):
+    knots = np.asarray(knots, np.float32)
+    value = Waveform(knots, "pchip", 2.0)(time)
+    left = min(int(time / 2 * (len(knots) - 1)), len(knots) - 2)
+    # At a knot the rounding of the time decides which of two pieces it lies in.
+    near = knots[max(left - 1, 0) : left + 3]
+    assert near.min() <= value <= near.max()
+
+
+@pytest.mark.thorough
+def test_pchip_has_the_derivatives_of_its_differences():
+    knots = jnp.asarray([0.1, 1.0, 0.7, -0.3, -0.2], jnp.float32)
+    value = jax.jit(lambda knots, time: Waveform(knots, "pchip", 2.0)(time))
+    for time in (0.2, 0.9, 1.3, 1.8):
+        slopes = jax.grad(value, argnums=(0, 1))(knots, time)
+        for i in range(5):
+            step = jnp.zeros(5).at[i].set(1e-2)
+            change = (value(knots + step, time) - value(knots - step, time)) / 2e-2
+            assert float(slopes[0][i]) == pytest.approx(float(change), abs=2e-3)
+        change = (value(knots, time + 1e-2) - value(knots, time - 1e-2)) / 2e-2
+        assert float(slopes[1]) == pytest.approx(float(change), abs=2e-2)
+    flat = jax.grad(value)(jnp.ones(5), 0.9)
+    assert np.isfinite(flat).all()
+
+
+def test_lines_and_pieces_at_given_times():
+    knots = KNOTS
+    clock = np.linspace(-1, 3, 401)
+    lines, held = (
+        Waveform(jnp.asarray(knots), hold, None, UNEVEN) for hold in ("linear", "constant")
+    )
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(lines))(clock), np.interp(clock, UNEVEN, knots), atol=1e-5
+    )
+    places = np.searchsorted(np.asarray(UNEVEN), clock + 1e-6, side="right") - 1
+    values = jax.jit(jax.vmap(held))(clock)
+    np.testing.assert_array_equal(values, knots[np.clip(places, 0, 4)])
+    host = Waveform(knots, "constant", None, UNEVEN)
+    np.testing.assert_array_equal([host(t) for t in clock.tolist()], knots[np.clip(places, 0, 4)])
+
+
+@pytest.mark.parametrize(
+    ("times", "width"), [(None, None), (None, 0.3), (UNEVEN, None), (UNEVEN, 0.08), ((0.5,), 0.7)]
+)
+def test_pulses_return_to_zero(times, width):
+    knots = KNOTS if times is None else KNOTS[: len(times)]
+    starts = np.arange(5) * 0.4 if times is None else np.asarray(times)
+    lasts = np.diff(starts).min() / 2 if width is None else width
+    clock = np.linspace(-1, 3, 401)
+    expected = np.zeros(401)
+    for i, start in enumerate(starts):
+        following = starts[i + 1] if i + 1 < len(starts) else np.inf
+        expected[(clock >= start - 1e-6) & (clock < min(start + lasts, following) - 1e-6)] = knots[
+            i
+        ]
+    wave = Waveform(jnp.asarray(knots), "pulse", 2.0, times, width)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(wave))(clock), expected)
+    client = ClientWaveform(knots, "pulse", 2.0, times, width)
+    np.testing.assert_array_equal([client(t) for t in clock.tolist()], expected)
+    both = Waveform(np.stack([knots, 2 * knots], 1), "pulse", 2.0, times, width)
+    np.testing.assert_array_equal(both(0.5), [expected[150], 2 * expected[150]])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("hold", ["linear", "constant"])
+def test_given_times_are_refined_between_them(hold):
+    wave = Waveform(jnp.asarray(KNOTS), hold, 2.5, UNEVEN)
+    fine = wave.refined(3)
+    assert len(fine.knots) == len(fine.times) == 13
+    times = TIMES + np.float32(0.0013)
+    np.testing.assert_allclose(jax.vmap(fine)(times), jax.vmap(wave)(times), atol=3e-5)
+
+
+@pytest.mark.parametrize("hold", ["pchip", "pulse"])
+def test_what_more_points_cannot_represent_is_not_refined(hold):
+    with pytest.raises(ValueError, match=f"hold='{hold}' has no refinement"):
+        Waveform(jnp.asarray(KNOTS), hold, 2.0).refined(2)
 
 
 def test_it_is_no_number():

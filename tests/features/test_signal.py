@@ -19,6 +19,7 @@ from verifai_jax.features import (
     Signal,
     Struct,
 )
+from verifai_jax.features.points import features_of_rows
 from verifai_jax.systems.ode import ode
 from verifai_jax.testing import check_domain
 
@@ -30,6 +31,9 @@ SIGNALS = [
     Signal(Normal(0, 1), knots=3, hold="constant"),
     Signal(LogUniform(1, 10), knots=5, hold="linear", duration=1.5),
     Array(Signal(Box(0, 1), knots=2), length=2),
+    Signal(Box(-1, 1), hold="pchip", times=[0, 0.5, 3]),
+    Signal(Box(0, 3), hold="pulse", times=[2, 8], width=0.5, duration=10.0),
+    Signal(Box([0, -5], [1, 5]), knots=3, hold="pulse"),
 ]
 
 
@@ -91,6 +95,15 @@ def test_what_a_person_writes():
             lambda: SIGNALS[0].check(Waveform(jnp.zeros(4), "constant"), "w"),
             "w must have hold='linear' and duration=None; got hold='constant'",
         ),
+        (lambda: Signal(Box(0, 1), 3, times=[0, 1]), "each of its times; got 3 knots and 2 times"),
+        (lambda: Signal(Box(0, 1), times=[0, 9], duration=4), "duration of 4 s; got 9"),
+        (lambda: Signal(Box(0, 1), times=[1, 1]), "times must increase"),
+        (lambda: Signal(Box(0, 1), times=[1]), "at least 2 knots; got 1"),
+        (lambda: Signal(Box(0, 1), 3, "pchip").refined(2), "'pchip' has no refinement"),
+        (
+            lambda: SIGNALS[7].check(Waveform(jnp.zeros(3), "pchip"), "w"),
+            r"times=\[0, 0.5, 3\]; got hold='pchip' and duration=None$",
+        ),
         (lambda: SIGNALS[0].refined(0), "factor must be a positive integer; got 0"),
     ],
 )
@@ -131,6 +144,32 @@ def test_refined_spaces_hold_the_same_functions(hold):
     ):
         before, after = (jax.vmap(pick(f).over(2.0))(times) for f in (coarse, again))
         np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+@pytest.mark.thorough
+def test_given_times_are_refined_in_spaces():
+    space = FeatureSpace({"w": Signal(Box(-1, 1), times=[0, 0.5, 3], duration=4.0)})
+    finer, refine = space.refined(2)
+    assert finer["w"] == Signal(Box(-1, 1), times=[0, 0.25, 0.5, 1.75, 3], duration=4.0)
+    coarse = space.coerce({"w": [0, 1, -1]})
+    finer.check(refine(coarse))
+    np.testing.assert_allclose(refine(coarse)["w"].knots, [0, 0.5, 1, 0, -1], atol=1e-6)
+
+
+def test_json_and_tables_keep_times_and_widths():
+    space = FeatureSpace({"w": SIGNALS[-2], "p": SIGNALS[-3], "x": Signal(Box(0, 1), 2)})
+    again = FeatureSpace.from_json(space.to_json())
+    assert again == space
+    assert repr(again["w"]) == (
+        "Signal(Box(0, 3), times=[2, 8], hold='pulse', width=0.5, duration=10)"
+    )
+    features = space.coerce({"w": [1, 2], "p": [0, 1, 0], "x": 0.5})
+    rows = {
+        name: np.asarray(column)
+        for name, column in space.rows(jax.tree.map(lambda leaf: leaf[None], features)).items()
+    }
+    batch = features_of_rows(dict(space.root.fields), rows, "float32")
+    assert (batch["w"].times, batch["w"].width, batch["p"].hold) == ((2.0, 8.0), 0.5, "pchip")
 
 
 class TestInRollouts:
@@ -184,6 +223,19 @@ def test_people_read_the_time_of_a_control_point():
     assert labels["a"] == "a"
     assert labels["wind[1]"] == "wind at 1.5 s"
     assert labels["wind[4]"] == "wind at 6 s"
+    uneven = FeatureSpace(
+        {
+            "p": Signal(Box(0, 1), hold="pchip", times=[0, 1, 4]),
+            "c": Signal(Box(0, 1), hold="constant", times=[1, 2]),
+            "k": Signal(Box(0, 1), hold="pulse", times=[1, 2], width=0.25),
+        }
+    )
+    assert list(uneven.labels(6.0).values()) == [
+        *("p at 0 s", "p at 1 s", "p at 4 s", "c from 0 s to 2 s", "c from 2 s to 6 s"),
+        *("k from 1 s to 1.25 s", "k from 2 s to 2.25 s"),
+    ]
+    assert uneven.labels()["c[1]"] == "c from 2 s on"
+    assert uneven["p"].spans(6.0) == [(0, 4), (0, 6), (0, 6)]
     assert labels["car.throttle[1][0]"] == "car.throttle[0] from 5 s to 10 s"
     assert space.labels()["wind[1]"] == "wind[1]"
     assert space.fixed(wind=0.0).labels(6.0).keys() == {"a", *list(labels)[-4:]}

@@ -6,7 +6,9 @@ features["wind"].over(4.0)(time)                             # where no duration
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, TypeGuard, TypeVar
 
 import jax
@@ -17,9 +19,14 @@ from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.interpolation import between, monotone_cubic
 
-HOLDS = ("linear", "constant")
-"""Courses between two control points: a line, or the value of the first."""
+HOLDS = ("linear", "constant", "pchip", "pulse")
+"""Courses between control points: lines, the value of the one before, a monotone cubic through
+them, or the value of the one before for a while and then 0."""
+
+HELD = ("constant", "pulse")
+"""Courses that jump: within a step of an integrator they keep the value of its beginning."""
 
 Features = TypeVar("Features")
 
@@ -27,15 +34,18 @@ Features = TypeVar("Features")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Waveform:
-    """Control points at equal distances, joined by lines or held until the next.
+    """Control points at equal distances or given times, and the course between them.
 
     **Arguments:**
 
-    - `knots`: `[knots, ...]`. With `"linear"` the first is the value at time 0 and the last that
-      at the end; with `"constant"` each is held for an equal part of the duration, its beginning
-      included.
+    - `knots`: `[knots, ...]`. With `"linear"` and `"pchip"` the first is the value at time 0 and
+      the last that at the end; with `"constant"` each is held for an equal part of the duration,
+      its beginning included; with `"pulse"` for the first `width` seconds of that part, and the
+      value is 0 for the rest.
     - `duration`: in seconds; None until `over` sets it. Before 0 and behind the end the first and
-      the last value hold.
+      the last value hold; those of pulses are 0.
+    - `times`: of the control points in seconds, increasing; equal distances when left out.
+    - `width`: of a pulse in seconds; half the shortest distance of two when left out.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
@@ -45,9 +55,15 @@ class Waveform:
     hold: str = field(default="linear", metadata={"static": True})
     duration: float | None = field(default=None, metadata={"static": True})
 
+    times: tuple[float, ...] | None = field(default=None, metadata={"static": True})
+    width: float | None = field(default=None, metadata={"static": True})
+
     def __post_init__(self) -> None:
         if self.hold not in HOLDS:
             raise unknown_name("hold", self.hold, HOLDS)
+        if self.times is not None:
+            object.__setattr__(self, "times", check_times(self.times))
+        check_width(self.hold, self.times, self.width)
 
     def over(self, duration: float) -> "Waveform":
         """Return the same control points over so many seconds.
@@ -63,7 +79,7 @@ class Waveform:
 
         **Raises:** `ValueError` without a duration.
         """
-        if self.duration is None:
+        if self.duration is None and self.times is None:
             raise ValueError(
                 "a Signal without a duration cannot be evaluated: give Signal(..., duration=4.0), "
                 "or call features[...].over(4.0)(time)"
@@ -73,19 +89,59 @@ class Waveform:
         xp: Any = np if on_host else jnp
         knots = xp.asarray(self.knots)
         count = knots.shape[0]
-        place = xp.asarray(time).astype(knots.dtype) / self.duration
+        time = xp.asarray(time).astype(knots.dtype)
+        if self.hold in HELD:
+            return self._held(knots, time, 1, xp)
         if count == 1:
             return knots[0]
+        left, share = self._place(time, count, xp)
+        share = share.astype(knots.dtype)
+        if self.hold == "linear":
+            return between(knots[left], knots[left + 1], share, xp)
+        gaps = np.ones(count - 1) if self.times is None else np.diff(self.times)
+        return monotone_cubic(knots, gaps, left, share, xp)
+
+    def _place(self, time: Any, count: int, xp: Any) -> tuple[Any, Any]:
+        """Return the index of the control point before a time, and the share of the way on."""
+        if self.times is None:
+            place = xp.clip(time / self.duration, 0.0, 1.0) * (count - 1)
+            left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
+            return left, place - left
+        starts, gaps = (xp.asarray(a, time.dtype) for a in (self.times, np.diff(self.times)))
+        left = xp.clip(_last_not_after(starts, time, xp), 0, count - 2)
+        return left, xp.clip((time - starts[left]) / gaps[left], 0.0, 1.0)
+
+    def _held(self, knots: Any, time: Any, sign: Any, xp: Any) -> Any:
+        """Return the value at a time; `sign` is -1 where a piece that just begins counts not yet.
+
+        An instant at which a piece begins or a pulse ends belongs to what follows, whatever its
+        rounding.
+        """
+        count = knots.shape[0]
+        if self.times is not None:
+            starts = xp.asarray(self.times, time.dtype)
+            gap = _shortest(self.times)
+            rounding = 4 * float(jnp.finfo(time.dtype).eps) * self.times[-1]
+            late = time + sign * max(1e-5 * gap, rounding)
+            piece = xp.clip(_last_not_after(starts, late, xp), 0, count - 1)
+            since, width = late - starts[piece], gap / 2 if self.width is None else self.width
+        else:
+            if count == 1 and self.hold == "constant":
+                return knots[0]
+            assert self.duration is not None
+            place = time / self.duration * count + sign * _slack(knots)
+            piece = xp.clip(xp.floor(place).astype(np.int32), 0, count - 1)
+            since = place - piece
+            width = 0.5 if self.width is None else self.width * count / self.duration
         if self.hold == "constant":
-            return knots[_piece(place, count, _slack(knots), xp)]
-        place = xp.clip(place, 0.0, 1.0) * (count - 1)
-        left = xp.clip(xp.floor(place).astype(np.int32), 0, count - 2)
-        share = (place - left).astype(knots.dtype)
-        return _between(knots[left], knots[left + 1], share, xp)
+            return knots[piece]
+        on = (since >= 0) & (since < width)
+        return xp.where(on.reshape(on.shape + (1,) * (knots.ndim - 1)), knots[piece], 0)
 
     def __repr__(self) -> str:
         over = "" if self.duration is None else f", over {self.duration:g} s"
-        return f"Waveform({self._outline()}, {self.hold}{over})"
+        at = "" if self.times is None else f" at {_listed(self.times)} s"
+        return f"Waveform({self._outline()}{at}, {self.hold}{over})"
 
     def _outline(self) -> str:
         """Return the number of control points and the range of their values, never an array."""
@@ -104,13 +160,17 @@ class Waveform:
 
     def refined(self, factor: int) -> "Waveform":
         """Return the same function by more control points; see `Signal.refined`."""
-        knots = jnp.asarray(self.knots)
-        if self.hold == "constant" or knots.shape[0] == 1:
+        check_refinable(self.hold)
+        knots, times = jnp.asarray(self.knots), refined_times(self.times, factor)
+        if (self.hold == "constant" and times is None) or knots.shape[0] == 1:
             return replace(self, knots=jnp.repeat(knots, factor, axis=0))
-        share = np.arange(factor).reshape((1, factor) + (1,) * (knots.ndim - 1)) / factor
-        between = _between(knots[:-1, None], knots[1:, None], share.astype(knots.dtype), jnp)
-        inner = between.reshape(-1, *knots.shape[1:])
-        return replace(self, knots=jnp.concatenate([inner, knots[-1:]]))
+        if self.hold == "constant":
+            inner = jnp.repeat(knots[:-1], factor, axis=0)
+        else:
+            share = np.arange(factor).reshape((1, factor) + (1,) * (knots.ndim - 1)) / factor
+            inner = between(knots[:-1, None], knots[1:, None], share.astype(knots.dtype), jnp)
+            inner = inner.reshape(-1, *knots.shape[1:])
+        return replace(self, knots=jnp.concatenate([inner, knots[-1:]]), times=times)
 
 
 @jax.tree_util.register_dataclass
@@ -131,16 +191,16 @@ class WaveformWithinStep(Waveform):
         self, time: Real[Array | np.ndarray, "*times"] | np.number | float
     ) -> Float[Array | np.ndarray, "*shape"] | np.floating:
         constant = isinstance(self.now, Tracer) and not isinstance(time, Tracer)
-        if self.duration is None or constant or not isinstance(time, jax.Array):
+        unbound = self.duration is None and self.times is None
+        if unbound or constant or not isinstance(time, jax.Array):
             return super().__call__(time)
         knots = jnp.asarray(self.knots)
         inside = (time >= self.begin) & (time <= self.now)
-        place = jnp.where(inside, self.begin, time).astype(knots.dtype) / self.duration
         # Another time (a delay) moves with the stages as well: behind the beginning of the step, a
         # piece that begins just there belongs to the next step.
         before = (self.now > self.begin) & ~inside
-        slack = jnp.where(before, -_slack(knots), _slack(knots))
-        return knots[_piece(place, knots.shape[0], slack, jnp)]
+        place = jnp.where(inside, self.begin, time).astype(knots.dtype)
+        return self._held(knots, place, jnp.where(before, -1, 1).astype(knots.dtype), jnp)
 
 
 def _slack(knots: Any) -> float:
@@ -149,11 +209,13 @@ def _slack(knots: Any) -> float:
     return max(1e-5, 4 * float(jnp.finfo(knots.dtype).eps) * knots.shape[0])
 
 
-def _piece(place: Any, count: int, slack: Any, xp: Any) -> Any:
-    """Return the index of the piece at a place from 0 to 1."""
-    # An instant at which a piece begins belongs to it, whatever its rounding.
-    piece = xp.floor(place * count + slack).astype(np.int32)
-    return xp.clip(piece, 0, count - 1)
+def _last_not_after(starts: Any, time: Any, xp: Any) -> Any:
+    return xp.sum(time[..., None] >= starts, axis=-1).astype(np.int32) - 1
+
+
+def _shortest(times: Sequence[float]) -> float:
+    """Return the shortest distance of two times; of one alone, a second."""
+    return min((b - a for a, b in pairwise(times)), default=1.0)
 
 
 IS_CALLED = (
@@ -177,19 +239,6 @@ for _operator in (
     setattr(Waveform, f"__{_operator}__", _refuse)
 
 
-def _between(left: Any, right: Any, share: Any, xp: Any) -> Any:
-    """Return `left` where the share is 0 and `right` where it is 1, never beyond them."""
-    value = left * (1 - share) + right * share
-    # Between two knots at the end of their domain the sum may be rounded to a value outside.
-    least, most = xp.minimum(left, right), xp.maximum(left, right)
-    if xp is np:
-        return np.clip(value, least, most)
-    least, most, zero = *jax.lax.stop_gradient((least, most)), value - jax.lax.stop_gradient(value)
-    # The derivative is that of the line, also where both knots are the same.
-    value = jnp.where(value < least, least + zero, value)
-    return jnp.where(value > most, most + zero, value)
-
-
 def check_duration(duration: object) -> float:
     """Check a duration in seconds.
 
@@ -198,6 +247,98 @@ def check_duration(duration: object) -> float:
     if not is_number(duration) or not 0 < duration < math.inf:
         raise ValueError(f"duration must be a positive number of seconds; got {duration!r}")
     return float(duration)
+
+
+def check_times(times: object) -> tuple[float, ...]:
+    """Check the times of control points, in seconds.
+
+    **Raises:** `ValueError` unless they are finite numbers that increase, the first not negative.
+    """
+    listed = tuple(times) if isinstance(times, list | tuple | np.ndarray) else ()
+    if not listed or not all(is_number(time) and math.isfinite(time) for time in listed):
+        raise ValueError(f"times must be a list of numbers, in seconds; got {times!r}")
+    seconds = tuple(float(time) for time in listed)
+    if seconds[0] < 0 or any(b <= a for a, b in pairwise(seconds)):
+        raise ValueError(f"times must increase and begin at 0 or later; got {_listed(seconds)}")
+    return seconds
+
+
+def check_width(hold: str, times: tuple[float, ...] | None, width: object) -> None:
+    """Check the width of pulses, in seconds.
+
+    **Raises:** `ValueError` unless it is None or positive, for another course than pulses, and for
+    a pulse at one given time, which has no distance to the next one.
+    """
+    if width is None:
+        if hold == "pulse" and times is not None and len(times) == 1:
+            raise ValueError("a pulse at one given time needs a width in seconds, as in width=0.5")
+        return
+    if hold != "pulse":
+        raise ValueError(f"only pulses have a width; got width={width!r} with hold={hold!r}")
+    if not is_number(width) or not 0 < width < math.inf:
+        raise ValueError(f"width must be a positive number of seconds; got {width!r}")
+
+
+def check_refinable(hold: str) -> None:
+    """Refuse a course that more control points cannot represent.
+
+    **Raises:** `ValueError` for a cubic and for pulses.
+    """
+    if hold in ("pchip", "pulse"):
+        raise ValueError(
+            f"a Signal with hold={hold!r} has no refinement: through more control points it would "
+            "be another function of time; a search from coarse to fine needs 'linear' or 'constant'"
+        )
+
+
+def refined_times(times: tuple[float, ...] | None, factor: int) -> tuple[float, ...] | None:
+    """Return the times with each distance divided into so many equal parts."""
+    if times is None:
+        return None
+    inner = [a + (b - a) * i / factor for a, b in pairwise(times) for i in range(factor)]
+    return (*inner, times[-1])
+
+
+def control_times(
+    count: int, hold: str, times: Sequence[float] | None, duration: float
+) -> Float[np.ndarray, " knots"]:
+    """Return the time in seconds at which each control point has its value, or begins to."""
+    if times is not None:
+        return np.asarray(times)
+    return (
+        np.linspace(0, duration, count + 1)[:-1]
+        if hold in HELD
+        else np.linspace(0, duration, count)
+    )
+
+
+def acting_spans(
+    count: int,
+    hold: str,
+    times: Sequence[float] | None,
+    width: float | None,
+    duration: float,
+) -> list[tuple[float, float]]:
+    """Return from when to when each control point changes the function, in seconds.
+
+    A point between two lines acts from the point before to the one behind, one of a cubic as far
+    as the second point before and behind it, and the first and the last to the ends.
+    """
+    starts = [float(time) for time in control_times(count, hold, times, duration)]
+    if hold in HELD:
+        spans = [*pairwise([*starts, max(duration, starts[-1])])]
+        if hold == "constant":
+            return [(0.0, spans[0][1]), *spans[1:]]
+        gap = _shortest(times) if times is not None else duration / count
+        return [(a, min(b, a + (gap / 2 if width is None else width))) for a, b in spans]
+    reach = 1 if hold == "linear" else 2
+    padded = [0.0] * reach + starts + [max(duration, starts[-1])] * reach
+    return list(zip(padded[:count], padded[2 * reach :], strict=True))
+
+
+def _listed(times: tuple[float, ...]) -> str:
+    shown = ", ".join(f"{time:g}" for time in times[:6])
+    return f"[{shown}{', ...' if len(times) > 6 else ''}]"
 
 
 def set_durations(features: Features, duration: float) -> Features:
@@ -216,9 +357,12 @@ def within_step(features: Features, begin: Any, now: Any) -> Features:
     """
 
     def hold(leaf: object) -> object:
-        if not is_waveform(leaf) or leaf.hold != "constant" or np.shape(leaf.knots)[:1] == (1,):
+        if not is_waveform(leaf) or leaf.hold not in HELD:
             return leaf
-        return WaveformWithinStep(leaf.knots, leaf.hold, leaf.duration, begin, now)
+        if leaf.hold == "constant" and np.shape(leaf.knots)[:1] == (1,):
+            return leaf
+        course = (leaf.hold, leaf.duration, leaf.times, leaf.width)
+        return WaveformWithinStep(leaf.knots, *course, begin=begin, now=now)
 
     return features if now is begin else jax.tree.map(hold, features, is_leaf=is_waveform)
 

@@ -1,7 +1,6 @@
 """The part that each feature has in a failure."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,18 +19,11 @@ class Span(NamedTuple):
 def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
     """Return when each coordinate of a signal acts; None for other domains.
 
-    A point between two lines acts from the point before to the one behind.
+    A point between two lines acts from the point before to the one behind; see `Signal.spans`.
     """
     if not isinstance(domain, Signal):
         return None
-    length = domain.duration or duration
-    if domain.hold == "constant":
-        edges = np.linspace(0, length, domain.knots + 1)
-        spans = [Span(float(a), float(b)) for a, b in pairwise(edges)]
-    else:
-        times = np.linspace(0, length, domain.knots)
-        ends = np.concatenate([[0.0], times, [length]])
-        spans = [Span(float(a), float(b)) for a, b in zip(ends[:-2], ends[2:], strict=True)]
+    spans = [Span(*span) for span in domain.spans(duration)]
     return tuple(span for span in spans for _ in range(domain.domain.size))
 
 

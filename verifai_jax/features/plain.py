@@ -30,6 +30,8 @@ FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Signal: ("domain", "knots", "hold", "duration"),
     Array: ("domain", "length"),
 }
+SIGNAL_OPTIONS = ("times", "width")
+"""Arguments of a Signal that are written where they are given."""
 KINDS: dict[str, Any] = {kind.__name__: kind for kind in FIELDS}
 
 
@@ -66,6 +68,9 @@ def to_plain(domain: Domain) -> dict[str, Any]:
         data[name] = to_plain(value) if isinstance(value, Domain) else _lists(value)
     if isinstance(domain, Box) and domain.closed != "both":
         data["closed"] = domain.closed
+    if isinstance(domain, Signal):
+        options = {name: _lists(getattr(domain, name)) for name in SIGNAL_OPTIONS}
+        data |= {name: value for name, value in options.items() if value is not None}
     return data
 
 
@@ -126,6 +131,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
     }
     if kind == "Box" and "closed" in data:
         arguments["closed"] = data["closed"]
+    if kind == "Signal":
+        arguments |= {name: data[name] for name in SIGNAL_OPTIONS if name in data}
     return KINDS[kind](**arguments)
 
 

@@ -10,7 +10,6 @@ from jaxtyping import PyTree
 
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.waveform import Waveform
 from verifai_jax.features.arrays import Array, Items, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
@@ -66,7 +65,7 @@ def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str, precisi
     if isinstance(domain, Signal):
         each = indexed(name, domain.knots)
         knots = [_batch(domain.domain, columns, knot, precision) for knot in each]
-        return Waveform(np.stack(knots, axis=1), domain.hold, domain.duration)  # pyright: ignore[reportArgumentType]
+        return domain.waveform(np.stack(knots, axis=1))  # pyright: ignore[reportArgumentType]
     # One row at a time, but equal ones once.
     rows = list(zip(*(columns[column].tolist() for column in names), strict=True))
     count = len(next(iter(columns.values())))

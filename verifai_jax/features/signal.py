@@ -1,7 +1,8 @@
 """Functions of time as features (`Signal`), varied through their control points."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -9,34 +10,62 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
-from verifai_jax.core.waveform import HOLDS, Waveform, check_duration, is_waveform
+from verifai_jax.core.waveform import (
+    HELD,
+    HOLDS,
+    Waveform,
+    acting_spans,
+    check_duration,
+    check_refinable,
+    check_times,
+    check_width,
+    control_times,
+    is_waveform,
+    refined_times,
+)
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import Domain, Row, as_numbers, indexed
+from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, short
+
+DEFAULT_KNOTS = 16
+
+Course = tuple[str, float | None, tuple[float, ...] | None, float | None]
+"""Hold, duration, times and width."""
 
 
 @dataclass(frozen=True)
 class Signal(Domain):
     """A function of time by control points: `Signal(Box(-1, 1), knots=16, hold="linear")`.
 
+        Signal(Box(0, 61), times=[0, 5, 20, 30], hold="pchip")   # where the control points are
+        Signal(Box(0, 3), times=[2, 8], hold="pulse", width=0.5)  # two gusts of half a second
+
     A value is a `Waveform`, which a system calls with a time in seconds: `features["wind"](time)`.
 
     **Arguments:**
 
     - `domain`: of each control point: a `Box`, of numbers or vectors, or a distribution.
-    - `knots`: number of control points, at equal distances.
+    - `knots`: number of control points, at equal distances; with `times` it is theirs.
     - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
-      `"constant"` holds each for an equal part of the time.
+      `"pchip"` by a cubic that is monotone between them and never beyond them;
+      `"constant"` holds each for an equal part of the time;
+      `"pulse"` holds each for `width` seconds from its time on, and is 0 otherwise.
     - `duration`: in seconds; that of the simulation when left out (`ode` knows it).
+    - `times`: of the control points in seconds, increasing. The first and the last value hold
+      before and behind them.
+    - `width`: of a pulse in seconds; half the shortest distance of two when left out.
 
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
-    (1 for constant, 2 for linear) or a duration that is not positive.
+    (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
+    and times that do not increase, lie behind the duration or are not as many as the knots.
     """
 
     domain: Domain
-    knots: int = 16
+    knots: int = DEFAULT_KNOTS
     hold: str = "linear"
     duration: float | None = None
+    times: Sequence[float] | None = None
+    width: float | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.domain, Box | Continuous):
@@ -46,15 +75,32 @@ class Signal(Domain):
             )
         if self.hold not in HOLDS:
             raise unknown_name("hold", self.hold, HOLDS)
-        least = 2 if self.hold == "linear" else 1
-        knots = self.knots
+        least, knots = 1 if self.hold in HELD else 2, self.knots
+        times = None if self.times is None else check_times(self.times)
+        if times is not None:
+            # The default cannot be told from a 16 that was given.
+            if knots not in (DEFAULT_KNOTS, len(times)):
+                raise ValueError(
+                    f"a Signal has one knot at each of its times; got {knots!r} knots and "
+                    f"{len(times)} times"
+                )
+            knots = len(times)
         if isinstance(knots, bool) or not isinstance(knots, int | np.integer) or knots < least:
             raise ValueError(
                 f"a Signal with {self.hold} hold needs at least {least} knots; got {knots!r}"
             )
+        check_width(self.hold, times, self.width)
         object.__setattr__(self, "knots", int(knots))
+        object.__setattr__(self, "times", times)
+        if self.width is not None:
+            object.__setattr__(self, "width", float(self.width))
         if self.duration is not None:
             object.__setattr__(self, "duration", check_duration(self.duration))
+            if times is not None and times[-1] > self.duration:
+                raise ValueError(
+                    f"the times of a Signal must lie in its duration of {self.duration:g} s; got "
+                    f"{times[-1]:g}"
+                )
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -67,7 +113,7 @@ class Signal(Domain):
 
     def from_unit(self, u: Float[Array, " size"]) -> Waveform:
         knots = jax.vmap(self.domain.from_unit)(u.reshape(self.knots, self.domain.size))
-        return self._waveform(knots)
+        return self.waveform(knots)
 
     def to_unit(self, value: Waveform) -> Float[Array, " size"]:
         return jnp.ravel(jax.vmap(self.domain.to_unit)(value.knots))
@@ -75,18 +121,18 @@ class Signal(Domain):
     def coerce(self, value: PyTree) -> Waveform:
         """Convert a `Waveform`, a list of control points, or one value for all times."""
         if is_waveform(value):
-            return self._waveform(self.domain.coerce(value.knots))
+            return self.waveform(self.domain.coerce(value.knots))
         knots = self.domain.coerce(value)
         if knots.ndim == np.ndim(getattr(self.domain, "low", 0.0)):
             knots = jnp.broadcast_to(knots, (self.knots, *knots.shape))
-        return self._waveform(knots)
+        return self.waveform(knots)
 
     def check(self, value: object, name: str) -> None:
         if isinstance(value, Waveform):
-            if (value.hold, value.duration) not in ((self.hold, self.duration), (self.hold, None)):
+            own, course = self._course, (value.hold, value.duration, value.times, value.width)
+            if course not in (own, (self.hold, None, *own[2:])):
                 raise ValueError(
-                    f"{name} must have hold={self.hold!r} and duration={self.duration}; got "
-                    f"hold={value.hold!r} and duration={value.duration}"
+                    f"{name} must have {_format_course(own)}; got {_format_course(course)}"
                 )
             value = value.knots
         knots = as_numbers(value, name)
@@ -105,15 +151,25 @@ class Signal(Domain):
 
     def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
         length = self.duration or duration
-        if length is None:
+        if length is None and self.times is None:
             return self.coordinates(name)
         parts = self.domain.coordinates(name)
-        if self.hold == "linear":
-            times = [f"at {time:.4g} s" for time in np.linspace(0, length, self.knots)]
+        if self.hold in HELD:
+            times = [_format_span(*span) for span in self.spans(length or math.inf)]
         else:
-            edges = np.linspace(0, length, self.knots + 1)
-            times = [f"from {a:.4g} s to {b:.4g} s" for a, b in pairwise(edges)]
+            instants = control_times(self.knots, self.hold, self.times, length or math.inf)
+            times = [f"at {time:.4g} s" for time in instants]
         return tuple(f"{part} {time}" for time in times for part in parts)
+
+    def spans(self, duration: float) -> list[tuple[float, float]]:
+        """Return from when to when each control point changes the function, in seconds.
+
+        **Arguments:**
+
+        - `duration`: of the simulation in seconds; that of the signal comes first.
+        """
+        length = self.duration or duration
+        return acting_spans(self.knots, self.hold, self.times, self.width, length)
 
     def to_columns(self, values: Waveform, name: str) -> dict[str, np.ndarray]:
         knots, columns = np.asarray(values.knots), {}
@@ -123,28 +179,61 @@ class Signal(Domain):
 
     def from_columns(self, row: Row, name: str) -> Waveform:
         knots = [self.domain.from_columns(row, knot) for knot in indexed(name, self.knots)]
-        return self._waveform(jnp.stack(knots))
+        return self.waveform(jnp.stack(knots))
 
     def refined(self, factor: int) -> "Signal":
         """Return the signal with more control points, among which are all of the coarse one's.
 
         `(knots - 1) * factor + 1` where linear, `knots * factor` where constant: `Waveform.refined`
-        gives the same function on them, so that a search can go from coarse to fine.
+        gives the same function on them, so that a search can go from coarse to fine. Given times
+        are refined between the first and the last.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer.
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for a cubic and
+        pulses, which more control points cannot represent.
         """
         if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:
             raise ValueError(f"factor must be a positive integer; got {factor!r}")
-        finer = self.knots * factor
-        return replace(self, knots=finer - factor + 1 if self.hold == "linear" else finer)
+        check_refinable(self.hold)
+        _, _, times, _ = self._course
+        if times is not None:
+            finer = refined_times(times, factor)
+            assert finer is not None
+            return replace(self, knots=len(finer), times=finer)
+        count = self.knots * factor
+        return replace(self, knots=count - factor + 1 if self.hold == "linear" else count)
 
     def refine(self, value: Waveform, factor: int) -> Waveform:
         """Convert a value to one of `refined(factor)`: the same function of time."""
         return value.refined(factor)
 
-    def _waveform(self, knots: Float[Array, "*knots"]) -> Waveform:
-        return Waveform(knots, self.hold, self.duration)
+    def waveform(self, knots: Float[Array | np.ndarray, "*knots"]) -> Waveform:
+        """Return the function of time with these control points `[knots, ...]`, unchecked."""
+        return Waveform(knots, *self._course)
+
+    @property
+    def _course(self) -> Course:
+        return (
+            self.hold,
+            self.duration,
+            None if self.times is None else tuple(self.times),
+            self.width,
+        )
 
     def __repr__(self) -> str:
+        points = f"knots={self.knots}" if self.times is None else f"times={short(self.times)}"
         duration = "" if self.duration is None else f", duration={self.duration:g}"
-        return f"Signal({self.domain!r}, knots={self.knots}, hold={self.hold!r}{duration})"
+        width = "" if self.width is None else f", width={self.width:g}"
+        return f"Signal({self.domain!r}, {points}, hold={self.hold!r}{width}{duration})"
+
+
+def _format_course(course: Course) -> str:
+    hold, duration, times, width = course
+    text = f"hold={hold!r} and duration={duration}"
+    if times is not None:
+        text += f", times={short(times)}"
+    return text if width is None else f"{text}, width={width:g}"
+
+
+def _format_span(begin: float, end: float) -> str:
+    until = f" to {end:.4g} s" if math.isfinite(end) else " on"
+    return f"from {begin:.4g} s{until}"

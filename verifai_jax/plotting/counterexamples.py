@@ -4,13 +4,15 @@ plot_explanation(explain(run), "why.png")             # what broke, when, and wh
 plot_shrunk(shrink(run), "small.png")               # what departs from nominal, and what broke
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.waveform import is_waveform
+from verifai_jax.core.waveform import HELD, Waveform, acting_spans, control_times, is_waveform
 from verifai_jax.counterexamples._explain import Explained, Influence
 from verifai_jax.counterexamples._shrink import Shrunk
 from verifai_jax.counterexamples.description import format_apart, format_number
@@ -126,21 +128,14 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
     length = wave.duration or float(clock[-1])
     knots = np.asarray(wave.knots, np.float64)
     knots = knots.reshape(len(knots), -1)
-    if wave.hold == "constant":
-        edges = np.linspace(0, length, len(knots) + 1)
-        axes.stairs(knots[:, 0], edges, color=BOUND, linewidth=1.5, baseline=None)
-    else:
-        axes.plot(np.linspace(0, length, len(knots)), knots[:, 0], ".-", color=BOUND, linewidth=1.4)
+    wave = wave if wave.duration is not None else wave.over(length)
+    axes.plot(*_course(wave, knots[:, 0], length), color=BOUND, linewidth=1.5)
+    if wave.hold not in HELD:
+        times = control_times(len(knots), wave.hold, wave.times, length)
+        axes.plot(times, knots[:, 0], ".", color=BOUND)
     if influence.nominal and knots.shape[1] == 1:
-        usual = np.array(influence.nominal, float)
-        axes.plot(
-            np.linspace(0, length, len(usual)),
-            usual,
-            "--",
-            color=SAFE,
-            linewidth=1,
-            label="nominal",
-        )
+        usual = _course(wave, np.array(influence.nominal, float), length)
+        axes.plot(*usual, "--", color=SAFE, linewidth=1, label="nominal")
         axes.legend(fontsize=7, frameon=False, loc="upper right")
     gain = np.nan_to_num(influence.each - explained.rho)
     every = [np.nan_to_num(i.each - explained.rho) for i in explained.influences]
@@ -150,6 +145,26 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
             axes.axvspan(*span, color=FAILING, alpha=0.25 * one / most, linewidth=0)
     axes.set_ylabel(_short(influence.name, 14))
     tidy(axes)
+
+
+def _course(
+    wave: Waveform, knots: Float[np.ndarray, " knots"], length: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return times and values that draw a function of time through these control points."""
+    count = len(knots)
+    if wave.hold == "linear":
+        return control_times(count, wave.hold, wave.times, length), knots
+    if wave.hold == "pchip":
+        clock, smooth = np.linspace(0, length, 40 * count), replace(wave, knots=knots)
+        return clock, np.array([smooth(float(time)) for time in clock])
+    spans = acting_spans(count, wave.hold, wave.times, wave.width, length)
+    corners = [(time, value) for span, value in zip(spans, knots, strict=True) for time in span]
+    if wave.hold == "pulse":
+        ends = [(span[0], 0.0) for span in spans], [(span[1], 0.0) for span in spans]
+        pairs = zip(ends[0], corners[::2], corners[1::2], ends[1], strict=True)
+        corners = [(0.0, 0.0), *(corner for four in pairs for corner in four), (length, 0.0)]
+    times, values = zip(*corners, strict=True)
+    return np.array(times), np.array(values)
 
 
 def _draw_bars(axes: Axes, explained: Explained) -> None:

@@ -81,6 +81,17 @@ def test_a_held_input_stays_within_a_step():
     np.testing.assert_allclose(level(fixed, dt=0.5, steps=2), [0, 0.5, 1.0])
 
 
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_pulses_stay_within_a_step(substeps):
+    """Two pulses of 0.2 s from 0.1 s and 0.6 s on, integrated without an error of the method."""
+    wave = Waveform(jnp.asarray([1.0, -3.0]), "pulse", None, (0.1, 0.6), 0.2)
+    system = ode(lambda t, s, c, f: f["u"](t), lambda f, key: 0.0, dt=0.1, duration=1.0,
+                 signals=lambda t, s, c, f: {"x": s}).refined(substeps)  # fmt: skip
+    x = system({"u": wave}, KEY)["x"]
+    expected = [0, 0, 0.1, 0.2, 0.2, 0.2, 0.2, -0.1, -0.4, -0.4, -0.4]
+    np.testing.assert_allclose(x, expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("steps", [(8, 16), (6, 12)])
 def test_a_linear_input_converges(steps):
     # The kinks at 0.25, 0.5 and 0.75 are at steps, or within them.

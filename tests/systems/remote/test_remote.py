@@ -315,6 +315,7 @@ def test_features_arrive_as_they_are():
         "wave": wave,
         "steps": steps,
         "open": Waveform(np.ones((2, 2)), "linear"),
+        "pulses": Waveform(np.array([1.0, 2.0]), "pulse", 4.0, (0.5, 2.0), 1.5),
     }
     got = remote_client.features_of(json.loads(wire.to_text(wire.plain(features))))
     assert (got["a"], got["n"], got["s"]) == (0.1, 3, "red")
@@ -323,6 +324,7 @@ def test_features_arrive_as_they_are():
     for time_ in (-1.0, 0.0, 0.3, 1.0, 2.0, 3.9, 4.0, 9.0):
         np.testing.assert_allclose(got["wave"](time_), wave(time_), rtol=1e-6)
         np.testing.assert_allclose(got["steps"](time_), steps(time_), rtol=1e-6)
+        assert got["pulses"](time_) == features["pulses"](time_)
     np.testing.assert_array_equal(got["open"].over(2.0)(1.0), [1.0, 1.0])
     with pytest.raises(ValueError, match="has no duration"):
         got["open"](1.0)

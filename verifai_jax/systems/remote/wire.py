@@ -202,7 +202,9 @@ def plain(value: Any) -> Any:
         return {str(name): plain(inner) for name, inner in value.items()}
     if is_waveform(value):
         knots = np.asarray(value.knots).tolist()
-        return {"knots": knots, "hold": value.hold, "duration": value.duration}
+        data = {"knots": knots, "hold": value.hold, "duration": value.duration}
+        options = {"times": value.times, "width": value.width}
+        return data | {name: plain(part) for name, part in options.items() if part is not None}
     if isinstance(value, tuple | list):
         return [plain(inner) for inner in value]
     if value is None or isinstance(value, str | bool | int | float):
