@@ -8,6 +8,7 @@ import pytest
 from checked_types import unchecked
 from click.testing import CliRunner
 from scipy.optimize import brentq
+from scipy.stats import norm
 
 import verifai_jax as vj
 from envs import cartpole
@@ -64,6 +65,29 @@ def test_rounds_and_what_it_says(mended):
     assert "before: " in text
     assert "after:  0 of 2000 held-out environments fail" in text
     assert len(mended.plot().axes) == 1
+
+
+@pytest.mark.thorough
+def test_rare_failures_are_compared_by_estimates():
+    space = {"k": vj.Box(0.0, 4.0), "x": vj.Normal(0.0, 1.0)}
+    system = lambda f, key: vj.Trace({"x": jnp.full(2, f["x"] - f["k"])}, dt=1.0)  # noqa: E731
+    problem = vj.Problem("tail", space, system, "always x < 3", nominal={"k": 1.0, "x": 0.0})
+    result = repair(problem, "k", 4000)
+    estimates = result.estimate(4000, seed=2)
+    for estimate, k in ((estimates.before, 1.0), (estimates.after, result.parameters["k"])):
+        share = norm.sf(3 + k)
+        if estimate.probability is None:
+            assert share < estimate.upper_bound
+        else:
+            assert 0.2 * share < estimate.probability < 5 * share
+    lines = str(estimates).splitlines()
+    assert lines[0] == "repair of tail, failure probabilities"
+    assert lines[1].startswith("  before: ")
+    assert lines[2].startswith("  after:  ")
+    assert ("not shown" in lines[3]) != estimates.lowered
+    assert result.nominal_problem.nominal["k"] == 1.0
+    assert result.held_out_before.failures == result.held_out_after.failures == 0
+    assert "too rare for the check to compare: see .estimate()" in str(result)
 
 
 def test_the_repaired_problem_is_ready(mended):

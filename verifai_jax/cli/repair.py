@@ -29,6 +29,11 @@ from verifai_jax.cli.arguments import (
 )
 @click.option("--run", "folder", type=click.Path(path_type=Path), help="Run with counterexamples.")
 @click.option("--budget", type=int, default=20_000, show_default=True, help="Simulations at most.")
+@click.option(
+    "--estimate",
+    type=int,
+    help="Simulations for each of the failure probabilities before and after  [default: none]",
+)
 @PARAMETER_CHOICE
 @PLOT
 def repair(
@@ -37,6 +42,7 @@ def repair(
     nominal: tuple[str, ...],
     folder: Path | None,
     budget: int,
+    estimate: int | None,
     plot: Path | None,
     **keywords: Any,
 ) -> None:
@@ -53,6 +59,8 @@ def repair(
         **keywords,
     )
     click.echo(printable(str(result)))
+    if estimate is not None:
+        click.echo(printable(str(result.estimate(estimate, seed=result.seed))))
     if plot is not None:
         result.plot(plot)
         click.echo(f"  picture      {plot}")

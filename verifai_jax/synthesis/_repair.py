@@ -154,6 +154,7 @@ def repair(
         arrays=system_of is not None,
         notes=tuple(work.notes),
         make=lambda: loop.with_parameters(theta),
+        make_nominal=lambda: loop.with_parameters(start),
     )
 
 

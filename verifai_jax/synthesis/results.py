@@ -137,6 +137,45 @@ class Round(NamedTuple):
     change: float
 
 
+class RepairEstimates(NamedTuple):
+    """Failure probabilities before and after a repair, as `Repair.estimate` returns them.
+
+    **Fields:**
+
+    - `name`: of the problem.
+    - `before`, `after`: an `Estimate` each.
+    """
+
+    name: str
+    before: Any
+    after: Any
+
+    @property
+    def lowered(self) -> bool:
+        """True where the whole interval after the repair is below the one before."""
+        known = self.before.probability is not None
+        return bool(known and self.after.high < self.before.low)
+
+    def __str__(self) -> str:
+        lines = [f"repair of {self.name}, failure probabilities"]
+        for when, estimate in (("before", self.before), ("after", self.after)):
+            sure = f"{100 * estimate.confidence:g} %"
+            if estimate.probability is None:
+                text = f"no estimate, at most {estimate.upper_bound:.2g} ({sure} bound)"
+            else:
+                text = (
+                    f"{estimate.probability:.3g} ({sure} interval {estimate.low:.3g} to "
+                    f"{estimate.high:.3g}), in {estimate.simulations:,} simulations"
+                )
+            lines.append(f"  {when + ':':<8}{text}")
+        lines.append(
+            "  lowered: the whole interval after the repair is below the one before"
+            if self.lowered
+            else "  not shown to be lower: the interval after the repair reaches the one before"
+        )
+        return "\n".join(lines)
+
+
 @dataclass(frozen=True, eq=False)
 class Repair:
     """Result of `repair`: parameters changed as little as removes the failures.
@@ -171,6 +210,7 @@ class Repair:
     arrays: bool = False
     notes: tuple[str, ...] = ()
     make: Callable[[], Problem] | None = field(default=None, repr=False)
+    make_nominal: Callable[[], Problem] | None = field(default=None, repr=False)
 
     @property
     def repaired(self) -> bool:
@@ -182,6 +222,31 @@ class Repair:
         """The problem with the repaired parameters: ready to `falsify`."""
         assert self.make is not None
         return self.make()
+
+    @cached_property
+    def nominal_problem(self) -> Problem:
+        """The problem with the parameters before the repair."""
+        assert self.make_nominal is not None
+        return self.make_nominal()
+
+    def estimate(self, budget: int = 50_000, **options: Any) -> RepairEstimates:
+        """Estimate the failure probabilities before and after, where failures are rare.
+
+        The check counts failures in samples of the prior, among which rare ones are none. This
+        looks for them, as `vj.estimate` does.
+
+        **Arguments:**
+
+        - `budget`: simulations at most for each of the two.
+        - `options`: of `vj.estimate`.
+
+        **Raises:** as `vj.estimate`.
+        """
+        estimate = late("verifai_jax.estimation", "estimate")
+        problems = (self.nominal_problem, self.problem)
+        return RepairEstimates(
+            self.name, *(estimate(problem, budget=budget, **options) for problem in problems)
+        )
 
     def __str__(self) -> str:
         lines = [f"repair of {self.name}: {self._changes()}"]
@@ -212,6 +277,9 @@ class Repair:
             lines.append(
                 "  the check found what the attacks did not: try a larger budget or margin"
             )
+        checks = (self.held_out_before, self.held_out_after)
+        if all(check is not None and check.simulations and not check.failures for check in checks):
+            lines.append("  too rare for the check to compare: see .estimate()")
         if _worse(self.held_out_before, self.held_out_after):
             lines.append("  the change made it worse: keep the nominal parameters")
         counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
