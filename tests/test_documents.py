@@ -12,7 +12,18 @@ from typing import NamedTuple
 import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGES = ("robustness_function",)
+PAGES = (
+    "own_equations",
+    "own_environment",
+    "own_mjcf",
+    "feature_spaces",
+    "reading_the_table",
+    "robustness_function",
+    "ode",
+    "signals",
+    "blackbox",
+    "replays",
+)
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 
 
