@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import pytest
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 PAGES = (
     "own_equations",
     "own_environment",
@@ -25,6 +26,10 @@ PAGES = (
     "replays",
 )
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
+FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
+LINK = re.compile(r"\]\(([\w./-]+)(?:#[\w-]+)?\)")
+"""A link to a file; those with a scheme lead elsewhere."""
 
 
 class Block(NamedTuple):
@@ -59,6 +64,12 @@ def test_every_block_is_python(page):
     assert len(found) == (DOCS / f"{page}.md").read_text().count("```python")
     for block in found:
         compile(block.code, page, "exec")
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_links_lead_to_files(file):
+    prose = CODE.sub("", file.read_text())
+    assert [link for link in LINK.findall(prose) if not (file.parent / link).exists()] == []
 
 
 @pytest.mark.thorough
