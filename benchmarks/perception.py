@@ -240,7 +240,7 @@ def gradient(seeds: int) -> None:
             )
 
 
-BUDGET = 4096
+BUDGET = 2048
 
 
 def rate_text(fails: np.ndarray) -> str:

@@ -21,6 +21,7 @@ from envs.cones import (
     neural,
     perfect,
 )
+from envs.cones_drawing import draw
 
 SAFE = "always cone_gap > 0.1"
 SWERVE = "always heading < 0.53"
@@ -75,6 +76,7 @@ def problem(name: str, perception: Perception, manoeuvre: str, about: str) -> vj
             **NOMINAL,
         },
         description=about,
+        draw=draw,
     )
 
 

@@ -1,5 +1,7 @@
 """The cones: the loop without a camera never fails, the networks do as was promised of them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,10 @@ import pytest
 import verifai_jax as vj
 from envs import cones as ec
 from envs import train_cones
+from envs.cones_drawing import film_strip
 from specs import cones as specs
 from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.figure import new_figure
 
 KEY = jax.random.key(0)
 PROBLEMS = [p for name in dir(specs) if isinstance(p := getattr(specs, name), vj.Problem)]
@@ -62,7 +66,7 @@ def test_problems_are_sound(problem):
 
 
 @pytest.mark.thorough
-def test_the_car_goes_around_the_cones_or_stops_before_them():
+def test_the_car_goes_around_the_cones_or_stops_before_them(tmp_path):
     around = jax.jit(specs.perfectly.system)(specs.perfectly.nominal, KEY)
     assert around["offset"][0] == 0
     assert abs(around["offset"][-1] - ec.LANE) < 0.1
@@ -72,8 +76,31 @@ def test_the_car_goes_around_the_cones_or_stops_before_them():
     assert 0.5 < stops["cone_gap"][-1] < 8
     film = specs.perfectly.system.film(around, specs.perfectly.nominal)
     assert film.shape == (len(around["x"]), ec.HEIGHT, ec.WIDTH, 3)
+    figure = film_strip(around, specs.perfectly.nominal, tmp_path / "strip.png", count=2)
+    assert len(figure.axes) == 4
+    assert (tmp_path / "strip.png").stat().st_size > 5000
+    assert "cones at 26.0 m  seen at 26.0 m" in figure.axes[1].get_title()
+    assert np.allclose(figure.axes[0].images[0].get_array(), film[0], atol=2e-3)
+    axes = new_figure().subplots()
+    specs.perfectly.draw(axes, around, 5, specs.perfectly.nominal)
+    assert "1.25 s" in axes.get_title()
     begun = np.argmax(np.asarray(around["distance"]) == ec.NOTHING)
     assert ec.TRIGGER - 7 < around["distance"][begun - 1] < ec.TRIGGER
+
+
+@pytest.mark.thorough
+def test_one_look_is_what_the_loop_saw_there_and_late_is_too_late():
+    def outcome(severity):
+        system = ec.cones(ec.late(severity))
+        features = {**specs.perfectly.nominal, "cruising_speed": 7.2}
+        trace = system(features, KEY)
+        looks = jax.vmap(lambda sample: system.frame(features, sample))(dict(trace.signals))
+        wrong = [jnp.max(jnp.abs(seen - trace[name])) for name, seen in looks.items()]
+        return trace["cone_gap"].min(), jnp.max(jnp.stack(wrong))
+
+    (gap, late_gap), wrong = jax.jit(jax.vmap(outcome))(jnp.array([0.0, 1.0]))
+    assert gap > 0.1 > late_gap
+    assert wrong.max() < 1e-3
 
 
 @pytest.mark.slow
@@ -88,12 +115,31 @@ def test_nothing_fails_that_sees_perfectly(problem):
 
 @pytest.mark.slow
 def test_the_narrow_network_does_not_see_cones_before_an_orange_car():
-    run = vj.falsify(specs.narrow, "uniform", budget=768, seed=1, confirm=False)
+    run = vj.falsify(specs.narrow, "uniform", budget=2048, seed=1, confirm=False)
     table = run.table.all
     orange, fails = table["car_hue"] < ec.ORANGE, table["rho"] < 0
     counts = [(int(fails[rows].sum()), int(rows.sum())) for rows in (orange, ~orange)]
     of_orange, of_others = (vj.clopper_pearson(*count) for count in counts)
     assert of_orange.low > 2 * of_others.high
+    rules = vj.analysis.rules(run).rules
+    assert rules
+    assert all("car_hue <= 0." in str(rule) for rule in rules)
+
+
+@pytest.mark.slow
+def test_the_wide_network_collides_after_few_images():
+    collisions = replace(specs.wide, spec=specs.SAFE, priority=None)
+    result = vj.perception.abstract(
+        collisions,
+        lambda severity: ec.cones(ec.late(severity)),
+        collisions.system.frame,
+        "distance < 15 and (estimate > 15 or logit < 0)",
+        budget=1000,
+    )
+    # Uniform sampling takes 20 000 images: one simulation of 33 in 600 fails.
+    assert len(result.confirmed) == 1
+    assert result.frames["total"] < 500
+    assert result.replay().violated
 
 
 def test_the_file_of_one_network_is_not_that_of_two(capsys):

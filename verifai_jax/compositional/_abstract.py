@@ -222,15 +222,17 @@ class _Stages:
         while self.rendered < self.budget:
             before = self.rendered
             stopped = self._look(min(self.batch, self.budget - self.rendered))
-            if stopped != "budget":
-                return INTERRUPTED if stopped == "interrupted" else stopped
-            for row in self._next_candidates():
+            if stopped == INTERRUPTED:
+                return INTERRUPTED
+            for row in self._next_candidates(last=stopped != BUDGET):
                 if self.rendered + self.per > self.budget:
                     return BUDGET
-                if self._simulate(row) == "interrupted":
+                if self._simulate(row) == INTERRUPTED:
                     return INTERRUPTED
                 if self.confirmed >= self.stop_after:
                     return FOUND
+            if stopped != BUDGET:
+                return stopped
             bar.advance(self.rendered - before, f"{self.confirmed} confirmed")
         return BUDGET
 
@@ -246,11 +248,10 @@ class _Stages:
             self.images = resume(self.images, budget=budget, progress=False)
         return self.images.stopped
 
-    def _next_candidates(self) -> list[int]:
-        """Return rows of images on which the network errs, the worst first."""
-        erring = self._erring()
-        rows = [int(row) for row in erring.index if row not in self.rows]
-        return rows[: max(1, self.batch // self.per)]
+    def _next_candidates(self, last: bool) -> list[int]:
+        """Return rows of images on which the network errs, the worst first; all in a last round."""
+        rows = [int(row) for row in self._erring().index if row not in self.rows]
+        return rows if last else rows[: max(1, self.batch // self.per)]
 
     def _erring(self) -> pd.DataFrame:
         assert self.images is not None
@@ -261,7 +262,7 @@ class _Stages:
         run = simulate(
             self.problem, self._erring().loc[[row]], batch=1, seed=self.seed, progress=False
         )
-        if run.stopped != "interrupted":
+        if run.stopped != INTERRUPTED:
             self.simulations.append(run)
             self.rows.append(row)
             self.after.append(self.rendered)

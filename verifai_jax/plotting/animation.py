@@ -77,9 +77,12 @@ def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
     samples = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count)).clip(
         max=len(clock) - 1
     )
+    # A sample that is longer than a frame is drawn once, and shown as long.
+    samples, repeated = np.unique(samples, return_counts=True)
     frames = [_frame(replay, draw, int(sample)) for sample in samples]
     # The last instant is the one that matters: it stays for a while.
-    shown = [1000 / FRAMES_PER_SECOND] * (count - 1) + [1500]
+    shown = [1000 / FRAMES_PER_SECOND * int(times) for times in repeated]
+    shown[-1] += 1500 - 1000 / FRAMES_PER_SECOND
     images = [Image.fromarray(frame).quantize(colors=32) for frame in frames]
     file = io.BytesIO()
     images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=shown, loop=0)
