@@ -45,7 +45,9 @@ class Compiled:
         """Names of the program's own variables, by the identity of what they hold."""
         core = sys.modules["scenic.core.distributions"]
         held: dict[int, str] = {}
-        for name, value in self.namespace.items():
+        parts = self.scenario.dynamicScenario
+        local = {name: getattr(parts, name, None) for name in getattr(parts, "_locals", ())}
+        for name, value in {**self.namespace, **local}.items():
             if not name.startswith("_") and isinstance(value, core.Samplable):
                 held.setdefault(id(value), name)
         return held
@@ -96,7 +98,7 @@ def compile_program(
     except KeyboardInterrupt:
         raise
     except Exception as error:
-        raise ProgramError(_message(error, filename)) from error
+        raise ProgramError(_message(error, filename, source)) from error
     return Compiled(compiled, namespace, source, filename)
 
 
@@ -121,7 +123,7 @@ def _path_of(program: str | Path) -> Path | None:
     return path
 
 
-def _message(error: BaseException, filename: str) -> str:
+def _message(error: BaseException, filename: str, source: str) -> str:
     """Return Scenic's message, with the file and line of the program that it is about."""
     line = getattr(error, "lineno", None)
     file = getattr(error, "filename", None) or filename
@@ -132,6 +134,10 @@ def _message(error: BaseException, filename: str) -> str:
             if code.co_filename == filename or code.co_filename.endswith(".scenic"):
                 file, line = code.co_filename, trace.tb_lineno
             trace = trace.tb_next
+    if isinstance(error, NameError) and file == filename and line is not None:
+        # Scenic gives assignments to ego the line of another statement.
+        using = [i for i, text in enumerate(source.splitlines(), 1) if str(error.name) in text]
+        line = line if line in using or not using else using[0]
     where = "" if line is None else f"{file}, line {line}: "
     text = str(error).strip().splitlines()
     first = text[0] if text else ""

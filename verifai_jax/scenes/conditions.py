@@ -77,10 +77,13 @@ class Condition:
     def __init__(self, requirement: Any, tree: ast.AST, compiled: Compiled) -> None:
         held = inspect.getclosurevars(requirement.closure).nonlocals
         code = held["condition"].atomics()[0].closure.__code__
-        if code.co_filename != compiled.filename or len(held["condition"].atomics()) != 1:
-            raise Unsupported("a requirement of an imported module, or over time")
+        if code.co_filename != compiled.filename:
+            raise Unsupported("a requirement of an imported module")
         self.tree, self.ego = tree, held["ego"]
-        self.bindings: Mapping[str, Any] = held["globalBindings"]
+        # Variables of a scenario's `setup` are kept by the scenario.
+        scenario = held["scenario"]
+        local = {name: getattr(scenario, name, None) for name in getattr(scenario, "_locals", ())}
+        self.bindings: Mapping[str, Any] = {**local, **held["globalBindings"]}
 
     def __call__(self, values: Values) -> Any:
         """Return whether the condition holds.
@@ -190,6 +193,8 @@ class _Evaluation:
         bound = self.bindings.get(name)
         own = getattr(bound, "__module__", "") or ""
         standard = bound is None or own.startswith(("scenic", "math", "builtins"))
+        if self.bindings.get(getattr(getattr(tree.func, "value", None), "id", "")) is math:
+            name, standard = tree.func.attr, True
         if name not in CALLS or tree.keywords or not standard:
             raise Unsupported(f"the function {name or 'call'} in a requirement")
         arguments = [self.of(argument) for argument in tree.args]

@@ -11,8 +11,11 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-SIMPLE = ("RectangularRegion", "CircularRegion")
-"""Regions with coordinates that a person recognises, kept where Scenic prunes them."""
+FRAMED = ("RectangularRegion", "CircularRegion", "SectorRegion")
+"""Regions with coordinates of their own, whatever is random about them."""
+
+PIECEWISE = ("PolygonalRegion", "PolylineRegion")
+"""Regions made of triangles or segments, which are invertible where they are fixed."""
 
 
 def field(node: Any, name: str) -> Any:
@@ -33,15 +36,23 @@ def is_random(value: Any) -> bool:
 def law(node: Any) -> Any:
     """Return the node that says how this one is computed.
 
-    Scenic replaces points in regions by points in the feasible part of them. Where the whole is a
-    rectangle or a disc, its coordinates are better, and the requirements refuse the rest.
+    Scenic replaces points in regions by points in the feasible part of them, of which there may be
+    no inverse. Then the whole region is taken, as it is where it has coordinates of its own; the
+    requirements refuse the rest.
     """
-    if kind_of(node) == "PointInRegionDistribution":
-        region = field(node, "region")
-        if kind_of(region) in SIMPLE and not is_random(region):
-            return node
     conditioned = field(node, "_conditioned")
-    return node if conditioned is None else conditioned
+    if conditioned is None or conditioned is node:
+        return node
+    if kind_of(node) == "PointInRegionDistribution":
+        whole = field(node, "region")
+        part = field(conditioned, "region")
+        if kind_of(whole) in FRAMED or (_is_fixed_pieces(whole) and not _is_fixed_pieces(part)):
+            return node
+    return conditioned
+
+
+def _is_fixed_pieces(region: Any) -> bool:
+    return kind_of(region) in PIECEWISE and not is_random(region)
 
 
 def children(node: Any) -> tuple[Any, ...]:

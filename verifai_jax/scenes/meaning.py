@@ -239,7 +239,7 @@ class Values:
         method, owner = field(node, "method"), field(node, "object")
         if kind_of(owner) == "VectorField" and method.__name__ == "__getitem__":
             return self._at_field(owner, field(node, "arguments")[0])
-        first = self._constant(owner)
+        first = self(owner)
         if isinstance(first, Vec | Yaw | Body):
             return self._applied(method.__name__, first, field(node, "arguments"))
         raise Unsupported(f"the method {method.__name__} of {kind_of(owner)}")

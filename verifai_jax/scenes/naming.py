@@ -11,8 +11,11 @@ from typing import Any
 
 from verifai_jax.scenes.graph import children, field, is_constructed, is_random, kind_of, law
 
-FIRST = ("position", "yaw", "parentOrientation", "heading", "orientation")
+FIRST = ("position", "yaw", "parentOrientation", "heading", "orientation", "width", "length")
 """Properties that give their name to a value before others that depend on it too."""
+
+FRAME = ("position", "center", "heading", "width", "length", "radius", "angle")
+"""Parts of a region that may be random."""
 
 ANGLES = ("yaw", "parentOrientation", "heading", "orientation", "pitch", "roll")
 """Properties that a person calls the heading."""
@@ -70,11 +73,14 @@ def leaf_names(
     for owner in made:
         properties = [p for p in FIRST if p in owner.properties]
         properties += [p for p in owner.properties if p not in FIRST]
+        for prop in owner.properties:
+            if prop not in ANGLES and _is_own(field(owner, prop)):
+                found.setdefault(id(_inner(field(owner, prop))), f"{owners[id(owner)]}.{prop}")
         for prop in properties:
             label = "heading" if prop in ANGLES else prop
-            _visit(field(owner, prop), f"{owners[id(owner)]}.{label}", "", found, owners)
+            _visit(field(owner, prop), f"{owners[id(owner)]}.{label}", found, owners, variables)
     for name, value in scenario.params.items():
-        _visit(value, f"param.{name}", "", found, owners)
+        _visit(value, f"param.{name}", found, owners, variables)
     for node in order:
         found.setdefault(id(node), "")
         if id(node) in variables and id(node) not in owners:
@@ -94,11 +100,26 @@ def unique(name: str, taken: Iterable[str]) -> str:
     return next(f"{stem}{i}" for i in range(2, len(known) + 3) if f"{stem}{i}" not in known)
 
 
+def _inner(node: Any) -> Any:
+    """Return what Scenic checks the type of, where it does."""
+    return field(node, "_dist") if kind_of(node) == "TypecheckedDistribution" else node
+
+
+def _is_own(node: Any) -> bool:
+    """Return whether a property is a random number or choice itself, and not computed from any."""
+    inner = _inner(node)
+    return is_random(inner) and not is_constructed(inner) and not children(inner)
+
+
 def _visit(
-    root: Any, label: str, suffix: str, found: dict[int, str], owners: Mapping[int, str]
+    root: Any,
+    label: str,
+    found: dict[int, str],
+    owners: Mapping[int, str],
+    variables: Mapping[int, str],
 ) -> None:
     """Name everything below a property that has no name yet, but for other objects' own."""
-    stack = [(root, label, suffix)]
+    stack = [(root, label, "")]
     seen: set[int] = set()
     while stack:
         node, label, suffix = stack.pop()
@@ -109,10 +130,14 @@ def _visit(
         pointed = kind_of(drawn) == "PointInRegionDistribution"
         found.setdefault(id(node), label if pointed or not suffix else f"{label}.{suffix}")
         moved = field(drawn, "operator") in LOCAL
-        operands = [field(drawn, "operands")] if moved else []
-        offsets = {id(operand) for operand in (operands[0] if operands else ())}
+        offsets = {id(operand) for operand in field(drawn, "operands")} if moved else set()
         places = vars(drawn).get("coordinates", ())
-        for child in reversed(children(node)):
+        region = kind_of(drawn).endswith("Region")
+        frame = {id(field(drawn, part)): part for part in FRAME} if region else {}
+        below_node = list(reversed(children(node)))
+        # The last is visited first, before what is computed from it.
+        below_node.sort(key=lambda child, frame=frame: id(child) in frame)
+        for child in below_node:
             own = suffix
             for axis, place in zip("xyz", places, strict=False):
                 if place is child:
@@ -120,4 +145,7 @@ def _visit(
             below = label
             if id(child) in offsets and label.endswith(".position"):
                 below = label.removesuffix("position") + "offset"
+            if id(child) in frame:
+                place = variables.get(id(node), f"{label}.region")
+                below, own = f"{place}.{frame[id(child)]}", ""
             stack.append((child, below, own))

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.scenes.compilation import ProgramError
 from verifai_jax.scenes.graph import field, is_random, kind_of
 from verifai_jax.scenes.meaning import Values, as_output
 from verifai_jax.scenes.sampling import LOCK, Refused, Sampling
@@ -88,7 +89,10 @@ class Outputs:
                 self.objects[owner] = names
 
     def _probe(self) -> Any:
-        """Return the values of one scene, to see which properties are numbers."""
+        """Return the values of one scene, to see which properties are numbers.
+
+        **Raises:** `ProgramError` for a program that Scenic itself cannot sample.
+        """
         random = np.random.default_rng(0)
         for _ in range(64):
             features = {
@@ -99,6 +103,10 @@ class Outputs:
                 return self.sampling.values(features)
             except Refused:
                 continue
+            except Exception as error:
+                raise ProgramError(
+                    f"Scenic cannot sample this program: {type(error).__name__}: {error}"
+                ) from error
         return None
 
     def _add(self, owner: str, name: str, trace: Read, on_host: Any, probe: Any) -> None:

@@ -127,6 +127,8 @@ def _simulator(scenario: Any) -> Any:
         else:
             newtonian = require("scenic.simulators.newtonian.simulator", "scenic")
             made = newtonian.NewtonianSimulator()
+        if hasattr(made, "render"):
+            made.render = False  # A window of its own in each worker helps nobody.
         scenario._verifai_jax_simulator = made
     return made
 
