@@ -90,7 +90,7 @@ bench: .venv-bench/installed .venv/scenic
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/perception.py frames
 	$(BIN)/python benchmarks/perception.py loop
-	$(BIN)/python benchmarks/scenic.py
+	$(BIN)/python benchmarks/scenes.py
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole

@@ -143,7 +143,8 @@ def _visit(
                 if place is child:
                     own = axis
             below = label
-            if id(child) in offsets and label.endswith(".position"):
+            inner = node is not root and bool(places)
+            if (inner or id(child) in offsets) and label.endswith(".position"):
                 below = label.removesuffix("position") + "offset"
             if id(child) in frame:
                 place = variables.get(id(node), f"{label}.region")
