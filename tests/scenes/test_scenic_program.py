@@ -1,6 +1,7 @@
 """Names, derivatives, systems and errors of Scenic programs."""
 
 import math
+import re
 import sys
 from pathlib import Path
 
@@ -190,3 +191,15 @@ class TestWithScenic:
             program.simulator(steps=2, records=("gapp",))(features, 0)
         with pytest.raises(ValueError, match="steps must be"):
             program.simulator(steps=0)
+
+    def test_the_code_of_the_page_runs(self, monkeypatch, capsys):
+        root = GALLERY.parents[2]
+        monkeypatch.chdir(root)
+        page = (root / "docs" / "scenic.md").read_text()
+        blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+        assert len(blocks) == 4
+        names: dict = {"__name__": "page"}
+        for block in blocks:
+            exec(compile(block, "scenic.md", "exec"), names)
+        assert "simulations violate the property" in capsys.readouterr().out
+        assert names["chased"].table.all["status"].eq("ok").any()
