@@ -75,6 +75,13 @@ def test_a_short_run_does_not_wait_for_a_compiler():
     assert "less than compiling for mjx takes" in choice.why
 
 
+def test_few_simulations_are_not_measured_however_slow(monkeypatch):
+    monkeypatch.setattr(backends, "_speed", lambda *arguments: pytest.fail("measured"))
+    choice = resolved(problem(likely="mjx"), batch=8, budget=30)
+    assert choice.backend == "native"
+    assert choice.why == "30 simulations, which take less than compiling for mjx takes"
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(("slow", "faster"), [(0.2, "mjx"), (0.0, "native")])
 def test_the_faster_one_is_taken_as_measured(monkeypatch, slow, faster):

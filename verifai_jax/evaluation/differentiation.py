@@ -64,6 +64,9 @@ class Derivative:
         """Differentiate an objective of several values: a reverse sweep for each, or as above."""
         if self.reverse:
             values, sweep, auxiliary = jax.vjp(objective, u, has_aux=True)
+            if len(values) == 1:
+                # Without an axis for it, which takes longer to trace and to compile.
+                return sweep(jnp.ones_like(values))[0][None], auxiliary
             each = jnp.eye(len(values), dtype=values.dtype)
             return jax.vmap(lambda weight: sweep(weight)[0])(each), auxiliary
         by_coordinate, auxiliary = _forward(objective, u)

@@ -24,6 +24,7 @@ from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.compilation import Compilation, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
+from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
@@ -103,6 +104,8 @@ class Engine:
         self._packing: dict[Mode, Packing] = {}
         self._traced: dict[Mode, jax.stages.Traced] = {}
         self._compiling: dict[Mode, Compilation] = {}
+        self._numbers: dict[Mode, LiftedNumbers] = {}
+        self._vectors: dict[Mode, Array] = {}
         self._executables: dict[Mode, jax.stages.Compiled] = {}
 
     def begin_compiling(self) -> None:
@@ -217,20 +220,25 @@ class Engine:
                 temperatures = np.full(self.padded, temperatures)
             # In NumPy: of an array of JAX each first use of this kind compiles a program.
             rows = jax.tree.map(lambda leaf: _pad(np.asarray(leaf), self.padded), rows)
+            program = self._executable(mode)
+            numbers = self._vectors[mode]
             if self.alone:
                 one = jax.tree.map(lambda leaf: leaf[0], rows)
-                packed = self._executable(mode)(one, _one_key(key), temperatures[0], shared)
+                packed = program(one, _one_key(key), temperatures[0], shared, numbers)
                 packed = jax.tree.map(lambda leaf: np.asarray(leaf)[None], packed)
             else:
                 number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
-                packed = self._executable(mode)(rows, number, temperatures, shared)
+                packed = program(rows, number, temperatures, shared, numbers)
             return self._packing[mode].unpack(packed, count)
 
     def _executable(self, mode: Mode) -> jax.stages.Compiled:
         if mode not in self._executables:
             self._begin(mode)
             started = time.perf_counter()
-            self._executables[mode] = self._compiling.pop(mode).result()
+            program = self._executables[mode] = self._compiling.pop(mode).result()
+            # Once where the program reads it, and not with every batch.
+            vector = self._numbers[mode].vector(self.precision)
+            self._vectors[mode] = jax.device_put(vector, program.input_shardings[0][-1])
             self.compile_seconds += time.perf_counter() - started
         return self._executables[mode]
 
@@ -259,11 +267,15 @@ class Engine:
             jax.ShapeDtypeStruct(leading, key.dtype) if self.own_keys else (key, first),
             jax.ShapeDtypeStruct(leading, jnp.float32),
             self.inputs.shared_form,
+            jax.ShapeDtypeStruct((CAPACITY,), self.precision),
         )
         packing = self._packing[mode] = Packing()
+        numbers = self._numbers[mode] = LiftedNumbers()
 
-        def packed_row(row: PyTree, key: Array, temperature: Array, shared: PyTree) -> Any:
-            result = one_row(row, key, temperature, shared)
+        def packed_row(
+            row: PyTree, key: Array, temperature: Array, shared: PyTree, vector: Array
+        ) -> Any:
+            result = numbers.read_from(vector, lambda: one_row(row, key, temperature, shared))
             if isinstance(result, Row) and not self.inputs.keeps_features:
                 result = result._replace(features=None)
             return packing.pack(result)
@@ -277,12 +289,20 @@ class Engine:
     def _batched(self, one_row: Callable[..., Any]) -> Callable[..., Any]:
         """Spread `one_row` over chunks of lanes and over the devices."""
 
-        def on_device(rows: PyTree, numbers: Array, temperature: Array, key: Any, shared: PyTree):
+        def on_device(
+            rows: PyTree,
+            numbers: Array,
+            temperature: Array,
+            key: Any,
+            shared: PyTree,
+            vector: Array,
+        ) -> Any:
             def chunk(block: tuple[PyTree, Array, Array]) -> Any:
                 keys = block[1]
                 if not self.own_keys:
                     keys = jax.vmap(partial(simulation_key, key))(keys)
-                return jax.vmap(one_row, in_axes=(0, 0, 0, None))(block[0], keys, block[2], shared)
+                each = jax.vmap(one_row, in_axes=(0, 0, 0, None, None))
+                return each(block[0], keys, block[2], shared, vector)
 
             blocks = (rows, numbers, temperature)
             if self.chunks == 1:
@@ -293,15 +313,17 @@ class Engine:
             results = jax.lax.map(chunk, cut)
             return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), results)
 
-        split = (True, True, True, False, False)
+        split = (True, True, True, False, False, False)
         spread = spread_over_devices(on_device, split, self.devices)
 
-        def program(rows: PyTree, number: Any, temperature: Array, shared: PyTree) -> Any:
+        def program(
+            rows: PyTree, number: Any, temperature: Array, shared: PyTree, vector: Array
+        ) -> Any:
             if self.own_keys:
-                return spread(rows, number, temperature, (), shared)
+                return spread(rows, number, temperature, (), shared, vector)
             key, first = number
             numbers = first + jnp.arange(self.padded, dtype=jnp.int32)
-            return spread(rows, numbers, temperature, key, shared)
+            return spread(rows, numbers, temperature, key, shared, vector)
 
         return program
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from verifai_jax.core.lifting import lifting
 from verifai_jax.problem.problem import Problem
 
 
@@ -62,7 +63,9 @@ class CubePoints(Inputs):
     def simulated(
         self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
     ) -> tuple[PyTree, Callable[..., Any]]:
-        return self.problem.space.unflatten(coordinates), self.problem.system
+        with lifting():
+            features = self.problem.space.unflatten(coordinates)
+        return features, self.problem.system
 
 
 class TableRows(Inputs):
@@ -116,4 +119,6 @@ class WithParameters(Inputs):
         self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
     ) -> tuple[PyTree, Callable[..., Any]]:
         theta, u = coordinates[: self.size], coordinates[self.size :]
-        return self.problem.space.unflatten(u), self.system_of(theta)
+        with lifting():
+            features = self.problem.space.unflatten(u)
+        return features, self.system_of(theta)

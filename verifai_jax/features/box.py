@@ -10,6 +10,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
+from verifai_jax.core.lifting import is_lifting, lifted
 from verifai_jax.features.domain import (
     LEAST_REAL,
     MOST_LEVELS,
@@ -103,15 +104,18 @@ class Box(Domain):
 
     def from_unit(self, u: Float[Array, " size"]) -> Float[Array, "*entries"]:
         low, high, _, width = self._limits(u.dtype)
-        u = u.reshape(low.shape)
-        # From the nearer end: exact at both ends and, but for a narrow box, never beyond them.
-        value = jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
         first, last = self.ends(u.dtype)
         eps = jnp.finfo(u.dtype).eps
         narrow = width < NARROW * eps * np.maximum(np.abs(low), np.abs(high))
-        if np.any(narrow | (low != first) | (high != last)):
-            value = clip_to_ends(value, first, last)
-        return value
+        # Where the program is to serve other bounds too, they may need it.
+        clips = is_lifting() or bool(np.any(narrow | (low != first) | (high != last)))
+        u = u.reshape(low.shape)
+        low, high, width, first, last = lifted(
+            self, low=low, high=high, width=width, first=first, last=last
+        )
+        # From the nearer end: exact at both ends and, but for a narrow box, never beyond them.
+        value = jnp.where(u < 0.5, low + u * width, high - (1 - u) * width)
+        return clip_to_ends(value, first, last) if clips else value
 
     def to_unit(self, value: Numbers) -> Float[Array, " size"]:
         value = as_real(value)

@@ -56,7 +56,7 @@ def ends_within(
 
 
 def clip_to_ends(
-    x: Float[Array, "*shape"], first: np.ndarray, last: np.ndarray
+    x: Float[Array, "*shape"], first: np.ndarray | Array, last: np.ndarray | Array
 ) -> Float[Array, "*shape"]:
     """Return numbers moved to the ends that they are beyond, with the derivative of `x` there.
 
@@ -66,7 +66,7 @@ def clip_to_ends(
 
 
 def replace_where(
-    x: Float[Array, "*shape"], condition: Any, value: float | np.floating | np.ndarray
+    x: Float[Array, "*shape"], condition: Any, value: float | np.floating | np.ndarray | Array
 ) -> Float[Array, "*shape"]:
     """Return `value` where the condition holds, and `x` elsewhere, with the derivative of `x`."""
     return jnp.where(condition, value + (x - jax.lax.stop_gradient(x)), x)

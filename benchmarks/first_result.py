@@ -1,0 +1,182 @@
+"""Time to a first result, whole processes: from the shell to the end, beside the code before.
+
+    python benchmarks/first_result.py --before ../checkout-of-before [--pairs 3] [--cases cold,help]
+
+Each case is run in turn with both checkouts, in processes of their own, and the order of a pair
+changes from pair to pair. Processor time (user and system, all threads, from the operating system)
+is what a busy machine disturbs least; the wall-clock time is beside it. The ratio is the median of
+those of the pairs.
+
+| case | what runs |
+|---|---|
+| `cold` | a planar quadrotor by `vj.ode`, default search and budget, no compiled program on disk |
+| `again` | the same in a new process |
+| `bound` | the same after an edit of a bound of its wind |
+| `budget` | the same after an edit of the budget, 10 000 to 9000 |
+| `at1` | `verifai-jax falsify` of ARCH AT1 to its first confirmed counterexample, the second time |
+| `falsify` | what `make falsify` runs, with its pictures, the second time |
+| `help`, `import` | `verifai-jax --help`; `import verifai_jax` and `verifai_jax.Box` |
+"""
+
+import argparse
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+CASES = ("cold", "again", "bound", "budget", "at1", "falsify", "help", "import")
+AT1 = "specs/arch/automatic_transmission.py:at1"
+COMMAND = "import sys; from verifai_jax.cli.main import main; sys.argv[0] = 'verifai-jax'; main()"
+
+
+def quadrotor(gust):
+    """Return the problem of a quadrotor in a plane that is to hover in gusts."""
+    import jax.numpy as jnp
+
+    import verifai_jax as vj
+
+    def motion(time, state, control, features):
+        thrust, torque = control["thrust"], control["torque"]
+        drag = 0.3 * (features["wind"](time) - state["vx"])
+        return {
+            "x": state["vx"],
+            "z": state["vz"],
+            "theta": state["omega"],
+            "vx": (drag - thrust * jnp.sin(state["theta"])) / features["mass"],
+            "vz": (thrust * jnp.cos(state["theta"]) - 0.3 * state["vz"]) / features["mass"] - 9.81,
+            "omega": torque / features["inertia"],
+        }
+
+    def hover(time, state, features):
+        lean = jnp.clip((state["x"] + 1.6 * state["vx"]) / 9.81, -0.5, 0.5)
+        lift = 9.81 + 6.0 * (1.0 - state["z"]) - 4.0 * state["vz"]
+        turn = 0.02 * (40.0 * (lean - state["theta"]) - 9.0 * state["omega"])
+        return {"thrust": jnp.clip(0.5 * lift, 0.0, 12.0), "torque": jnp.clip(turn, -0.2, 0.2)}
+
+    def start(features, key):
+        still = {"z": 1.0, "vx": 0.0, "vz": 0.0, "omega": 0.0}
+        return {"x": features["x0"], "theta": features["theta0"], **still}
+
+    space = {
+        "x0": vj.Box(-1.0, 1.0),
+        "theta0": vj.Box(-0.6, 0.6),
+        "mass": vj.Box(0.4, 0.8),
+        "inertia": vj.Box(0.01, 0.03),
+        "wind": vj.Signal(vj.Box(-gust, gust), knots=5, hold="linear"),
+    }
+    spec = {
+        "stays": "always abs(x) < 2.5",
+        "high": "always z > 0.3",
+        "calm": "eventually[0, 4] always[0, 1] abs(theta) < 0.3",
+    }
+    system = vj.ode(motion, start, controller=hover, dt=0.01, duration=5.0)
+    nominal = {"x0": 0.0, "theta0": 0.0, "mass": 0.5, "inertia": 0.02, "wind": 0.0}
+    return vj.Problem("hover", space, system, spec, nominal=nominal)
+
+
+def run_quadrotor(gust, budget):
+    """Falsify it and print what came of it."""
+    import verifai_jax as vj
+
+    run = vj.falsify(quadrotor(gust), budget=budget, progress=False)
+    least = run.table.all["rho"].min()
+    print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
+
+
+def measure(command, checkout, cache):
+    """Return processor seconds and seconds of a process, and what it printed."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "VERIFAI_JAX_CACHE": str(cache)}
+    started = time.perf_counter()
+    process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    said = process.stdout.read().decode()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    seconds = time.perf_counter() - started
+    if process.returncode:
+        raise SystemExit(f"{' '.join(command)} failed in {checkout}")
+    return usage.ru_utime + usage.ru_stime, seconds, said
+
+
+def command_of(case, place):
+    """Return the command of a case; `place` is an empty folder."""
+    python = sys.executable
+    if case in ("cold", "again", "bound", "budget"):
+        gust, budget = 2.1 if case == "bound" else 2.0, 9000 if case == "budget" else 10_000
+        return [python, __file__, "--quadrotor", str(gust), str(budget)]
+    if case == "import":
+        return [python, "-c", "import verifai_jax; verifai_jax.Box"]
+    if case == "help":
+        return [python, "-c", COMMAND, "--help"]
+    folder = ["--folder", str(place / "run"), "--no-progress"]
+    if case == "at1":
+        return [python, "-c", COMMAND, "falsify", AT1, "--stop-after", "1", *folder]
+    target = ["specs/cartpole.py:balance", "--search", "uniform", "--budget", "20000"]
+    return [python, "-c", COMMAND, "falsify", *target, *folder]
+
+
+def one(case, checkout, caches):
+    """Run a case once and return its processor seconds, its seconds and what it printed."""
+    cache = caches / checkout.name
+    with tempfile.TemporaryDirectory() as place:
+        if case == "cold":
+            # What it compiles is there for the cases that come again.
+            cache = caches / f"{checkout.name}-again"
+            shutil.rmtree(cache, ignore_errors=True)
+        elif case not in ("help", "import"):
+            # What an earlier process has compiled; for an edit, before the edit.
+            shutil.copytree(filled(case, checkout, caches), cache := Path(place) / "cache")
+        return measure(command_of(case, Path(place)), checkout, cache)
+
+
+def filled(case, checkout, caches):
+    """Return the cache that an earlier process of this checkout has left."""
+    before = "again" if case in ("bound", "budget") else case
+    cache = caches / f"{checkout.name}-{before}"
+    if not cache.exists():
+        with tempfile.TemporaryDirectory() as place:
+            measure(command_of(before, Path(place)), checkout, cache)
+    return cache
+
+
+def main():
+    """Measure pairs and print one line a case."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--before", type=Path, help="a checkout of the code before")
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--cases", default=",".join(CASES))
+    parser.add_argument("--quadrotor", nargs=2, type=float, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.quadrotor:
+        run_quadrotor(options.quadrotor[0], int(options.quadrotor[1]))
+        return
+    now = Path(__file__).resolve().parents[1]
+    checkouts = [now] if options.before is None else [options.before.resolve(), now]
+    print(f"{'case':<10}{'before':>16}{'now':>16}{'ratio':>8}   processor s (wall s)")
+    with tempfile.TemporaryDirectory() as caches:
+        for case in options.cases.split(","):
+            rows = {checkout: [] for checkout in checkouts}
+            for pair in range(options.pairs):
+                for checkout in checkouts if pair % 2 else checkouts[::-1]:
+                    rows[checkout].append(one(case, checkout, Path(caches)))
+            if case in ("cold", "again", "bound", "budget"):
+                assert len({said for runs in rows.values() for _, _, said in runs}) == 1, rows
+            shown = [
+                f"{statistics.median(r[0] for r in runs):.2f} "
+                f"({statistics.median(r[1] for r in runs):.1f})"
+                for runs in rows.values()
+            ]
+            ratio = ""
+            if len(checkouts) == 2:
+                pairs = zip(rows[now], rows[checkouts[0]], strict=True)
+                ratio = f"{statistics.median(a[0] / b[0] for a, b in pairs):.2f}"
+            before = shown[0] if len(checkouts) == 2 else ""
+            print(f"{case:<10}{before:>16}{shown[-1]:>16}{ratio:>8}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

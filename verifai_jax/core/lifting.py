@@ -1,0 +1,103 @@
+"""Numbers that a compiled program reads from an argument, where they would be constants in it.
+
+    numbers = LiftedNumbers()
+    numbers.read_from(vector, lambda: simulate(u))      # while a program of (u, vector) is traced
+    numbers.vector("float32")                           # the argument to call the program with
+
+A program that holds the bounds of a space is another one for every edit of a bound, and compiled
+anew. Within `lifting()`, which stands around the map from the unit cube to features, a domain asks
+`lifted(self, ...)` for its numbers; elsewhere they stay constants.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+CAPACITY = 256
+"""Numbers of a program that are lifted; further ones stay constants."""
+
+T = TypeVar("T")
+
+
+class LiftedNumbers:
+    """The numbers of one program, and their places in its argument."""
+
+    def __init__(self) -> None:
+        self._places: dict[tuple[int, str], int] = {}
+        self._owners: list[object] = []  # Kept, so that their identities stay theirs.
+        self._values: list[float] = []
+
+    def read_from(self, vector: Float[Array, " numbers"], function: Callable[[], T]) -> T:
+        """Call a function, while what it asks to be lifted is read from the vector."""
+        token = _current.set((self, vector))
+        try:
+            return function()
+        finally:
+            _current.reset(token)
+
+    def vector(self, precision: str) -> Float[np.ndarray, " numbers"]:
+        """Return the argument: the numbers in this precision, and zeros behind them."""
+        vector = np.zeros(CAPACITY, precision)
+        vector[: len(self._values)] = self._values
+        return vector
+
+    def place(self, name: str, owner: object, values: np.ndarray) -> int | None:
+        """Return where these numbers begin in the vector; None where there is no room for them."""
+        key = (id(owner), name)
+        if key not in self._places:
+            if len(self._values) + values.size > CAPACITY:
+                return None
+            self._places[key] = len(self._values)
+            self._owners.append(owner)
+            self._values.extend(np.ravel(values).tolist())
+        return self._places[key]
+
+
+_current: ContextVar[tuple[LiftedNumbers, Any] | None] = ContextVar("lifted numbers", default=None)
+_wanted: ContextVar[bool] = ContextVar("numbers are to be lifted", default=False)
+
+
+@contextmanager
+def lifting() -> Iterator[None]:
+    """Return a context in which numbers are lifted, where the program being traced can take them.
+
+    Nothing that JAX traces once and keeps may be called in it: it would keep the argument.
+    """
+    token = _wanted.set(True)
+    try:
+        yield
+    finally:
+        _wanted.reset(token)
+
+
+def is_lifting() -> bool:
+    """Return whether numbers are lifted here."""
+    return _wanted.get() and _current.get() is not None
+
+
+def lifted(owner: object, **values: np.ndarray) -> tuple[Any, ...]:
+    """Return these numbers: as an argument of the program that is traced, or as they are.
+
+    **Arguments:**
+
+    - `owner`: of the numbers, which they are known by, with their names.
+    - `values`: arrays of the precision of the program.
+    """
+    current = _current.get()
+    if current is None or not _wanted.get():
+        return tuple(values.values())
+    numbers, vector = current
+    found = []
+    for name, value in values.items():
+        same = value.dtype == vector.dtype
+        place = numbers.place(name, owner, value) if same else None
+        if place is None:
+            found.append(value)
+        else:
+            found.append(jnp.reshape(vector[place : place + value.size], value.shape))
+    return tuple(found)
