@@ -14,7 +14,7 @@ PACKAGE = ROOT / "verifai_jax"
 LAYERS = (
     {"core", "statistics", "_version"},
     {"features", "mtl", "systems", "search"},
-    {"rl", "problem", "perception", "events", "scenes"},
+    {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation"},
     {"falsification"},
     {"counterexamples", "estimation", "synthesis", "certification", "analysis", "compositional"},

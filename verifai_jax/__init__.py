@@ -9,6 +9,7 @@ from verifai_jax.core.cores import claim_cores as _claim_cores
 if TYPE_CHECKING:
     from verifai_jax import analysis as analysis
     from verifai_jax import augmentation as augmentation
+    from verifai_jax import blocks as blocks
     from verifai_jax import events as events
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
@@ -99,7 +100,7 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
 
-_ROOMS = ("analysis", "augmentation", "events", "mtl", "perception", "rl", "search")
+_ROOMS = ("analysis", "augmentation", "blocks", "events", "mtl", "perception", "rl", "search")
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 _NAMES = {

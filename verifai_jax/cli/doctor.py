@@ -23,6 +23,7 @@ EXTRAS = {
     "brax": "brax",
     "gymnax": "gymnax",
     "gymnasium": "gymnasium",
+    "diffrax": "diffrax",
 }
 """Optional packages, and the extra of verifai_jax that installs each."""
 

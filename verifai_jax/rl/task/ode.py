@@ -20,11 +20,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.waveform import within_step
 from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
-from verifai_jax.systems.ode._ode import Ode
-from verifai_jax.systems.ode.integrators import Derivative, Time, integrator
+from verifai_jax.systems.ode._ode import Ode, substep, updated
 from verifai_jax.systems.pytree_checks import as_floating, outline
 
 Tree = TypeVar("Tree")
@@ -81,14 +79,7 @@ class OdeTask:
         """Take one period of the control, cut short where the loop ends."""
         loop, start = self.loop, state
         features, control = start.features, self.control(action)
-        advance = integrator(loop.method)
         dt = loop.dt / loop.substeps
-
-        def derivative_from(begin: Time) -> Derivative:
-            def derivative(now: Time, state: PyTree) -> PyTree:
-                return loop.dynamics(now, state, control, within_step(features, begin, now))
-
-            return derivative
 
         def ended(state: PyTree) -> Bool[Array, ""]:
             over = False if loop.terminate is None else loop.terminate(state, features)
@@ -98,7 +89,8 @@ class OdeTask:
         for _ in range(loop.steps_per_control):
             after, later = now, time
             for _ in range(loop.substeps):
-                after, later = advance(derivative_from(later), later, after, dt), later + dt
+                after, later = substep(loop, features, control, later, after, dt), later + dt
+            after = updated(loop, time + loop.dt, after, features)
             # Each sample of a trace may be its last.
             time, now = _where(over, (time, now), (time + loop.dt, after))
             over = over | ended(now)

@@ -9,7 +9,7 @@ forward and reverse.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -25,7 +25,8 @@ from verifai_jax.core.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
-from verifai_jax.systems.ode.integrators import Derivative, Time, check_factor, integrator
+from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_factor, integrator
+from verifai_jax.systems.ode.switching import Switch, switched_step
 from verifai_jax.systems.pytree_checks import (
     as_floating,
     check_like,
@@ -51,12 +52,14 @@ class Ode(System):
     dt: float = field()
     steps: int
     steps_per_control: int
-    method: str
+    method: str | Integrator
     signals: Callable[..., Mapping[str, Any]] | None
     terminate: Callable[..., Any] | None
     unroll: int
     substeps: Any = 1
     exact_step: bool = False
+    update: Callable[..., Any] | None = None
+    switches: tuple[Switch, ...] = ()
 
     @property
     def duration(self) -> float:
@@ -154,6 +157,7 @@ class _Rollout:
             control, next_memory = self.decide(k, age, time, state, memory, held)
             signals = self.signals(time, state, control)
             next_state = self.step(time, self.safe_state(frozen, state, start), control)
+            next_state = updated(loop, time + loop.dt, next_state, self.features)
             applied = None if held is None else control
             following = (next_state, next_memory, applied, age + 1)
             after = _where(frozen, (state, memory, applied, age), following)
@@ -235,24 +239,15 @@ class _Rollout:
     def step(self, time: Time, state: PyTree, control: PyTree) -> Any:
         """Integrate from one sample to the next."""
         count = self.loop.substeps
-        advance = integrator(self.loop.method)
-
-        def derivative_from(begin: Time) -> Derivative:
-            def derivative(now: Time, state: PyTree) -> Any:
-                features = within_step(self.features, begin, now)
-                return self.loop.dynamics(now, state, control, features)
-
-            return derivative
-
         if isinstance(count, int) and count == 1:
-            return advance(derivative_from(time), time, state, self.loop.dt)
+            return substep(self.loop, self.features, control, time, state, self.loop.dt)
         dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
 
-        def substep(j: Int[Array, ""], state: PyTree) -> Any:
+        def advance(j: Int[Array, ""], state: PyTree) -> Any:
             begin = time + j.astype(dt.dtype) * dt
-            return advance(derivative_from(begin), begin, state, dt)
+            return substep(self.loop, self.features, control, begin, state, dt)
 
-        return jax.lax.fori_loop(0, count, substep, state)
+        return jax.lax.fori_loop(0, count, advance, state)
 
     def check(self, state: PyTree, memory: PyTree) -> tuple[str, ...]:
         """Refuse functions that do not fit together; abstract evaluation, nothing compiles.
@@ -283,6 +278,19 @@ class _Rollout:
         )
         role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
         check_like(derivative, state, "dynamics", role, note)
+        role = "a state, in the form of the state"
+        if loop.update is not None:
+            after = jax.eval_shape(loop.update, time, state, self.features)
+            check_like(after, state, "update", role, defined_at(loop.update))
+        for switch in loop.switches:
+            after = jax.eval_shape(switch.reset, time, state, self.features)
+            check_like(after, state, "reset of a Switch", role, defined_at(switch.reset))
+            guard = jax.eval_shape(switch.guard, time, state, self.features)
+            if getattr(guard, "shape", None) != () or not jnp.issubdtype(guard.dtype, jnp.floating):
+                raise ValueError(
+                    f"guard of a Switch must return one real number; got {outline(guard)}"
+                    f"{defined_at(switch.guard)}"
+                )
         parts, finite = jax.tree.leaves(state), []
 
         def sample_signals(control: PyTree) -> Any:
@@ -300,6 +308,31 @@ class _Rollout:
                     f"{defined_at(loop.terminate)}"
                 )
         return tuple(finite)
+
+
+def substep(
+    loop: Ode, features: Features, control: PyTree, begin: Time, state: PyTree, dt: Step
+) -> Any:
+    """Take one integration step of a loop from `begin` on, with its switches."""
+
+    def derivative(now: Time, state: PyTree) -> Any:
+        return loop.dynamics(now, state, control, within_step(features, begin, now))
+
+    advance = integrator(loop.method)
+    return switched_step(advance, derivative, begin, state, dt, loop.switches, features)
+
+
+def updated(loop: Ode, time: Time, state: PyTree, features: Features) -> Any:
+    """Return the state after what changes at a sample."""
+    if loop.update is None:
+        return state
+    # What is not finite stays so: an update may not hide it.
+    finite = jnp.array(True)
+    for leaf in jax.tree.leaves(state):
+        finite &= jnp.all(jnp.isfinite(leaf))
+    after = loop.update(time, state, features)
+    after = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), after, state)
+    return _where(finite, after, state)
 
 
 def _status(last: PyTree) -> Int[Array, ""]:
@@ -332,13 +365,15 @@ def ode(
     dt: float,
     duration: float | None = None,
     steps: int | None = None,
-    method: str = "rk4",
+    method: str | Integrator = "rk4",
     control_period: float | None = None,
     controller_memory: PyTree = None,
     signals: Callable[..., Mapping[str, Any]] | None = None,
     terminate: Callable[..., Any] | None = None,
     unroll: int = 1,
     exact_step: bool = False,
+    update: Callable[..., Any] | None = None,
+    switches: Sequence[Switch] = (),
 ) -> Ode:
     """Make a system `(features, key) -> Trace` from equations of motion, with a fixed step.
 
@@ -352,7 +387,7 @@ def ode(
     - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
     - `duration`: in seconds, a multiple of `dt`; or the number of `steps`.
     - `method`: `"rk4"`, `"euler"`, or `"semi_implicit_euler"`, whose state is a tuple
-      `(positions, velocities)`.
+      `(positions, velocities)`; or an integrator, as `vj.blocks.adaptive` makes them.
     - `control_period`: seconds between two runs of the controller, a multiple of `dt`; its output
       is held in between. `dt` when left out.
     - `controller_memory`: the memory at time 0 of a controller that has one (an integrator, a
@@ -368,6 +403,11 @@ def ode(
       is published as a difference equation. A counterexample is then confirmed in double precision
       and under rounding alone. False for a plant that moves continuously, of which a step is an
       approximation: counterexamples are also replayed at a half and a quarter of it.
+    - `update(time, state, features) -> state`: what changes at once at each sample but the first,
+      before the controller runs: a delay line, a latch, a counter. The derivative of such a part
+      is 0.
+    - `switches`: jumps of the state, such as an impact or a change of the mode, at instants found
+      within the step; see `vj.blocks.Switch`.
 
     **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
     infinite.
@@ -387,6 +427,9 @@ def ode(
     if controller is None and (control_period is not None or controller_memory is not None):
         raise ValueError("control_period and controller_memory need a controller; got none")
     check_count("unroll", unroll)
+    for switch in switches:
+        if not isinstance(switch, Switch):
+            raise ValueError(f"switches must be a list of vj.blocks.Switch; got {switch!r}")
     return Ode(
         dynamics=dynamics,
         initial=initial,
@@ -402,4 +445,6 @@ def ode(
         terminate=terminate,
         unroll=unroll,
         exact_step=exact_step,
+        update=update,
+        switches=tuple(switches),
     )

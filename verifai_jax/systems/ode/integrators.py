@@ -64,11 +64,13 @@ METHODS: dict[str, Integrator] = {
 }
 
 
-def integrator(method: str) -> Integrator:
-    """Return the integrator of this name.
+def integrator(method: str | Integrator) -> Integrator:
+    """Return the integrator of this name; one of the user's own as it is.
 
     **Raises:** `UnknownNameError` for a name that is none of `METHODS`.
     """
+    if callable(method):
+        return method
     if method not in METHODS:
         raise unknown_name("method", method, METHODS)
     return METHODS[method]

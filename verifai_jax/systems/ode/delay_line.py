@@ -1,0 +1,80 @@
+"""Transport delays: what a quantity was some time ago.
+
+line = delay_line(14.7, longest=0.8, period=0.01)    # in initial(): 14.7 until time 0
+line.at(time - 0.3)                                  # in dynamics(): 0.3 s ago
+line.push(time, state["lambda"])                     # in update(): once a period
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.core.checks import is_number
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DelayLine:
+    """The last samples of a quantity, the newest first, with lines between them.
+
+    It is part of a state, or of a controller's memory, and made by `delay_line`.
+
+    **Fields:** `values` `[n, ...]`; `latest`, the time in seconds of the first of them; `period`
+    between two, in seconds.
+    """
+
+    # JAX rebuilds the class with placeholders and with batches, which have other shapes.
+    __no_type_check__ = True
+
+    values: Float[Array, "n *shape"]
+    latest: Float[Array, ""]
+    period: float = field(metadata={"static": True})
+
+    def push(self, time: Any, value: Any) -> "DelayLine":
+        """Return the line with the value of this time, a period after the last one."""
+        newest = jnp.asarray(value, self.values.dtype)[None]
+        values = jnp.concatenate([newest, self.values[:-1]])
+        return DelayLine(values, jnp.asarray(time, self.latest.dtype), self.period)
+
+    def at(self, time: Any) -> Any:
+        """Return the value at a time in seconds; beyond the ends that of the end."""
+        count = self.values.shape[0]
+        place = (self.latest - jnp.asarray(time, self.latest.dtype)) / self.period
+        # Unlike jnp.clip, whose derivative at an end is halved.
+        place = jnp.where(place < 0, 0, jnp.where(place > count - 1, count - 1, place))
+        left = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 2)
+        share = (place - left).astype(self.values.dtype)
+        return self.values[left] * (1 - share) + self.values[left + 1] * share
+
+    @property
+    def still(self) -> "DelayLine":
+        """The derivative of a line between two samples: zero, in the form of the line."""
+        return jax.tree.map(jnp.zeros_like, self)
+
+
+def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
+    """Make a line that has had one value until time 0.
+
+    **Arguments:**
+
+    - `value`: a number or an array.
+    - `longest`: seconds back at most; what is older has the value of that time.
+    - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
+      period for one in a controller's memory. A delay shorter than it reads the newest sample.
+
+    **Raises:** `ValueError` for seconds that are not positive.
+    """
+    for name, seconds in (("longest", longest), ("period", period)):
+        if not is_number(seconds) or not 0 < seconds < math.inf:
+            raise ValueError(f"{name} must be a positive number of seconds; got {seconds!r}")
+    # One sample more than the delay is long: a stage of a step asks up to a period earlier.
+    count = math.ceil(longest / period - 1e-6) + 2
+    value = jnp.asarray(value)
+    real = value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
+    values = jnp.broadcast_to(real, (count, *np.shape(real)))
+    return DelayLine(values, jnp.zeros((), real.dtype), float(period))
