@@ -30,6 +30,7 @@ CHECKED_ROOMS: list[str] = [
     "events",
     "falsification",
     "features",
+    "fuzzing",
     "mtl._explain",
     "mtl.recording",
     "perception.camera",

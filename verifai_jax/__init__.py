@@ -52,6 +52,9 @@ if TYPE_CHECKING:
     from verifai_jax.features import Signal as Signal
     from verifai_jax.features import Struct as Struct
     from verifai_jax.features import TruncatedNormal as TruncatedNormal
+    from verifai_jax.fuzzing import FuzzCoverage as FuzzCoverage
+    from verifai_jax.fuzzing import FuzzRun as FuzzRun
+    from verifai_jax.fuzzing import fuzz as fuzz
     from verifai_jax.mtl import Formula as Formula
     from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
     from verifai_jax.mtl import always as always
@@ -154,6 +157,11 @@ _NAMES = {
         "Signal",
         "Struct",
         "TruncatedNormal",
+    ),
+    "fuzzing": (
+        "FuzzCoverage",
+        "FuzzRun",
+        "fuzz",
     ),
     "mtl": (
         "Formula",

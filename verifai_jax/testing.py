@@ -334,6 +334,11 @@ def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observat
     rho, gradient = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
     valid = jnp.ones(len(u), bool)
     observations = Observations(u, rho, valid, gradient if search.wants_gradient else None)
+    if search.wants_marks:
+        # What is covered depends on the first coordinate, and some rows cover less.
+        first = (u[:, :1] * 5).astype(jnp.int32) if cube.dim else jnp.zeros((len(u), 1), jnp.int32)
+        marks = jnp.concatenate([first, jnp.where(rho[:, None] < 0, 7, -1)], axis=1)
+        observations = observations._replace(marks=marks)
     if not search.wants_clauses:
         return observations
     plan = search.plan(pending, cube, len(u))

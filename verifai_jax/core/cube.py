@@ -22,7 +22,9 @@ class Cube:
     - `names`: what it is called, such as `cars[0].x`; nothing when left out.
 
     and `lengths`: which coordinates are lengths of arrays, on which others depend; `signals`: the
-    coordinates of each function of time, in the order of its control points.
+    coordinates of each function of time, in the order of its control points; `sequences`: arrays
+    of which items can be put in and taken out, each as its length's coordinate, the first one of
+    its items, how many an item has, and the number of items at most.
 
     **Raises:** `ValueError` for a negative level, or entries that do not go with the levels.
     """
@@ -33,6 +35,7 @@ class Cube:
     names: tuple[str, ...] = ()
     lengths: tuple[int, ...] = ()
     signals: tuple[tuple[int, ...], ...] = ()
+    sequences: tuple[tuple[int, int, int, int], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "levels", tuple(int(level) for level in self.levels))

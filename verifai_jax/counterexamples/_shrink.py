@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.events import Events
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
@@ -28,6 +29,7 @@ from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
 from verifai_jax.counterexamples.minimize_distance import minimize_distance
 from verifai_jax.counterexamples.nominal import Nominal
+from verifai_jax.counterexamples.remove_items import remove_items
 from verifai_jax.counterexamples.selection import (
     Row,
     columns_at,
@@ -136,6 +138,11 @@ class Shrunk:
                 f"  {name:<{width}}  {_shown(was)} -> {_shown(now)}"
                 for name, (was, now) in zip(names, self.changed.values(), strict=True)
             ]
+        lines += [
+            f"  {name}: {_events(value)}"
+            for name, value in self.features.items()
+            if isinstance(value, Events)
+        ]
         lines.append(
             f"  row {self.row} departed in {_of(self.start_count, d)}, by "
             f"{self.start_distance:.3g}; {self.simulations} simulations"
@@ -165,11 +172,12 @@ def shrink(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `by`: `"count"`: first the fewest coordinates that are not exactly nominal, then, with so
-      many, the least distance; `"distance"`: the least distance, whatever their number. It is
-      Euclidean in unit coordinates, of which each is 1 over its whole range (by probability, for a
-      distribution), between two choices 1, and by places in integers. Every control point of a
-      signal and every component of a vector is a coordinate of its own.
+    - `by`: `"count"`: first the fewest events, and other items of arrays of variable length; then
+      the fewest coordinates that are not exactly nominal, then, with so many, the least distance;
+      `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
+      of which each is 1 over its whole range (by probability, for a distribution), between two
+      choices 1, and by places in integers. Every control point of a signal and every component of a
+      vector is a coordinate of its own.
     - `budget`: simulations at most; a gradient counts as one.
     - `seed`: of the random candidates.
     - `others`: whether other counterexamples of the run are looked at too.
@@ -255,7 +263,7 @@ class _Search:
             self.candidates.nominal.distance(points),
         )
         if self.by == "count":
-            return np.lexsort((length, count))
+            return np.lexsort((length, count, self.candidates.nominal.items(points)))
         return np.lexsort((count, length))
 
     def failures(self) -> Float[np.ndarray, "n d"]:
@@ -284,6 +292,8 @@ class _Search:
         candidates.temperature = max(0.02 * max(spread, default=1.0), 1e-6)
         # Half for what decides where to go, so that some is left to go there.
         candidates.limit = candidates.budget // 2
+        if self.by == "count" and nominal.space.items:
+            points = self.with_fewest_items()
         if self.by == "count":
             own = points[:1][candidates(points[:1])[1]]
             minimize_count(candidates, self.starts(own, alike=False), self.rng)
@@ -310,6 +320,14 @@ class _Search:
         candidates.limit = candidates.budget
         revert_features(candidates, self.failures()[0])
         self.note()
+
+    def with_fewest_items(self) -> Float[np.ndarray, "1 d"]:
+        """Return the failure with the fewest items, such as events; from now on none has more."""
+        candidates = self.candidates
+        least = remove_items(candidates, self.failures()[0])
+        candidates.most_items = int(candidates.nominal.items(least[None])[0])
+        self.note()
+        return least[None]
 
     def starts(
         self,
@@ -465,5 +483,12 @@ def _of(count: int, d: int) -> str:
     return f"{count} of {d} features" if d != 1 else "its one feature"
 
 
+def _events(events: Events) -> str:
+    each = [f"{event['kind']} at {event['time']:.4g} s" for event in events.listed()]
+    return f"{len(each)} event{'s' * (len(each) != 1)}{': ' * bool(each)}{', '.join(each)}"
+
+
 def _shown(value: object) -> str:
+    if value is None or value != value:
+        return "absent"
     return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -40,7 +40,8 @@ class Candidates:
     - `precision`: of the simulations, `"float32"` or `"float64"`.
 
     **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all that were simulated;
-    `limit`: simulations after which no more are made for now; `temperature` of the smooth
+    `limit`: simulations after which no more are made for now; `most_items`: points with more items
+    (such as events) are not simulated; `temperature` of the smooth
     robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
     not, in words.
     """
@@ -50,6 +51,7 @@ class Candidates:
     ) -> None:
         self.problem, self.nominal, self.budget = problem, nominal, budget
         self.precision, self.limit = precision, budget
+        self.most_items: int | None = None
         self._evaluate = Evaluator(problem, BATCH, precision=precision)
         self._differentiate: Evaluator | None = None
         self._known: dict[bytes, tuple[float, bool]] = {}
@@ -127,6 +129,9 @@ class Candidates:
                 self._tangents_at[key] = Tangent(point.astype(np.float64), float(rho), gradient)
 
     def _accepted(self, points: Float[np.ndarray, "n d"], order: list[int]) -> list[int]:
+        if self.most_items is not None and order:
+            items = self.nominal.items(points[order])
+            order = [i for i, n in zip(order, items, strict=True) if n <= self.most_items]
         if self.nominal.space.where is None or not order:
             return order
         accepted_places = []

@@ -50,7 +50,8 @@ class Nominal:
         """
         space = problem.space
         check_names("feature", nominal or {}, space.domains)
-        whole = {**(problem.nominal or {}), **(nominal or {})}
+        ordinary = {n: d.nominal for n, d in space.root.fields if d.nominal is not None}
+        whole = {**ordinary, **(problem.nominal or {}), **(nominal or {})}
         varied = [name for name, domain in space.root.fields if domain.size]
         missing = [name for name in varied if name not in whole]
         if missing:
@@ -104,15 +105,30 @@ class Nominal:
             same = cells == self.cells(self.u)
             middles = self.centres(cells)
             u[:, discrete] = np.where(same, self.u[discrete], middles)
+        if self.space.items and len(u):
+            # Coordinates of items that there are not mean nothing, and do not depart. Powers of
+            # two, so that few shapes are compiled.
+            missing = (1 << (len(u) - 1).bit_length()) - len(u)
+            padded = np.pad(u, ((0, missing), (0, 0)), mode="edge")
+            u = np.asarray(self.space.settle(padded))[: len(u)]
         return u
 
     def cells(self, points: Float[np.ndarray, "*n d"]) -> Int[np.ndarray, "*n k"]:
         """Return the cell of each discrete coordinate of points `[*n, d]`."""
-        return np.asarray(self.cube.cells(np.asarray(points, np.float32)))  # pyright: ignore[reportArgumentType]
+        cube, u = self.cube, np.asarray(points, np.float32)
+        if any(weights is not None for weights in cube.weights):
+            return np.asarray(cube.cells(u))  # pyright: ignore[reportArgumentType]
+        # In NumPy: JAX would compile a program for each number of points.
+        counts = np.array([cube.levels[i] for i in cube.discrete], np.int32)
+        return np.clip((u[..., cube.discrete] * counts).astype(np.int32), 0, counts - 1)
 
     def centres(self, cells: Int[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
         """Return the middles of cells as coordinates."""
-        return np.asarray(self.cube.centres(np.asarray(cells, np.int32)))  # pyright: ignore[reportArgumentType]
+        cube, places = self.cube, np.asarray(cells, np.int32)
+        if any(weights is not None for weights in cube.weights):
+            return np.asarray(cube.centres(places))  # pyright: ignore[reportArgumentType]
+        counts = np.array([cube.levels[i] for i in cube.discrete], np.float32)
+        return ((places + np.float32(0.5)) / counts).astype(np.float32)
 
     def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
         """Return the coordinates of settled points that are not nominal."""
@@ -136,6 +152,13 @@ class Nominal:
     def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
         """Count the coordinates that depart."""
         return self.departs(points).sum(axis=1)
+
+    def items(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
+        """Count the items of all arrays of variable length, such as events, beyond the least."""
+        lengths = list(self.cube.lengths)
+        levels = np.array([self.cube.levels[i] for i in lengths], np.float32)
+        places = np.asarray(points, np.float32)[:, lengths] * levels
+        return np.clip(places.astype(int), 0, np.maximum(levels - 1, 0).astype(int)).sum(axis=1)
 
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the Euclidean length of the departure."""

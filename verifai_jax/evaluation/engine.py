@@ -34,6 +34,7 @@ from verifai_jax.evaluation.streaming_monitor import streaming_monitor
 from verifai_jax.evaluation.verdicts import (
     Verdicts,
     boolean_semantics,
+    trace_marks,
     trace_verdict,
     violations,
 )
@@ -166,6 +167,11 @@ class Engine:
         if self.gradient:
             return self._gradient(simulated, coordinates, key, temperature)
         features, system = simulated(coordinates)
+        if self.problem.behaviour is not None and self.inputs.streaming:
+            trace = system(features, key)
+            rho, status = trace_verdict(self.problem, trace)
+            more = {"marks": trace_marks(self.problem, trace)}
+            return Row(rho.astype(coordinates.dtype), status, features, more)
         monitor = streaming_monitor(self.problem) if self.inputs.streaming else None
         if monitor is not None:
             rho, status = monitor(features, key)

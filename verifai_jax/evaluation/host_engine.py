@@ -27,6 +27,7 @@ from verifai_jax.evaluation.verdicts import (
     RowVerdict,
     Verdicts,
     boolean_semantics,
+    trace_marks,
     trace_verdict,
     violations,
 )
@@ -45,21 +46,29 @@ class HostMonitor:
     """The compiled monitor of a problem for batches of traces that came from the host."""
 
     def __init__(self, problem: Problem) -> None:
-        self._decide = jax.jit(jax.vmap(lambda trace: trace_verdict(problem, trace)))
+        def decided(trace: Trace) -> tuple[Array, Array, Array]:
+            return *trace_verdict(problem, trace), trace_marks(problem, trace)
+
+        self._decide = jax.jit(jax.vmap(decided))
         self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
 
     def __call__(
         self, traces: Trace, count: int
-    ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, " n"], Bool[np.ndarray, "n k"]]:
-        """Return robustness, status and Boolean semantics, in one shape for many `count`."""
+    ) -> tuple[
+        Float[np.ndarray, "n k"],
+        Int[np.ndarray, " n"],
+        Bool[np.ndarray, "n k"],
+        Int[np.ndarray, "n marks"],
+    ]:
+        """Return robustness, status, Boolean semantics and marks, in one shape for many `count`."""
         signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
         padded = jax.tree.map(_power_of_two, _with_signals(traces, signals))
-        rho, status = (np.asarray(leaf)[:count] for leaf in self._decide(padded))
+        rho, status, marks = (np.asarray(leaf)[:count] for leaf in self._decide(padded))
         holds = np.ones(rho.shape, bool)
         if np.any(rho == 0):
             # Now, while the traces are here: simulating again may be dear.
             holds = np.asarray(self._holds(padded))[:count]
-        return rho, status, holds
+        return rho, status, holds, marks
 
 
 class HostEngine:
@@ -133,13 +142,17 @@ class HostEngine:
         u: Float[np.ndarray, "n d"] | None,
         first: int,
     ) -> Verdicts:
-        rows = _Rows(len(seeds), len(self.problem.formulas), self.precision)
+        behaviour = self.problem.behaviour
+        width = None if behaviour is None else behaviour.size
+        rows = _Rows(len(seeds), len(self.problem.formulas), self.precision, width)
         if self.system.can_simulate_batch:
             self._together(features, keys, rows)
         else:
             self._one_by_one(features, seeds, u, first, rows)
         violated = violations(rows.rho, rows.status, lambda: rows.holds)
-        return Verdicts(rows.rho, rows.status, violated, features, messages=rows.messages)
+        return Verdicts(
+            rows.rho, rows.status, violated, features, messages=rows.messages, marks=rows.marks
+        )
 
     def _prepared(self, u: Array, key: Array, first: Array) -> tuple[PyTree, Array, Array]:
         keys = jax.vmap(lambda i: simulation_key(key, first + i))(jnp.arange(len(u)))
@@ -151,7 +164,9 @@ class HostEngine:
         try:
             trace = _checked(self.system.simulate_batch(features, keys), count)
             if _is_plain(trace):
-                rows.rho[:], rows.status[:], rows.holds[:] = self.monitor(trace, count)
+                rows.rho[:], rows.status[:], rows.holds[:], marks = self.monitor(trace, count)
+                if rows.marks is not None:
+                    rows.marks[:] = marks
                 return
         except (Exception, SystemExit) as error:
             rows.messages[:] = [format_user_error(error)] * count
@@ -206,11 +221,12 @@ class HostEngine:
         filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
         try:
-            rho, status, holds = self.monitor(stacked, BLOCK)
+            rho, status, holds, marks = self.monitor(stacked, BLOCK)
         except Exception as error:
             # The monitor refuses traces of this form: their signals, or their clock.
             return [_without_verdict(Status.ERROR, format_user_error(error))] * len(traces)
-        return [RowVerdict(rho[i], int(status[i]), holds[i], "") for i in range(len(traces))]
+        each = range(len(traces))
+        return [RowVerdict(rho[i], int(status[i]), holds[i], "", marks[i]) for i in each]
 
 
 class _Waiting:
@@ -222,7 +238,7 @@ class _Waiting:
         keep: Callable[[int, RowVerdict], None],
     ) -> None:
         self._decide, self.keep = decide, keep
-        self._blocks: dict[Any, list[tuple[int, Trace]]] = {}
+        self._blocks: dict[Any, list[tuple[int, Trace, str]]] = {}
         self._since = time.monotonic()
 
     def add(self, row: int, outcome: Outcome) -> None:
@@ -231,7 +247,7 @@ class _Waiting:
             self.keep(row, without)
             return
         form = _form(trace)
-        self._blocks.setdefault(form, []).append((row, trace))
+        self._blocks.setdefault(form, []).append((row, trace, outcome.message))
         if len(self._blocks[form]) == BLOCK:
             self._settle(form)
         if time.monotonic() - self._since > PATIENCE:
@@ -244,22 +260,25 @@ class _Waiting:
 
     def _settle(self, form: Any) -> None:
         block = self._blocks.pop(form)
-        verdicts = self._decide([trace for _, trace in block])
-        for (row, _), verdict in zip(block, verdicts, strict=True):
-            self.keep(row, verdict)
+        verdicts = self._decide([trace for _, trace, _ in block])
+        for (row, _, message), verdict in zip(block, verdicts, strict=True):
+            self.keep(row, verdict._replace(message=verdict.message or message))
 
 
 class _Rows:
     """The rows of a batch while they are filled, in any order."""
 
-    def __init__(self, count: int, formulas: int, precision: str) -> None:
+    def __init__(self, count: int, formulas: int, precision: str, marks: int | None) -> None:
         self.rho = np.full((count, formulas), np.nan, precision)
         self.status = np.full(count, Status.ERROR, np.int32)
         self.holds = np.ones((count, formulas), bool)
         self.messages = [""] * count
+        self.marks = None if marks is None else np.full((count, marks), -1, np.int32)
 
     def put(self, i: int, row: RowVerdict) -> None:
-        self.rho[i], self.status[i], self.holds[i], self.messages[i] = row
+        self.rho[i], self.status[i], self.holds[i], self.messages[i], marks = row
+        if self.marks is not None and marks is not None and len(marks):
+            self.marks[i] = marks
 
 
 def _without_verdict(status: Status, message: str) -> RowVerdict:

@@ -46,6 +46,7 @@ class Journal:
             "status": int(verdict.status),
             "holds": np.asarray(verdict.holds).tolist(),
             "message": verdict.message,
+            "marks": None if verdict.marks is None else np.asarray(verdict.marks).tolist(),
         }
         self._last = max(self._last, row)
         if self._file is None:
@@ -96,11 +97,13 @@ def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
             continue  # It has changed, or was being written when the process died.
         try:
             entry = json.loads(text)
+            marks = entry.get("marks")
             verdict = RowVerdict(
                 np.asarray(entry["rho"], np.float64),
                 int(entry["status"]),
                 np.asarray(entry["holds"], bool),
                 str(entry["message"]),
+                None if marks is None else np.asarray(marks, np.int32),
             )
             known[int(entry["row"])] = (str(entry["point"]), verdict)
         except (ValueError, KeyError, TypeError):

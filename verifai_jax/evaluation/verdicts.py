@@ -36,6 +36,7 @@ class Verdicts(NamedTuple):
     - `clause_gradients`: `[n, clauses, d]`, of the clauses by the coordinates; None unless wanted.
     - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
       JAX traces.
+    - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -46,6 +47,7 @@ class Verdicts(NamedTuple):
     clauses: Float[np.ndarray, "n clauses"] | None = None
     clause_gradients: Float[np.ndarray, "n clauses d"] | None = None
     messages: list[str] | None = None
+    marks: Int[np.ndarray, "n marks"] | None = None
 
     @property
     def proper(self) -> Bool[np.ndarray, " n"]:
@@ -84,12 +86,14 @@ class RowVerdict(NamedTuple):
     - `status`: a code of `Status`.
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
     - `message`: what the system raised; empty where nothing.
+    - `marks`: what its trace shows, `[marks]`; None without a trace, or a `problem.behaviour`.
     """
 
     rho: Float[np.ndarray, " formulas"] | Float[np.ndarray, ""]
     status: int
     holds: Bool[np.ndarray, " formulas"] | Bool[np.ndarray, ""]
     message: str
+    marks: Int[np.ndarray, " marks"] | None = None
 
 
 def violations(
@@ -143,6 +147,13 @@ def trace_verdict(
     if counted is not None:
         status = jnp.where((status == Status.OK) & ~counted, jnp.int32(Status.ERROR), status)
     return with_status(rho, status, finite)
+
+
+def trace_marks(problem: Problem, trace: Trace) -> Int[Array, " marks"]:
+    """Return what a trace shows of a problem with a `behaviour`; traced by JAX."""
+    if problem.behaviour is None:
+        return jnp.zeros(0, jnp.int32)
+    return problem.behaviour(trace, problem.end)
 
 
 def _counted(trace: Trace) -> Bool[Array, ""] | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
@@ -19,6 +19,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.checkpoint import write_checkpoint
+from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
@@ -81,6 +82,7 @@ class Rounds:
             if search.wants_clauses
             else None
         )
+        self._marks = MarkBook(problem) if search.wants_marks else None
         self.search_key = run_keys(seed)[0]
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
@@ -99,14 +101,19 @@ class Rounds:
         - `resumed`: whether the first round is one of any kind; a new run begins with gradients
           where the search wants those of clauses.
         """
-        space = self.problem.space
-        compiled_search(self.search, space.cube, self.batch)
+        space, marks = self.problem.space, 0 if self._marks is None else self._marks.width
+        compiled_search(self.search, space.cube, self.batch, marks)
         self.evaluate.begin_compiling()
         if self._differentiate is not None and not resumed:
             self._differentiate.begin_compiling()
         self.evaluate.compile()
         self._proposals = Proposals(
-            self.search, space.cube, self.batch, self.search_key, space.constraint
+            self.search,
+            space.cube,
+            self.batch,
+            self.search_key,
+            space.constraint,
+            marks,
         )
         self._keep()
 
@@ -151,6 +158,11 @@ class Rounds:
             return
         verdicts = self._verdicts(points, first)
         columns = self._columns(verdicts)
+        marks = None
+        if self._marks is not None:
+            marks = self._marks.of(points, verdicts)
+            columns["new_marks"] = self._marks.add(marks)
+            marks = self._marks.of_kinds(marks)
         objective = verdicts.least
         if self._objective is not None:
             objective = self._objective(verdicts.rho, verdicts.rho < 0)
@@ -161,7 +173,7 @@ class Rounds:
             # A search that took them for failures would stay with them.
             objective = np.where(refused, told, objective)
             verdicts = _raised(verdicts, refused)
-        self._tell(objective, verdicts)
+        self._tell(objective, verdicts, marks)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
@@ -169,7 +181,12 @@ class Rounds:
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
 
-    def _tell(self, objective: Float[np.ndarray, " n"], verdicts: Verdicts) -> None:
+    def _tell(
+        self,
+        objective: Float[np.ndarray, " n"],
+        verdicts: Verdicts,
+        marks: Int[np.ndarray, "n marks"] | None,
+    ) -> None:
         """Tell the search what came of its points, in float32 whatever the simulations do."""
 
         def single(values: np.ndarray | None) -> np.ndarray | None:
@@ -181,6 +198,7 @@ class Rounds:
             single(verdicts.gradient),
             single(verdicts.clauses),
             single(verdicts.clause_gradients),
+            marks,
         )
 
     def _confirmed(
@@ -274,6 +292,8 @@ class Rounds:
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
+        if self._marks is not None:
+            self._marks.restore(checkpoint)
         counts = self.table.counts
         self.without_verdict, self.violating = counts.without_verdict, counts.violating
         self.found = counts.claimed
@@ -288,6 +308,8 @@ class Rounds:
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }
+        if self._marks is not None:
+            self.checkpoint |= self._marks.checkpoint()
         if self._confirmer is not None:
             seen = self._confirmer
             self.checkpoint["confirmer"] = np.array([seen.examined, seen.band], np.float64)

@@ -65,6 +65,7 @@ RESERVED = (
     "gradient_finite",
     "differentiated",
     "verdict",
+    "new_marks",
 )
 """Names of the table's own columns, which no feature may have."""
 _FEW = 256

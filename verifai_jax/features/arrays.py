@@ -270,6 +270,10 @@ class VariableArray(Domain):
         return Items(_stacked(items), jnp.asarray(length, jnp.int32))
 
     @property
+    def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
+        return ((0, 1, self.domain.size, self.most),) if self._varies else ()
+
+    @property
     def items(self) -> int:
         return self.most * self._varies
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -178,6 +178,10 @@ class Automaton(Domain):
     @property
     def lengths(self) -> tuple[int, ...]:
         return (0,) * self._varies
+
+    @property
+    def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
+        return ((0, 1, sum(self._widths), self.most),) if self._varies else ()
 
     @property
     def nominal(self) -> PyTree:
@@ -615,7 +619,7 @@ def _transition(place: object, event: object) -> Transition:
         ),
         after=(after,) if isinstance(after, str) else tuple(after),
         at_most=None if at_most is None else check_count(f"at_most of event {place!r}", at_most),
-        guard=guard,
+        guard=cast("Guard | None", guard),
     )
 
 

@@ -144,6 +144,15 @@ class Struct(Domain):
         }
 
     @property
+    def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
+        places, start = [], 0
+        for _, domain in self.fields:
+            for length, first, width, count in domain.sequences:
+                places.append((start + length, start + first, width, count))
+            start += domain.size
+        return tuple(places)
+
+    @property
     def items(self) -> int:
         return sum(domain.items for _, domain in self.fields)
 

@@ -134,6 +134,11 @@ class Domain(abc.ABC):
         return ()
 
     @property
+    def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
+        """Arrays whose items can be put in and taken out; see `Cube`."""
+        return ()
+
+    @property
     def nominal(self) -> PyTree:
         """A value that is ordinary whatever the system is, such as no events; None without one."""
         return None

@@ -182,6 +182,7 @@ class FeatureSpace:
             names=self.coordinates,
             lengths=self.lengths,
             signals=self.signals,
+            sequences=self.root.sequences,
         )
 
     def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:

@@ -23,6 +23,7 @@ from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
+from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.systems.base import System, as_system
 
@@ -49,6 +50,8 @@ class Problem:
     - `priority`: which of several formulas matter more: names in falling order, or pairs
       `(higher, lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest
       counterexamples instead of the least robustness.
+    - `behaviour`: what a trace shows, as numbers of cells (`Behaviour`), for a search guided by
+      coverage.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
 
     `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
@@ -67,6 +70,7 @@ class Problem:
     end: End
     draw: Callable[..., None] | None
     priority: Sequence[str] | Sequence[tuple[str, str]] | None
+    behaviour: Behaviour | None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False)
     programs: ProgramCache = field(init=False, repr=False)
@@ -82,6 +86,7 @@ class Problem:
         end: End = "hold",
         draw: Callable[..., None] | None = None,
         priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
+        behaviour: Behaviour | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {name!r}")
@@ -109,6 +114,7 @@ class Problem:
             "end": end,
             "draw": draw,
             "priority": priority,
+            "behaviour": behaviour,
             "formulas": formulas,
             "rulebook": None if priority is None else _rulebook(priority, formulas),
             "programs": ProgramCache(),

@@ -20,6 +20,7 @@ from verifai_jax.search.base import Search as Search
 from verifai_jax.search.bayes import Bayes as Bayes
 from verifai_jax.search.ce_compat import CECompat as CECompat
 from verifai_jax.search.cmaes import CMAES as CMAES
+from verifai_jax.search.coverage import Coverage as Coverage
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
 from verifai_jax.search.diverse import Diverse as Diverse
 from verifai_jax.search.diverse import distinct as distinct
@@ -39,6 +40,7 @@ __all__ = [
     "Bandit",
     "Bayes",
     "CECompat",
+    "Coverage",
     "CrossEntropy",
     "Cube",
     "Diverse",
@@ -81,6 +83,7 @@ _SEARCHES: dict[str, type[Search]] = {
     "bayes": Bayes,
     "cmaes": CMAES,
     "mutation": Mutation,
+    "coverage": Coverage,
     "gradient": Gradient,
     "portfolio": Portfolio,
 }

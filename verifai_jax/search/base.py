@@ -20,6 +20,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
 
+KIND = 1 << 16
+"""Marks below it are of the first kind, the next so many of the second, and so on."""
+
 
 class Observations(NamedTuple):
     """A batch of points and the results of their simulations.
@@ -34,6 +37,8 @@ class Observations(NamedTuple):
       very low where there are fewer than `CLAUSES`. Only for a search that `wants_clauses`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
+    - `marks`: numbers of what each simulation covered, -1 for nothing; `marks // KIND` is the kind
+      of thing. Only for a search that `wants_marks`.
     """
 
     u: Float[Array, "n d"]
@@ -42,6 +47,7 @@ class Observations(NamedTuple):
     gradient: Float[Array, "n d"] | None = None
     clauses: Float[Array, "n clauses"] | None = None
     clause_gradients: Float[Array, "n clauses d"] | None = None
+    marks: Int[Array, "n marks"] | None = None
 
     @property
     def usable(self) -> Bool[Array, " n"]:
@@ -86,6 +92,9 @@ class Search(abc.ABC, Generic[State]):
     wants_clauses: ClassVar[bool] = False
     """Whether `tell` needs `Observations.clauses`, with `clause_gradients` in the rounds whose
     `plan` says so."""
+
+    wants_marks: ClassVar[bool] = False
+    """Whether `tell` needs `Observations.marks`."""
 
     samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""

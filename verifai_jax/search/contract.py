@@ -94,6 +94,9 @@ def _rows(search: Search, cube: Cube) -> Observations:
 
     points, valid = real(BATCH, cube.dim), jax.ShapeDtypeStruct((BATCH,), jnp.bool_)
     rows = Observations(points, real(BATCH), valid, points if search.wants_gradient else None)  # pyright: ignore[reportArgumentType]
+    if search.wants_marks:
+        marks: Any = jax.ShapeDtypeStruct((BATCH, 4), jnp.int32)
+        rows = rows._replace(marks=marks)
     if not search.wants_clauses:
         return rows
     clauses, gradients = real(BATCH, CLAUSES), real(BATCH, CLAUSES, cube.dim)

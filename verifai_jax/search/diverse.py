@@ -94,6 +94,10 @@ class Diverse(Search[DiverseState]):
         return self.search.wants_clauses
 
     @property
+    def wants_marks(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.search.wants_marks
+
+    @property
     def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.search.samples_prior
 

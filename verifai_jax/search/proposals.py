@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, NoReturn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.compilation import Compilation, compile_soon, tracing
@@ -52,11 +52,13 @@ class Proposals:
         batch: int,
         key: Key[Array, ""],
         accepts: Callable[[Any], Bool[Array, " n"]] | None = None,
+        marks: int = 0,
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
-        self._program = compiled_search(search, self.cube, batch)
+        self._marks = marks if search.wants_marks else 0
+        self._program = compiled_search(search, self.cube, batch, self._marks)
         self._checked = is_own(search)
         self._accepts = accepts
         if self._accepts is not None:
@@ -118,6 +120,7 @@ class Proposals:
         gradient: Float[np.ndarray, "m d"] | None,
         clauses: Float[np.ndarray, "m clauses"] | None = None,
         clause_gradients: Float[np.ndarray, "m clauses d"] | None = None,
+        marks: Int[np.ndarray, "m marks"] | None = None,
     ) -> None:
         """Let the search learn from the simulations of the points that `next` gave last.
 
@@ -127,6 +130,7 @@ class Proposals:
         - `valid`: False for simulations without a verdict.
         - `gradient`: of the smooth robustness, for a search that wants it.
         - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
+        - `marks`: for a search that wants them, as many as the constructor was told.
         """
         if not self.search.learns:
             return
@@ -144,12 +148,16 @@ class Proposals:
                     none if clause_gradients is None else clause_gradients, 0.0
                 ),
             )
+        if self.search.wants_marks:
+            whole = np.zeros((len(rho), 0), np.int32) if marks is None else marks
+            observations = observations._replace(marks=self._spread(whole, -1))
         self._state = self._program.tell(self._state, observations)
 
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
         gradient = np.zeros((0, self.cube.dim), np.float32) if self.search.wants_gradient else None
-        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient)
+        marks = np.zeros((0, self._marks), np.int32)
+        self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, marks=marks)
 
     def warm_start(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
         """Let the search learn from the points of an earlier table, before the first round."""
@@ -293,7 +301,7 @@ class SearchProgram(NamedTuple):
 
 @lru_cache(maxsize=64)
 @tracing()
-def compiled_search(search: Search, cube: Cube, batch: int) -> SearchProgram:
+def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> SearchProgram:
     """Compile `init / ask / tell` of one search on one cube, in the background, side by side."""
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
@@ -305,6 +313,9 @@ def compiled_search(search: Search, cube: Cube, batch: int) -> SearchProgram:
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
     observations = Observations(points, rho, valid, points if search.wants_gradient else None)
+    if search.wants_marks:
+        form: Any = jax.ShapeDtypeStruct((batch, marks), jnp.int32)
+        observations = observations._replace(marks=form)
     plan: Any = None
     if search.wants_clauses:
         observations = observations._replace(

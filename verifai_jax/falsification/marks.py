@@ -1,0 +1,91 @@
+"""Marks of simulations, numbers of what they covered, and who was the first to have each.
+
+    marks = MarkBook(problem)
+    rows = marks.of(points, verdicts)                   # [n, marks], -1 for nothing
+    fresh = marks.add(rows)                             # [n], marks that no earlier row had
+
+The numbers: statuses first, then what features cover (transitions of an automaton, and pairs of
+them), then what traces show (`problem.behaviour`): cells, and the clause nearest to breaking.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search.base import KIND
+
+SEEN = "marks.seen"
+"""Entry of a checkpoint: how many rows had each mark."""
+
+
+class MarkBook:
+    """The marks of a run, counted; see the module's docstring."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.features = problem.space.root.mark_count
+        self.behaviour = 0 if problem.behaviour is None else problem.behaviour.total
+        self.counts = np.zeros(len(Status) + self.features + self.behaviour, np.int64)
+
+    @property
+    def width(self) -> int:
+        """Number of marks of a row at most."""
+        return 1 + self._feature_width + self._shown
+
+    @property
+    def _feature_width(self) -> int:
+        space = self.problem.space
+        point = jax.ShapeDtypeStruct((space.dim,), jnp.float32)
+        return jax.eval_shape(lambda u: space.root.marks(space.unflatten(u)), point).shape[0]
+
+    @property
+    def _shown(self) -> int:
+        return 0 if self.problem.behaviour is None else self.problem.behaviour.size
+
+    def of(self, points: Float[Any, "n d"], verdicts: Verdicts) -> Int[np.ndarray, "n marks"]:
+        """Return the marks of rows."""
+        parts = [verdicts.status[:, None].astype(np.int32)]
+        if self.features:
+            own = np.asarray(self.problem.space.marks_at(points))
+            parts.append(np.where(own >= 0, own + len(Status), -1))
+        if self._shown:
+            assert verdicts.marks is not None
+            first = len(Status) + self.features
+            parts.append(np.where(verdicts.marks >= 0, verdicts.marks + first, -1))
+        return np.concatenate(parts, axis=1).astype(np.int32)
+
+    def of_kinds(self, rows: Int[np.ndarray, "n marks"]) -> Int[np.ndarray, "n marks"]:
+        """Return the marks as a search is told them: features, cells and verdicts are kinds."""
+        cells = len(Status) + self.features
+        behaviour = self.problem.behaviour
+        clauses = cells + (0 if behaviour is None else behaviour.cells)
+        numbers = np.where(rows >= clauses, 2 * KIND + len(Status) + rows - clauses, rows)
+        numbers = np.where((rows >= cells) & (rows < clauses), KIND + rows - cells, numbers)
+        numbers = np.where((rows >= len(Status)) & (rows < cells), rows - len(Status), numbers)
+        numbers = np.where((rows >= 0) & (rows < len(Status)), 2 * KIND + rows, numbers)
+        return numbers.astype(np.int32)
+
+    def add(self, rows: Int[np.ndarray, "n marks"]) -> Int[np.ndarray, " n"]:
+        """Count the marks of rows; return how many of each row no earlier one had."""
+        fresh = np.zeros(len(rows), np.int32)
+        for i, row in enumerate(rows):
+            own = np.unique(row[row >= 0])
+            fresh[i] = np.count_nonzero(self.counts[own] == 0)
+            self.counts[own] += 1
+        return fresh
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Return the counts as an entry of a checkpoint."""
+        return {SEEN: self.counts.copy()}
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on with the counts of a checkpoint."""
+        if SEEN in checkpoint:
+            self.counts = np.array(checkpoint[SEEN], np.int64)

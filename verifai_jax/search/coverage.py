@@ -1,0 +1,244 @@
+"""Coverage-guided fuzzing: mutations of points that did what few others did.
+
+Each simulation has marks, numbers of what it covered: transitions of an automaton, cells of
+behaviour, the clause nearest to breaking. For each mark the search keeps the point with the least
+robustness among those that have it (an archive of elites: Mouret, Clune, Illuminating search spaces
+by mapping elites, 2015), and mutates those of seldom marks more often (Boehme, Pham, Roychoudhury,
+Coverage-based greybox fuzzing as Markov chain, IEEE Transactions on Software Engineering 45(5),
+2019). So it climbs by what is new where the robustness says nothing. Each kind of mark gets the
+same share, so that many pairs of transitions do not drown a few cells.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key, UInt32
+
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import KIND, Observations, Search, standard_normal
+
+STEP = 0.1
+"""Standard deviation of small steps, in unit coordinates."""
+
+WAYS = (0.35, 0.55, 0.75, 0.9)
+"""Cumulative shares of mutations: a few coordinates, a stretch, all from a place on, a splice; the
+rest are small steps."""
+
+SHARES = (0.25, 0.5, 0.25, 0.25)
+"""Shares of the kinds of marks: of features, of cells of behaviour, of verdicts, and others."""
+
+KINDS = len(SHARES)
+"""Kinds of marks that are told apart."""
+
+VERDICT = 2
+"""The kind of marks of verdicts."""
+
+EDITED = 0.85
+"""Share of mutations that edit an item of an array, where there are such."""
+
+EDITS = (0.3, 0.38, 0.72, 0.8)
+"""Cumulative shares of edits: putting an item in, another item in place of one, the same kind of
+item with one other number, taking one out; the rest are new items from a place on."""
+
+APPENDED = 0.3
+"""Share of edits at the end of an array, where what has happened before stays as it is."""
+
+EXTREME = 0.5
+"""Share of new items whose numbers are drawn towards the ends of their ranges."""
+
+LONGER = 0.5
+"""Share of mutations that make an array no shorter and perhaps longer."""
+
+
+class CoverageState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    elites: Float[Array, "kinds*buckets d"]
+    score: Float[Array, " kinds*buckets"]  # infinite where no point has the mark
+    hits: Float[Array, " kinds*buckets"]  # simulations with the mark
+
+
+@dataclass(frozen=True)
+class Coverage(Search[CoverageState]):
+    """Mutations of points that covered what few others did; see the module's docstring.
+
+    **Arguments:**
+
+    - `exploration`: share of points drawn from the prior, for ever.
+    - `rarity`: exponent by which seldom marks are preferred; 0 is not at all.
+    - `buckets`: marks of a kind that are told apart; others share one.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    wants_marks: ClassVar[bool] = True
+    most_at_once: ClassVar[int] = 64
+
+    exploration: float = 0.15
+    rarity: float = 2.0
+    buckets: int = 512
+
+    def __post_init__(self) -> None:
+        check_fraction("exploration", self.exploration, one=True)
+        if self.rarity:
+            check_positive("rarity", self.rarity, finite=True)
+        check_count("buckets", self.buckets)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> CoverageState:
+        return CoverageState(
+            key=key,
+            round=jnp.uint32(0),
+            elites=jnp.full((KINDS * self.buckets, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(KINDS * self.buckets, jnp.inf, jnp.float32),
+            hits=jnp.zeros(KINDS * self.buckets, jnp.float32),
+        )
+
+    def ask(
+        self, state: CoverageState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], CoverageState]:
+        d = cube.dim
+        key = jax.random.fold_in(state.key, state.round)
+        # One call for all random numbers: each costs a good part of a second to compile.
+        random = jax.random.uniform(key, (batch, 12 + 3 * d), jnp.float32)
+        coins, fresh, masks, noise = jnp.split(random, [12, 12 + d, 12 + 2 * d], axis=1)
+        there = state.hits > 0
+        weights = jnp.where(there, jnp.maximum(state.hits, 1.0) ** -self.rarity, 0.0)
+        each = weights.reshape(KINDS, self.buckets)
+        each = each / jnp.maximum(jnp.sum(each, axis=1, keepdims=True), 1e-30)
+        each = each * np.array(SHARES, np.float32)[:, None]
+        edges = jnp.cumsum(each.ravel())
+        last = KINDS * self.buckets - 1
+        parent, other = (
+            state.elites[jnp.minimum(jnp.searchsorted(edges, coin * edges[-1]), last)]
+            for coin in (coins[:, 0], coins[:, 1])
+        )
+        changed = self._mutated(cube, parent, other, coins[:, 2:], fresh, masks, noise)
+        explores = (coins[:, 11] < self.exploration) | ~jnp.any(there)
+        return jnp.where(explores[:, None], fresh, changed), state._replace(round=state.round + 1)
+
+    def _mutated(
+        self,
+        cube: Cube,
+        parent: Float[Array, "n d"],
+        other: Float[Array, "n d"],
+        coins: Float[Array, "n coins"],
+        fresh: Float[Array, "n d"],
+        masks: Float[Array, "n d"],
+        noise: Float[Array, "n d"],
+    ) -> Float[Array, "n d"]:
+        d = max(cube.dim, 1)
+        place = np.arange(cube.dim)
+        begin = jnp.floor(coins[:, 0] * d)[:, None]
+        length = jnp.ceil(2.0 ** (coins[:, 1] * np.log2(d)))[:, None]
+        # One coordinate surely, and one, two, four or eight of them in the mean.
+        few = (place == begin) | (masks * d < 2.0 ** jnp.floor(coins[:, 2:3] * 4) - 1)
+        stretch = (place >= begin) & (place < begin + length)
+        tail = place >= begin
+        way = coins[:, 3][:, None]
+        drawn = jnp.where(
+            way < WAYS[0], few, jnp.where(way < WAYS[1], stretch, tail & (way < WAYS[2]))
+        )
+        spliced = tail & (way >= WAYS[2]) & (way < WAYS[3])
+        moved = jnp.where(drawn, fresh, jnp.where(spliced, other, parent))
+        continuous = np.array(cube.levels) == 0
+        steps = few & continuous & (way >= WAYS[3])
+        moved = jnp.where(steps, moved + STEP * standard_normal(noise), moved)
+        if cube.lengths:
+            # Items behind the end change nothing.
+            is_length = np.isin(place, cube.lengths)
+            longer = is_length & (coins[:, 4:5] < LONGER)
+            moved = jnp.where(longer, jnp.maximum(parent, fresh), moved)
+        if cube.sequences:
+            edited = _edited(cube, parent, coins, fresh)
+            moved = jnp.where(coins[:, 5:6] < EDITED, edited, moved)
+        return jnp.clip(moved, 0.0, 1.0)
+
+    def tell(self, state: CoverageState, cube: Cube, observations: Observations) -> CoverageState:
+        usable, n = observations.usable, len(observations.rho)
+        marks = observations.marks
+        if marks is None or not marks.shape[1]:
+            marks = jnp.zeros((n, 1), jnp.int32)
+        u = jnp.where(usable[:, None], observations.u, 0.5)
+        known, size = usable[:, None] & (marks >= 0), KINDS * self.buckets
+        place = (marks // KIND) % KINDS * self.buckets + marks % KIND % self.buckets
+        bucket = jnp.where(known, place, size)
+        rows = jnp.broadcast_to(jnp.arange(n)[:, None], bucket.shape)
+        scores = self._scores(cube, observations, place)
+        best = jnp.full(size, jnp.inf, jnp.float32).at[bucket].min(scores, mode="drop")
+        nearest = best[jnp.minimum(bucket, size - 1)]
+        first = jnp.where(scores <= nearest, rows, n)
+        winner = jnp.full(size, n, jnp.int32).at[bucket].min(first, mode="drop")
+        # Of equally good points the newest: where nothing falls, it walks.
+        better = (winner < n) & (best <= state.score)
+        elites = jnp.where(better[:, None], u[jnp.minimum(winner, n - 1)], state.elites)
+        return state._replace(
+            elites=elites,
+            score=jnp.where(better, best, state.score),
+            hits=state.hits.at[bucket].add(1.0, mode="drop"),
+        )
+
+    def _scores(
+        self, cube: Cube, observations: Observations, place: Int[Array, "n marks"]
+    ) -> Float[Array, "n marks"]:
+        """Return what is kept for each mark: short arrays, then the least robustness.
+
+        For marks of verdicts the robustness alone: those lead to what fails.
+        """
+        score = observations.score.astype(jnp.float32)
+        score = jnp.where(jnp.isfinite(score), score / (1 + score), 1.0)
+        size = jnp.zeros_like(score)
+        if cube.lengths:
+            is_length = np.isin(cube.discrete, cube.lengths)
+            size = jnp.sum(cube.cells(observations.u)[:, is_length], axis=1).astype(jnp.float32)
+        verdict = place // self.buckets == VERDICT
+        return jnp.where(verdict, score[:, None], (size + score)[:, None])
+
+
+def _edited(
+    cube: Cube,
+    parent: Float[Array, "n d"],
+    coins: Float[Array, "n coins"],
+    fresh: Float[Array, "n d"],
+) -> Float[Array, "n d"]:
+    """Put an item into an array, take one out, or change one or all from it on."""
+    chosen = jnp.floor(coins[:, 0] * len(cube.sequences))
+    result = parent
+    for number, (length, first, width, count) in enumerate(cube.sequences):
+        levels = cube.levels[length]
+        least = count + 1 - levels
+        items = jnp.minimum(jnp.floor(parent[:, length] * levels), levels - 1) + least
+        block = parent[:, first : first + width * count].reshape(-1, count, width)
+        new = fresh[:, first : first + width * count].reshape(block.shape)
+        # Behind the last item too, where one more goes.
+        slot = jnp.floor(coins[:, 1] * (items + 1))
+        slot = jnp.where(coins[:, 6] < APPENDED, items, slot)
+        changes = (coins[:, 3] >= EDITS[1]) & (coins[:, 3] < EDITS[2])
+        slot = jnp.where(changes, jnp.floor(coins[:, 1] * items), slot)
+        slot = jnp.minimum(slot, count - 1)[:, None]
+        # Arcsine distributed: dense at both ends. The kind of an item is its first coordinate.
+        extreme = (coins[:, 7] < EXTREME)[:, None, None] & (np.arange(width) > 0)
+        new = jnp.where(extreme, jnp.sin(0.5 * np.pi * new) ** 2, new)
+        places, way = jnp.arange(count), coins[:, 3][:, None]
+        here = (places == slot)[:, :, None]
+        behind = (places > slot)[:, :, None]
+        inserted = jnp.where(here, new, jnp.where(behind, jnp.roll(block, 1, axis=1), block))
+        removed = jnp.where(here | behind, jnp.roll(block, -1, axis=1), block)
+        # Some changes keep the kind of an item and all its numbers but one.
+        one = 1 + jnp.floor(coins[:, 8] * max(width - 1, 1))[:, None, None]
+        within = here & ((np.arange(width) == one) | (way[:, :, None] < EDITS[1]))
+        replaced = jnp.where(within, new, block)
+        tail = jnp.where(here | behind, new, block)
+        ways = [way < EDITS[0], way < EDITS[2], way < EDITS[3]]
+        sizes = [items + 1, jnp.maximum(items, slot[:, 0] + 1), items - 1]
+        longest = jnp.maximum(items, jnp.floor(fresh[:, length] * levels) + least)
+        size = jnp.select([w[:, 0] for w in ways], sizes, longest)
+        edited = jnp.select([w[:, :, None] for w in ways], [inserted, replaced, removed], tail)
+        size = jnp.clip(size, least, count)
+        whole = parent.at[:, first : first + width * count].set(edited.reshape(len(parent), -1))
+        whole = whole.at[:, length].set((size - least + 0.5) / levels)
+        result = jnp.where((chosen == number)[:, None], whole, result)
+    return result
