@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import Confirmations as Confirmations
     from verifai_jax.counterexamples import confirm as confirm
     from verifai_jax.counterexamples import explain as explain
+    from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import estimate as estimate
@@ -126,6 +127,7 @@ _NAMES = {
         "Confirmations",
         "confirm",
         "explain",
+        "replay_counterexamples",
         "shrink",
     ),
     "estimation": (

@@ -18,6 +18,7 @@ import click
 from verifai_jax._version import __version__
 from verifai_jax.cli.analyze import analyze
 from verifai_jax.cli.confirm import confirm
+from verifai_jax.cli.counterexamples import replay_counterexamples, save_counterexamples
 from verifai_jax.cli.doctor import doctor
 from verifai_jax.cli.estimate import estimate
 from verifai_jax.cli.exit_codes import (
@@ -52,6 +53,8 @@ COMMANDS = (
     shrink,
     sweep,
     synthesize,
+    save_counterexamples,
+    replay_counterexamples,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
 

@@ -223,6 +223,20 @@ class Run:
         precision = self.precision if precision is None else precision
         return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
 
+    def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
+        """Write counterexamples as small files made for version control; returns their paths.
+
+        `vj.replay_counterexamples(problem, folder)` simulates them again.
+
+        **Arguments:**
+
+        - `folder`: it is made where there is none.
+        - `options`: of `counterexamples.save_counterexamples`: `most`, `shrink`, `budget`.
+
+        **Raises:** `ValueError` for a run without its problem or without a counterexample.
+        """
+        return late("verifai_jax.counterexamples", "save_counterexamples")(self, folder, **options)
+
     def summary(self) -> str:
         """Write what failed, how often, the worst case and how to see it again."""
         return late("verifai_jax.falsification.summary", "summarize")(self)

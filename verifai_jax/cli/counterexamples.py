@@ -1,0 +1,63 @@
+"""`verifai-jax save-counterexamples runs/balance-1`, and `replay-counterexamples TARGET FOLDER`."""
+
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.arguments import (
+    PROBLEM,
+    RUN,
+    TARGET,
+    fail_on,
+    load_judged_run,
+    load_problem,
+    split_pairs,
+)
+from verifai_jax.cli.exit_codes import fail_gate
+
+CORPUS = "counterexamples"
+"""Usual folder of a corpus."""
+
+
+@click.command("save-counterexamples")
+@RUN
+@click.option(
+    "--into",
+    type=click.Path(path_type=Path),
+    default=Path(CORPUS),
+    show_default=True,
+    help="Folder of the files, made for version control.",
+)
+@click.option("--most", type=int, default=5, show_default=True, help="Counterexamples at most.")
+@click.option("--shrink/--no-shrink", default=True, show_default=True, help="Shrink each first.")
+@click.option(
+    "--budget", type=int, default=1000, show_default=True, help="Simulations to shrink one with."
+)
+@PROBLEM
+def save_counterexamples(
+    folder: Path, into: Path, most: int, shrink: bool, budget: int, target: str | None
+) -> None:
+    """Write counterexamples of the run in RUN as small files that can be replayed for ever."""
+    run = load_judged_run(folder, target)
+    paths = run.save_counterexamples(into, most=most, shrink=shrink, budget=budget)
+    for path in paths:
+        click.echo(str(path))
+
+
+@click.command("replay-counterexamples")
+@TARGET
+@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path), default=Path(CORPUS))
+@click.option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
+@fail_on("counterexample", "unless every one is simulated and fixed")
+def replay_counterexamples(
+    target: str, folder: Path, rename: tuple[str, ...], fail_on: str | None
+) -> None:
+    """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
+    from verifai_jax.core.text import printable
+    from verifai_jax.counterexamples import replay_counterexamples as replay
+
+    names = dict(split_pairs("--rename", rename))
+    result = replay(load_problem(target), folder, rename=names)
+    click.echo(printable(str(result)))
+    if fail_on is not None and not result.passed:
+        raise fail_gate()

@@ -1,0 +1,247 @@
+"""Counterexamples kept as small readable files, so that none that was found ever comes back.
+
+    run.save_counterexamples("counterexamples")         # a JSON file each, made for version control
+    replay_counterexamples(problem, "counterexamples")  # all in one batch: failing, fixed, invalid
+
+A file holds the features of one simulation, the formulas, what it was worth, how it was found and
+how to see it again. Nothing in it is executed: the problem comes from whoever replays it.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.keys import run_keys
+from verifai_jax.counterexamples._shrink import shrink as shrink_row
+from verifai_jax.counterexamples.selection import columns_at, problem_of
+from verifai_jax.evaluation.replay import replay
+from verifai_jax.falsification.run import Run
+
+FORMAT = 1
+"""Format of the files; those of a later one are refused."""
+
+
+class CorpusError(ValueError):
+    """An error for a file that is no counterexample, or a damaged one."""
+
+
+@dataclass(frozen=True)
+class SavedCounterexample:
+    """One counterexample of a corpus, as plain data.
+
+    - `problem`, `target`: names of the problem, in itself and on the command line.
+    - `formulas`: their texts by name.
+    - `features`: the columns of the feature space.
+    - `robustness`: of each formula, as simulated.
+    - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
+    - `precision`, `backend`: that it was simulated with.
+    - `verdict`: of closer replays of the row that it came from; empty where there were none.
+    - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
+    - `found`: the search, its budget, the number of simulations, and the version.
+    """
+
+    problem: str
+    target: str | None
+    formulas: dict[str, str]
+    features: dict[str, Any]
+    robustness: dict[str, float]
+    seed: int
+    row: int
+    precision: str
+    backend: str | None
+    verdict: str
+    changed: dict[str, Any] | None
+    found: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Name of its file: the problem's, and a digest of what decides the simulation."""
+        deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
+        text = json.dumps(deciding, sort_keys=True)
+        stem = re.sub(r"\W+", "-", self.problem).strip("-") or "counterexample"
+        return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
+
+    def write(self, folder: Path) -> Path:
+        """Write the file into a folder; return its path."""
+        path = folder / self.name
+        content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
+        if self.target is not None:
+            content["reproduce"] = f"verifai-jax replay-counterexamples {self.target} {path}"
+        partial = path.with_suffix(".json.part")
+        partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        partial.replace(path)
+        return path
+
+    @classmethod
+    def read(cls, path: Path) -> "SavedCounterexample":
+        """Read a file that `write` wrote, edited by a person or not.
+
+        **Raises:** `CorpusError` for anything else.
+        """
+        try:
+            content = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise CorpusError(f"{path} cannot be read: {error}") from None
+        form = content.get("format") if isinstance(content, dict) else None
+        if form != FORMAT:
+            raise CorpusError(
+                f"{path} is no counterexample of format {FORMAT}; its format is {form!r}"
+            )
+        missing = [field.name for field in fields(cls) if field.name not in content]
+        if missing:
+            raise CorpusError(f"{path} lacks {', '.join(missing)}")
+        values = {field.name: content[field.name] for field in fields(cls)}
+        for name in ("formulas", "features", "robustness"):
+            if not isinstance(values[name], dict):
+                raise CorpusError(f"{path}: {name} must be an object; got {values[name]!r}")
+        for name in ("seed", "row"):
+            if isinstance(values[name], bool) or not isinstance(values[name], int):
+                raise CorpusError(f"{path}: {name} must be a whole number; got {values[name]!r}")
+        if values["precision"] not in ("float32", "float64"):
+            raise CorpusError(
+                f"{path}: precision must be float32 or float64; got {values['precision']!r}"
+            )
+        return cls(**values)
+
+
+def save_counterexamples(
+    run: Run,
+    folder: str | Path,
+    *,
+    most: int = 5,
+    shrink: bool = True,
+    budget: int = 1000,
+) -> list[Path]:
+    """Write counterexamples of a run into a folder, one small file each.
+
+    Only rows that the run claims are written: where it confirms, those that closer replays
+    confirmed. The worst comes first, then each time the one farthest from those before, so that a
+    few of them stand for all.
+
+    **Arguments:**
+
+    - `run`: with its problem.
+    - `folder`: it is made where there is none; files that are there already stay.
+    - `most`: counterexamples at most.
+    - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
+    - `budget`: simulations to shrink one with, at most.
+
+    **Returns:** the paths of the files, none twice.
+
+    **Raises:** `ValueError` for a run without its problem or without a counterexample.
+    """
+    problem = problem_of(run)
+    check_count("most", most)
+    check_count("budget", budget)
+    claimed = run.table.counterexamples
+    if not len(claimed):
+        raise ValueError(
+            f"the run of {run.name!r} claims no counterexample in {run.simulations} simulations"
+        )
+    ordered = claimed.sort_values("rho", kind="stable")
+    points = problem.space.points(ordered)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths: dict[Path, None] = {}
+    for place in _spread(points, most):
+        row = int(ordered.index[place])
+        features = {name: ordered.iloc[place][name] for name in problem.space.columns}
+        changed = None
+        if shrink and problem.nominal is not None:
+            small = shrink_row(run, row, budget=budget, others=False)
+            features = columns_at(small.problem, small.u)
+            changed = {
+                name: [_plain(was), _plain(now)] for name, (was, now) in small.changed.items()
+            }
+        seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
+        if not seen.violated:
+            # Shrinking in another precision, or rounding in the table, must not claim too much.
+            features, changed = {name: ordered.iloc[place][name] for name in features}, None
+            seen = replay(problem, features, run_keys(run.seed)[1], row, run.precision)
+        if not seen.violated:
+            continue
+        verdict = str(ordered.iloc[place]["verdict"]) if "verdict" in ordered else ""
+        saved = SavedCounterexample(
+            problem=run.name,
+            target=run.target,
+            formulas=dict(run.formulas),
+            features={name: _plain(value) for name, value in features.items()},
+            robustness={name: _plain(value) for name, value in seen.rho.items()},
+            seed=run.seed,
+            row=row,
+            precision=run.precision,
+            backend=run.backend,
+            verdict=verdict,
+            changed=changed,
+            found={
+                "search": run.search,
+                "budget": run.budget,
+                "simulations": run.simulations,
+                "version": run.version,
+                "jax": jax.__version__,
+            },
+        )
+        paths[saved.write(folder)] = None
+    return list(paths)
+
+
+def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], dict[Path, str]]:
+    """Read the files of a corpus: a folder, or one file.
+
+    **Returns:** the counterexamples by path, and what is wrong with the other files.
+
+    **Raises:** `FileNotFoundError` where there is no such place.
+    """
+    place = Path(folder)
+    if not place.exists():
+        raise FileNotFoundError(f"there is no corpus of counterexamples in {place}")
+    paths = sorted(place.glob("*.json")) if place.is_dir() else [place]
+    entries, damaged = {}, {}
+    for path in paths:
+        try:
+            entries[path] = SavedCounterexample.read(path)
+        except CorpusError as error:
+            damaged[path] = str(error)
+    return entries, damaged
+
+
+def renamed(features: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """Return columns under new names; that of a feature renames all columns of it."""
+    result = {}
+    for column, value in features.items():
+        stem = re.split(r"[.\[]", column, maxsplit=1)[0]
+        new = names.get(column)
+        if new is None and stem in names:
+            new = names[stem] + column[len(stem) :]
+        result[new or column] = value
+    return result
+
+
+def _spread(points: Any, most: int) -> list[int]:
+    """Return places of points, the first and then each time the one farthest from those before."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(most, len(points)):
+        farthest = int(np.argmax(distance))
+        if distance[farthest] <= 0:
+            break
+        chosen.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(points - points[farthest], axis=1))
+    return chosen
+
+
+def _plain(value: object) -> Any:
+    """Return an entry of a table as JSON has it; what is absent from an array is null."""
+    if isinstance(value, np.ndarray | jax.Array):
+        return np.asarray(value).tolist()
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not np.isfinite(value) else value
