@@ -17,6 +17,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pandas as pd
 
 import verifai_jax as vj
 
@@ -25,7 +26,7 @@ warnings.simplefilter("ignore")
 ROOT = Path(__file__).parent.parent
 CONES = ROOT / "tests" / "scenes" / "gallery" / "cones.scenic"
 ROUNDS, BATCH, CALLS, THEIRS = 5, 32_768, 4, 60
-SEEDS, SAMPLED, MOST, PRIOR = 10, 4, 30_000, 500_000
+SEEDS, SAMPLED, MOST, PRIOR = 10, 3, 30_000, 500_000
 
 
 def scenes_per_second() -> None:
@@ -94,9 +95,9 @@ def simulations_to_a_failure() -> None:
         count = 0
         while count < MOST:
             drawn = [scene.scenario.generate(maxIterations=10_000)[0] for _ in range(block)]
-            rows = [space.coerce(scene.features_of(one)) for one in drawn]
-            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
-            broken = np.flatnonzero(np.asarray(fails(stacked)))
+            rows = pd.DataFrame([scene.features_of(one) for one in drawn])
+            features = space.features_of({name: rows[name].to_numpy() for name in rows})
+            broken = np.flatnonzero(np.asarray(fails(features)))
             if len(broken):
                 count += int(broken[0]) + 1
                 break

@@ -25,7 +25,7 @@ def poses(body):
 
 
 def apart(one, other):
-    """Greatest difference of two poses; headings differ by what turns one into the other."""
+    """Return the greatest difference of two poses, modulo full turns."""
     turned = (one["heading"] - other["heading"] + np.pi) % (2 * np.pi) - np.pi
     return max(abs(one["x"] - other["x"]), abs(one["y"] - other["y"]), abs(turned))
 
@@ -40,11 +40,16 @@ def test_scenes_refusals_and_distribution_are_those_of_scenic(path):
     program = scenic(path)
     space, names = program.space, [name for name in program.objects if name != "params"]
     count = 12 if path.stem == "road" else POINTS
-    points = np.random.default_rng(3).random((OURS, space.dim), np.float32)
-    few = points[:count]
-    features = space.features_at(few)
-    scenes = jax.tree.map(np.asarray, jax.jit(jax.vmap(program.scenes))(features))
-    accepted = np.asarray(space.accepts_points(few)) if space.where else np.ones(count, bool)
+    size = 160 if program.by_scenic or program.in_python else OURS
+    points = np.random.default_rng(3).random((size, space.dim), np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def together(u):
+        features = space.unflatten(u)
+        return features, program.scenes(features), space.accepts(features)
+
+    features, scenes, accepted = jax.tree.map(np.asarray, together(points))
     for i in range(count):
         here = {name: np.asarray(column[i]) for name, column in features.items()}
         refusal = program.refusal(here)
@@ -66,14 +71,10 @@ def test_scenes_refusals_and_distribution_are_those_of_scenic(path):
     np.random.seed(1)  # noqa: NPY002 - what Scenic draws from
     sampled = 40 if path.stem == "road" else THEIRS
     theirs = [program.scenario.generate(maxIterations=5000)[0] for _ in range(sampled)]
-    points = points[: 160 if program.by_scenic or program.in_python else OURS]
-    if space.where is not None:
-        points = points[np.asarray(space.accepts_points(points))]
-    ours = jax.tree.map(np.asarray, jax.jit(jax.vmap(program.scenes))(space.features_at(points)))
     for i, name in enumerate(names):
         for key in ("x", "y", "heading"):
             # Rounded alike, since values that come again and again are compared exactly.
             one = np.round([poses(scene.objects[i])[key] for scene in theirs], 3)
-            other = np.round(ours[name][key].astype(float), 3)
+            other = np.round(scenes[name][key][accepted].astype(float), 3)
             if np.ptp(one) > 0:
                 assert ks_2samp(one, other).pvalue > LEAST_P, f"{name}.{key}"

@@ -19,10 +19,11 @@ CORNERS = 128
 
 
 class Rectangle(NamedTuple):
-    """A rectangle: its centre, the cosine and sine of its heading, and its half sizes."""
+    """A rectangle: its centre, its heading with cosine and sine, and its half sizes."""
 
     x: Any
     y: Any
+    heading: Any
     cos: Any
     sin: Any
     half_width: Any
@@ -48,6 +49,7 @@ def rectangle_of(body: Body) -> Rectangle:
     return Rectangle(
         place.x,
         place.y,
+        yaw,
         jnp.cos(yaw),
         jnp.sin(yaw),
         body.get("width") / 2,
@@ -136,24 +138,30 @@ def _crosses(box: Rectangle, edges: Float[np.ndarray, "n 2 2"]) -> Bool[Array, "
 
 
 def sees_all_around(x: Any, y: Any, radius: Any, box: Rectangle) -> Bool[Array, ""]:
-    """Return whether a rectangle meets the disc around a point, as Scenic's polygon has it."""
+    """Return whether a rectangle meets the disc around a point, as Scenic's polygon has it.
+
+    Separating axes: those of the rectangle, and the normals of the polygon's edges. How far the
+    rectangle lies along a direction is concave in the direction wherever it is positive, and
+    greatest towards its nearest point, so the two normals next to that one decide.
+    """
     step = 2 * math.pi / CORNERS
-    middles = (np.arange(CORNERS) + 0.5) * step
-    normals = np.stack([np.cos(middles), np.sin(middles)], axis=1)
-    place = jnp.stack([jnp.asarray(p, jnp.result_type(float)) for p in (x, y)])
-    nearest = jnp.min((box.corners - place) @ normals.T.astype(place.dtype), axis=0)
-    meets = jnp.all(nearest <= radius * math.cos(step / 2))
-    dx, dy = x - box.x, y - box.y
+    dx, dy = box.x - x, box.y - y
     right, forward = dx * box.cos + dy * box.sin, -dx * box.sin + dy * box.cos
-    heading = jnp.arctan2(box.sin, box.cos)
-    for place, half, turn in (
-        (right, box.half_width, 0.0),
-        (forward, box.half_length, math.pi / 2),
+    apart = jnp.asarray(False)
+    for place, half, direction in (
+        (right, box.half_width, box.heading),
+        (forward, box.half_length, box.heading + math.pi / 2),
     ):
-        for sign in (0.0, math.pi):
-            direction = heading + turn + sign
-            off = direction - step * jnp.round(direction / step)
-            towards = place if sign == 0.0 else -place
-            # The farthest corner of the polygon towards the box, from the box's own side.
-            meets = meets & (-towards - radius * jnp.cos(off) <= half)
-    return meets
+        off = direction - step * jnp.round(direction / step)
+        apart = apart | (jnp.abs(place) - half > radius * jnp.cos(off))
+    nearest_right = right - jnp.clip(right, -box.half_width, box.half_width)
+    nearest_forward = forward - jnp.clip(forward, -box.half_length, box.half_length)
+    towards = jnp.arctan2(nearest_forward, nearest_right) + box.heading
+    below = jnp.floor(towards / step - 0.5) + 0.5
+    for normal in (below * step, (below + 1) * step):
+        local = normal - box.heading
+        cos, sin = jnp.cos(local), jnp.sin(local)
+        least = right * cos + forward * sin
+        least = least - box.half_width * jnp.abs(cos) - box.half_length * jnp.abs(sin)
+        apart = apart | (least > radius * math.cos(step / 2))
+    return ~apart
