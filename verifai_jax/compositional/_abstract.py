@@ -80,7 +80,7 @@ def abstract(
     - `frame`: `(features, sample) -> signals`: renders one image from where the loop is in one
       sample of a trace of the abstraction, and returns what `error` speaks of.
     - `error`: a condition on the signals of one instant, of both the abstraction and `frame`: the
-      perception errs. Its robustness is what the search for images lowers, so continuous signals
+      perception errs. The search for images raises its robustness, so continuous signals
       (a logit, a distance) help it more than a decision.
     - `search`: of images: a name, or a search with its options.
     - `budget`: rendered images, at most.
