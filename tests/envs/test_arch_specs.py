@@ -9,11 +9,21 @@ from specs.arch import (
     automatic_transmission,
     chasing_cars,
     f16,
+    fuel_control,
     neural_network_controller,
     pacemaker,
+    steam_condenser,
 )
 
-MODULES = (automatic_transmission, chasing_cars, f16, neural_network_controller, pacemaker)
+MODULES = (
+    automatic_transmission,
+    chasing_cars,
+    f16,
+    fuel_control,
+    neural_network_controller,
+    pacemaker,
+    steam_condenser,
+)
 PROBLEMS = {
     name: problem
     for module in MODULES
@@ -21,12 +31,12 @@ PROBLEMS = {
     if isinstance(problem, vj.Problem)
 }
 BOTH = ["at1", "at2", "at51", "at52", "at53", "at54", "at6a", "at6b", "at6c", "at6abc"]
-BOTH += ["cc1", "cc2", "cc3", "cc4", "cc5", "nn", "nn_wide", "pm"]
+BOTH += ["cc1", "cc2", "cc3", "cc4", "cc5", "nn", "nn_wide", "pm", "sc"]
 
 
 def test_requirements_are_complete():
     wanted = {f"{name}{suffix}" for name in BOTH for suffix in ("", "_instance1")}
-    assert set(PROBLEMS) == wanted | {"f16a", "f16a_high"}
+    assert set(PROBLEMS) == wanted | {"f16a", "f16a_high", "afc27", "afc29", "afc33"}
     assert all(name == problem.name for name, problem in PROBLEMS.items())
 
 
