@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from verifai_jax.features import FeatureSpace as FeatureSpace
     from verifai_jax.features import LogUniform as LogUniform
     from verifai_jax.features import Normal as Normal
+    from verifai_jax.features import Reactive as Reactive
     from verifai_jax.features import Signal as Signal
     from verifai_jax.features import Struct as Struct
     from verifai_jax.features import TruncatedNormal as TruncatedNormal
@@ -156,6 +157,7 @@ _NAMES = {
         "FeatureSpace",
         "LogUniform",
         "Normal",
+        "Reactive",
         "Signal",
         "Struct",
         "TruncatedNormal",

@@ -14,6 +14,7 @@ from verifai_jax.features.distributions import LogUniform as LogUniform
 from verifai_jax.features.distributions import Normal as Normal
 from verifai_jax.features.distributions import TruncatedNormal as TruncatedNormal
 from verifai_jax.features.domain import Domain as Domain
+from verifai_jax.features.reactive import Reactive as Reactive
 from verifai_jax.features.signal import Signal as Signal
 from verifai_jax.features.space import FeatureSpace as FeatureSpace
 from verifai_jax.features.transitions import Past as Past

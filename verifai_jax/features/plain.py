@@ -18,6 +18,7 @@ from verifai_jax.features.compound import Struct
 from verifai_jax.features.distributions import Distribution, LogUniform, Normal, TruncatedNormal
 from verifai_jax.features.domain import Domain
 from verifai_jax.features.fixed import Fixed
+from verifai_jax.features.reactive import Reactive
 from verifai_jax.features.signal import Signal
 
 FIELDS: dict[type[Domain], tuple[str, ...]] = {
@@ -29,6 +30,7 @@ FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Constant: ("value",),
     Signal: ("domain", "knots", "hold", "duration"),
     Array: ("domain", "length"),
+    Reactive: ("inputs", "hidden", "bounds", "scale"),
 }
 SIGNAL_OPTIONS = ("times", "width")
 """Arguments of a Signal that are written where they are given."""
