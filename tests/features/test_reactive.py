@@ -35,8 +35,6 @@ def test_the_function_is_that_of_numpy():
     assert float(react(20.0, 12.0)) == pytest.approx(expected, rel=1e-5)
     compiled = jax.jit(lambda gap, v: react(gap, v=v))
     assert float(compiled(20.0, 12.0)) == pytest.approx(expected, rel=1e-5)
-        expected, rel=1e-5
-    )
     on_host = jax.tree.map(np.asarray, react)(20.0, 12.0)
     assert isinstance(on_host, np.floating)
     assert float(on_host) == pytest.approx(expected, rel=1e-5)
