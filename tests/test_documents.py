@@ -21,6 +21,7 @@ PAGES = (
     "reading_the_table",
     "robustness_function",
     "ode",
+    "building_blocks",
     "signals",
     "blackbox",
     "replays",
