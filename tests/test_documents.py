@@ -25,6 +25,7 @@ PAGES = (
     "signals",
     "blackbox",
     "replays",
+    "road",
 )
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))

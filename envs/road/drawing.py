@@ -62,8 +62,17 @@ class Picture:
         title = f"{float(np.asarray(trace.clock())[sample]):5.2f} s  gap {at(self.gap):6.2f} m"
         if self.hidden is not None:
             seen = at("visible") > 0
-            places = [[at(f"{name}_{part}") for name in self.hidden] for part in "xy"]
-            axes.plot(*places, color=INK, linewidth=0.8, linestyle="-" if seen else ":")
+            directions = [at(f"{name}_heading") for name in self.hidden]
+            fronts = [self.bodies[name].front for name in self.hidden]
+            places = [
+                [
+                    at(f"{name}_{part}") + front * turn(direction)
+                    for name, front, direction in zip(self.hidden, fronts, directions, strict=True)
+                ]
+                for part, turn in (("x", np.cos), ("y", np.sin))
+            ]
+            style = "-" if seen else (0, (2, 2))
+            axes.plot(*places, color=PAINT, linewidth=1.4, linestyle=style, zorder=7)
             title += "  in sight" if seen else "  hidden"
         axes.set_title(
             title + ("  collision" if hit else ""),
