@@ -27,7 +27,7 @@ from verifai_jax.features import (
     Normal,
     TruncatedNormal,
 )
-from verifai_jax.features.domain import Domain
+from verifai_jax.features.domain import MOST_LEVELS, Domain
 from verifai_jax.scenes.graph import field, is_random, kind_of, law
 
 Given: TypeAlias = Callable[[Any], Any]
@@ -178,7 +178,7 @@ class Chosen(Leaf):
 
 
 class Place(Leaf):
-    """An integer between ends that are random themselves: its feature is the share of the way."""
+    """An integer between ends that are random, or far apart: its feature is a share of the way."""
 
     def _ends(self, given: Given, xp: Any) -> tuple[Any, Any]:
         node = law(self.node)
@@ -418,7 +418,10 @@ def _discrete(
     weights: Sequence[float] | None,
     options: Sequence[Any] | None,
 ) -> Leaf | None:
-    values = tuple(range(math.ceil(low), math.floor(high) + 1))
+    first, last = math.ceil(low), math.floor(high)
+    if last - first >= MOST_LEVELS:
+        return Place(node, name, {f"{name}.share": Box(0, 1)})
+    values = tuple(range(first, last + 1))
     if weights is not None:
         weighted = [(v, w) for v, w in zip(values, weights, strict=True) if w > 0]
         values = tuple(v for v, _ in weighted)
