@@ -97,5 +97,6 @@ handover = vj.Problem(
     system=vj.blackbox(supervise),
     spec="always gap > 0",
     nominal={"events": []},
+    behaviour=vj.Behaviour(MODES),
     description="a supervisor with a fault that needs three events in order",
 )

@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from verifai_jax.mtl import robustness as robustness
     from verifai_jax.mtl import signal as signal
     from verifai_jax.mtl import until as until
+    from verifai_jax.problem import Behaviour as Behaviour
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
@@ -178,6 +179,7 @@ _NAMES = {
         "until",
     ),
     "problem": (
+        "Behaviour",
         "Problem",
         "ProblemError",
         "Rulebook",

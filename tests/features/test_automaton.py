@@ -221,6 +221,8 @@ def test_plain_data_and_analysis_know_it():
         SPACE.to_json()
     rows = SPACE.rows(jax.tree.map(np.asarray, SPACE.features_at(POINTS[:8])))
     assert tuple(rows) == SPACE.columns
+    assert set(rows["traffic[4].kind"]) <= {"", *TRAFFIC.names}
+    assert set(rows["traffic[4].who"]) <= {"", "car", "truck"}
     import pandas as pd
 
     assert feature_columns(pd.DataFrame(rows), SPACE) == SPACE.columns

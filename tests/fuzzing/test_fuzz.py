@@ -94,7 +94,9 @@ def test_the_same_seed_gives_the_same_table(run):
 @pytest.mark.thorough
 def test_a_run_that_is_resumed_counts_on(run, tmp_path):
     options = {"batch": 64, "cells": CELLS, "seed": 3, "confirm": False, "progress": False}
-    half = vj.fuzz(LEVEL, 128, folder=tmp_path / "half", **options)
+    vj.fuzz(LEVEL, 128, folder=tmp_path / "half", **options)
+    half = vj.load(tmp_path / "half", run.problem)
+    assert not half.damage
     whole = vj.resume(half, budget=256)
     assert whole.table.all.equals(run.table.all)
     np.testing.assert_array_equal(whole.checkpoint["marks.seen"], run.checkpoint["marks.seen"])

@@ -39,7 +39,7 @@ def format_features(features: Mapping[str, object], labels: Mapping[str, str] | 
     labels = labels or {}
     entries: dict[str, list[tuple[str, object]]] = {}
     for name, value in features.items():
-        if "]." in name and (value is None or value != value):
+        if "]." in name and (value is None or value == "" or value != value):
             continue
         stem = name.partition("[")[0] if name.endswith("]") and _is_real(value) else name
         entries.setdefault(stem, []).append((name, value))

@@ -489,6 +489,6 @@ def _events(events: Events) -> str:
 
 
 def _shown(value: object) -> str:
-    if value is None or value != value:
+    if value is None or value == "" or value != value:
         return "absent"
     return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -524,7 +524,8 @@ class Automaton(Domain):
         columns: dict[str, np.ndarray] = {
             f"{name}.length": (kinds >= 0).sum(axis=1).astype(np.int32)
         }
-        shown = np.array([*self.names, None], object)
+        # Texts throughout, so that a column has one type in every batch, on the disk too.
+        shown = np.array([*self.names, ""], object)
         for i, item in enumerate(indexed(name, self.most)):
             columns[dotted(item, "kind")] = shown[kinds[:, i]]
             columns[dotted(item, "wait")] = np.where(kinds[:, i] >= 0, waits[:, i], np.nan)
@@ -648,7 +649,7 @@ def _own_entries(
         entries = [(list(part.values())[place], users) for part, users in parts]
         numeric = all(part.dtype.kind in "iufb" for part, _ in entries)
         real = entries[0][0].dtype if entries[0][0].dtype.kind == "f" else np.float64
-        whole = np.full(len(taken), np.nan if numeric else None, real if numeric else object)
+        whole = np.full(len(taken), np.nan if numeric else "", real if numeric else object)
         for part, users in entries:
             mine = np.isin(taken, users)
             whole[mine] = part[mine]

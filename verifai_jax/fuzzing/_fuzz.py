@@ -56,7 +56,8 @@ def fuzz(
     - `name`: of the run, where there is no problem.
     - `ranges`: signal -> `(low, high)`: within which it must stay.
     - `cells`: signal -> `(low, high, how many)`: cells of behaviour to cover, of all these signals
-      together. Each signal with a range is cut in four when left out, where these are few.
+      together. When left out those of the problem's `behaviour`, or each signal with a range is cut
+      in four, where these are few.
     - `search`: another search; `search.Coverage` when left out.
     - the others as in `falsify`.
 

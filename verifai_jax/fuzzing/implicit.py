@@ -196,6 +196,7 @@ def with_implicit(
     properties: dict[str, Formula] = {FINITE: always(signal(FINITE) > 0)}
     for key, (low, high) in ranges.items():
         properties[f"range_{key}"] = always((signal(key) >= low) & (signal(key) <= high))
+    own_behaviour = None if problem is None or cells is not None else problem.behaviour
     if cells is None:
         cut = ranges if len(ranges) <= MOST_CUT else {}
         cells = {key: (low, high, CELLS_OF_A_RANGE) for key, (low, high) in cut.items()}
@@ -206,7 +207,7 @@ def with_implicit(
         if taken:
             raise ValueError(f"fuzz has a property {taken[0]!r} of its own; rename that formula")
         own = problem.formulas
-        behaviour = problem.behaviour or Behaviour(cells, own.values())
+        behaviour = own_behaviour or Behaviour(cells, own.values())
         checked = CheckedSystem(problem.system, ranges, verdicts=False)
         # What has no order beside the priority is as good as none.
         return replace(problem, system=checked, spec={**own, **properties}, behaviour=behaviour)

@@ -179,7 +179,8 @@ def _of_automaton(domain: Automaton, name: str) -> dict[str, dict[str, Any]]:
     """Return what is known of the events' columns: kinds, and bounds over all kinds of events."""
     found = {f"{name}.length": {**_integers(0, domain.most), "length": True}}
     for item in indexed(name, domain.most):
-        found[f"{item}.kind"] = {"ordered": False, "choices": domain.names}
+        # An absent event is a choice of its own.
+        found[f"{item}.kind"] = {"ordered": False, "choices": (*domain.names, "")}
         for each in domain.transitions:
             for part, own in (("wait", each.wait), *each.parameters):
                 for column, known in _of_domain(own, f"{item}.{part}").items():
@@ -188,7 +189,9 @@ def _of_automaton(domain: Automaton, name: str) -> dict[str, dict[str, Any]]:
 
 
 def _both(one: dict[str, Any] | None, other: dict[str, Any]) -> dict[str, Any]:
-    """Return what is known of a column that has one of two domains."""
+    """Return what is known of a column that has one of two domains, or is empty."""
+    if not other["ordered"]:
+        return {"ordered": False}
     if one is None or one == other:
         return other
     if not (one["ordered"] and other["ordered"]):
