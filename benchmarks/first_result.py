@@ -121,26 +121,36 @@ def command_of(case, place):
 
 def one(case, checkout, caches):
     """Run a case once and return its processor seconds, its seconds and what it printed."""
-    cache = caches / checkout.name
+    # One place for all: JAX knows a compiled program by the folder of its cache, too.
+    cache = caches / checkout.name / "compiled"
+    if case not in ("cold", "help", "import"):
+        fill(case, checkout, caches, cache)
+    else:
+        shutil.rmtree(cache, ignore_errors=True)
     with tempfile.TemporaryDirectory() as place:
-        if case == "cold":
-            # What it compiles is there for the cases that come again.
-            cache = caches / f"{checkout.name}-again"
-            shutil.rmtree(cache, ignore_errors=True)
-        elif case not in ("help", "import"):
-            # What an earlier process has compiled; for an edit, before the edit.
-            shutil.copytree(filled(case, checkout, caches), cache := Path(place) / "cache")
-        return measure(command_of(case, Path(place)), checkout, cache)
+        result = measure(command_of(case, Path(place)), checkout, cache)
+    if case == "cold":
+        shutil.copytree(cache, kept(case, checkout, caches), dirs_exist_ok=True)
+    return result
 
 
-def filled(case, checkout, caches):
-    """Return the cache that an earlier process of this checkout has left."""
-    before = "again" if case in ("bound", "budget") else case
-    cache = caches / f"{checkout.name}-{before}"
-    if not cache.exists():
+def fill(case, checkout, caches, cache):
+    """Put what an earlier process has compiled into the cache; for an edit, before the edit."""
+    earlier = kept(case, checkout, caches)
+    shutil.rmtree(cache, ignore_errors=True)
+    if not earlier.exists():
         with tempfile.TemporaryDirectory() as place:
+            before = "cold" if case in ("again", "bound", "budget") else case
             measure(command_of(before, Path(place)), checkout, cache)
-    return cache
+        shutil.copytree(cache, earlier)
+    else:
+        shutil.copytree(earlier, cache)
+
+
+def kept(case, checkout, caches):
+    """Return where the cache is kept that this case begins with, or leaves if it is cold."""
+    name = "quadrotor" if case in ("cold", "again", "bound", "budget") else case
+    return caches / checkout.name / name
 
 
 def main():

@@ -53,6 +53,29 @@ def test_what_the_compiler_raises_is_raised_where_the_program_is_called():
     assert not compilation._running
 
 
+def test_ctrl_c_gives_up_what_waits_and_what_waited_is_compiled_when_called(monkeypatch):
+    monkeypatch.setattr(compilation, "available_cores", lambda: 1)
+    compilation._pool.cache_clear()
+    slow, waiting = Slow(), Slow()
+    waiting.go.set()
+    first, second = compile_soon("one", slow), compile_soon("other", waiting)
+    assert slow.begun.wait(10)
+    with monkeypatch.context() as patch:
+        patch.setattr(first._future, "result", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            first.result()
+    assert second._future.cancelled()
+    assert not waiting.begun.is_set()
+    assert second(1) == 2
+    slow.go.set()
+    assert first(1) == 2
+    compilation._pool.cache_clear()
+
+
+def interrupted():
+    raise KeyboardInterrupt
+
+
 def test_the_collector_waits_while_programs_are_traced():
     assert gc.isenabled()
     with tracing():

@@ -11,7 +11,7 @@ import gc
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -32,9 +32,10 @@ class Compilation:
     - `name`: of the program, for people.
     """
 
-    def __init__(self, name: str, future: "Future[jax.stages.Compiled]") -> None:
+    def __init__(self, name: str, lowered: jax.stages.Lowered) -> None:
         self.name = name
-        self._future = future
+        self._lowered: jax.stages.Lowered | None = lowered
+        self._future: Future[jax.stages.Compiled] = _pool().submit(_compiled, name, lowered)
         self._program: jax.stages.Compiled | None = None
 
     def result(self) -> jax.stages.Compiled:
@@ -43,7 +44,16 @@ class Compilation:
         **Raises:** what the compiler raised.
         """
         if self._program is None:
-            self._program = self._future.result()
+            try:
+                self._program = self._future.result()
+            except CancelledError:
+                assert self._lowered is not None
+                self._program = _compiled(self.name, self._lowered)
+            except KeyboardInterrupt:
+                # Or else the process would not end before all others are compiled.
+                _cancel_waiting()
+                raise
+            self._lowered = None
         return self._program
 
     def __call__(self, *arguments: Any) -> Any:
@@ -60,7 +70,7 @@ def compile_soon(name: str, lowered: jax.stages.Lowered) -> Compilation:
     - `lowered`: the program, lowered by JAX.
     """
     enable_compile_cache()
-    return Compilation(name, _pool().submit(_compiled, name, lowered))
+    return Compilation(name, lowered)
 
 
 @contextmanager
@@ -94,6 +104,12 @@ def describe_compilation() -> str:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(available_cores(), "compile")
+
+
+def _cancel_waiting() -> None:
+    """Give up what waits for its turn; it is compiled when it is called, if it ever is."""
+    _pool().shutdown(wait=False, cancel_futures=True)
+    _pool.cache_clear()
 
 
 def _compiled(name: str, lowered: jax.stages.Lowered) -> jax.stages.Compiled:
