@@ -104,11 +104,23 @@ class State(NamedTuple):
 
 def initial(features: Features) -> State:
     """Return the state at time 0: idling, before the controller has run."""
-    numbers = (0.0, 0.982, 0.0112, RATIO, RATIO, 0.0)
+    zero, pressure, ratio = (jnp.asarray(number, real()) for number in (0.0, 0.982, RATIO))
     line = delay_line(jnp.asarray([0.0, RATIO], real()), longest=LONGEST, period=PERIOD)
-    controller = (0.982, 0.0, 0.1726, 0.0, 0.0, RATIO)
-    engine = [jnp.asarray(number, real()) for number in numbers]
-    return State(*engine, line, *(jnp.asarray(number, real()) for number in controller))
+    return State(
+        throttle=zero,
+        pressure=pressure,
+        film=jnp.asarray(0.0112, real()),
+        first=ratio,
+        sensed=ratio,
+        way=zero,
+        line=line,
+        estimate=pressure,
+        integral=zero,
+        fuel=jnp.asarray(0.1726, real()),
+        normal=zero,
+        power=zero,
+        target=ratio,
+    )
 
 
 def angle(state: State) -> Scalar:

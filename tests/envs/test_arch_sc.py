@@ -43,6 +43,7 @@ def derivative(t, y, steam):
     return [filling, heating, (pressure - sensor) / 0.5, wanted - flow, *moves]
 
 
+@pytest.mark.thorough
 def test_values_of_the_sheet(simulate):
     pressure = np.asarray(simulate([4.0, 4.0])["P"][0])
     for time, expected in REFERENCE.items():

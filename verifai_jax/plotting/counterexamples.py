@@ -153,7 +153,10 @@ def _course(
     """Return times and values that draw a function of time through these control points."""
     count = len(knots)
     if wave.hold == "linear":
-        return control_times(count, wave.hold, wave.times, length), knots
+        # The first and the last value hold before and behind given times.
+        times = control_times(count, wave.hold, wave.times, length)
+        clock = np.concatenate([[0.0], times, [max(length, float(times[-1]))]])
+        return clock, np.concatenate([knots[:1], knots, knots[-1:]])
     if wave.hold == "pchip":
         clock, smooth = np.linspace(0, length, 40 * count), replace(wave, knots=knots)
         return clock, np.array([smooth(float(time)) for time in clock])
