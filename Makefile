@@ -90,6 +90,7 @@ bench: .venv-bench/installed .venv/scenic
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/perception.py frames
 	$(BIN)/python benchmarks/perception.py loop
+	$(BIN)/python benchmarks/road.py
 	$(BIN)/python benchmarks/scenes.py
 
 policy: .venv/installed
