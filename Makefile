@@ -34,12 +34,12 @@ help:
 	fi
 	@touch $@
 
-# Scenic brings 700 MB, which the quick tests do without.
-.venv/scenic: .venv/installed
+# Scenic brings 700 MB, which the quick tests do without; diffrax is small, and as rarely used.
+.venv/extras: .venv/installed
 	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic]'; \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax]'; \
 	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic]'; \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax]'; \
 	fi
 	@touch $@
 
@@ -54,7 +54,7 @@ PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 test: .venv/installed
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
 
-test-slow: .venv/scenic
+test-slow: .venv/extras
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST) -m "thorough and not slow"
 	$(PYTEST) -m slow
 
@@ -78,7 +78,7 @@ notebooks-update: .venv/installed
 	.venv-bench/bin/python -m pip install -q --disable-pip-version-check -e '.[bench]'
 	@touch $@
 
-bench: .venv-bench/installed .venv/scenic
+bench: .venv-bench/installed .venv/extras
 	.venv-bench/bin/python benchmarks/throughput.py
 	.venv-bench/bin/python benchmarks/search_quality.py landscapes
 	.venv-bench/bin/python benchmarks/search_quality.py cartpole
