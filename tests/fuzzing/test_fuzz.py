@@ -185,7 +185,7 @@ def test_cells_of_a_behaviour():
 
 
 @pytest.mark.slow
-def test_a_fault_that_needs_three_events_is_found_ten_times_sooner():
+def test_a_fault_that_needs_three_events_is_found_many_times_sooner():
     from specs.handover import MODES, handover
 
     found = []
@@ -193,6 +193,7 @@ def test_a_fault_that_needs_three_events_is_found_ten_times_sooner():
         run = vj.fuzz(handover, 20_000, cells=MODES, seed=seed, stop_after=1, progress=False)
         found.append(run.simulations)
     uniform = vj.falsify(handover, "uniform", 60_000, progress=False).table.counts.violating
+    # On few seeds, which scatter: the benchmark has twenty.
     assert np.mean(found) < 60_000 / max(uniform, 1) / 5
     small = vj.shrink(run, budget=600)
     assert int(small.features["events"].length) == 3
