@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -93,7 +94,7 @@ def _ink(now: Mapping[str, float]) -> str:
 
 
 def _draw_camera(axes: Any, features: Mapping[str, Any], now: Mapping[str, float]) -> None:
-    pose = Pose(*(np.float32(now[name]) for name in ("x", "offset", "heading")))
+    pose = Pose(*(jnp.float32(now[name]) for name in ("x", "offset", "heading")))
     image: Float[np.ndarray, "h w 3"] = np.asarray(_look(dict(features), pose))
     axes.imshow(image, interpolation="nearest")
     axes.set_xticks([])
