@@ -10,6 +10,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.fuzzing.implicit import as_recorded, with_implicit
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.search import Coverage
 
@@ -204,3 +205,14 @@ def test_options_of_the_search():
     for wrong in ({"exploration": 2.0}, {"rarity": -1.0}, {"buckets": 0}):
         with unchecked(), pytest.raises(ValueError, match=next(iter(wrong))):
             Coverage(**wrong)
+
+
+def test_the_problem_of_a_recorded_run_has_its_implicit_properties():
+    ranges = {"x": (-0.1, 2.5), "n": (0, 3)}
+    checked = with_implicit(LEVEL, None, None, ranges, None, "level")
+    texts = {name: str(formula) for name, formula in checked.formulas.items()}
+    again = as_recorded(LEVEL, texts)
+    assert {name: str(formula) for name, formula in again.formulas.items()} == texts
+    assert again.system.ranges == ranges
+    assert as_recorded(LEVEL, {"spec": "always (x < 1.5)"}) is LEVEL
+    assert as_recorded(LEVEL, {"spec": "always (x < 1.5)", "other": "always (x < 2)"}) is LEVEL

@@ -127,7 +127,7 @@ def falsify(
                 progress=progress,
                 target=target,
             )
-    _print(run, pictures)
+    print_run(run, pictures)
     if fail_on is not None and run.table.counts.claimed:
         raise fail_gate()
 
@@ -149,7 +149,11 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
     return Decided(decide)
 
 
-def _print(run: "Run", pictures: bool) -> None:
+def print_run(run: "Run", pictures: bool) -> None:
+    """Print the summary of a run and how to see more of it.
+
+    **Raises:** `CommandError` where no simulation has a verdict.
+    """
     click.echo(run.summary())
     assert run.folder is not None
     if run.stopped == "interrupted":

@@ -30,6 +30,7 @@ from verifai_jax.cli.exit_codes import (
 )
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
+from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.monitor import monitor
 from verifai_jax.cli.repair import repair
@@ -41,6 +42,7 @@ from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
     falsify,
+    fuzz,
     list_targets,
     replay,
     analyze,

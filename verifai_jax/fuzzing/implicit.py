@@ -18,7 +18,9 @@ from verifai_jax.core.checks import is_number
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.features import Domain, FeatureSpace
-from verifai_jax.mtl import Formula, always, signal
+from verifai_jax.mtl import Formula, always, parse, signal
+from verifai_jax.mtl.expression import Number
+from verifai_jax.mtl.formula import Predicate
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system
@@ -28,6 +30,9 @@ FINITE = "finite"
 """The signal that is positive where all signals are finite, and its property."""
 COMPLETED = "completed"
 """The signal that is positive in a simulation that ended properly, and its property."""
+
+RANGE = "range_"
+"""Beginning of the name of the property that a signal stays in its range."""
 
 HOLDS = 1e6
 """The value of these signals where all is well: more than any formula's robustness, which leads."""
@@ -195,7 +200,7 @@ def with_implicit(
             raise ValueError(f"fuzz adds a signal {key!r} of its own; call yours otherwise")
     properties: dict[str, Formula] = {FINITE: always(signal(FINITE) > 0)}
     for key, (low, high) in ranges.items():
-        properties[f"range_{key}"] = always((signal(key) >= low) & (signal(key) <= high))
+        properties[f"{RANGE}{key}"] = always((signal(key) >= low) & (signal(key) <= high))
     own_behaviour = None if problem is None or cells is not None else problem.behaviour
     if cells is None:
         cut = ranges if len(ranges) <= MOST_CUT else {}
@@ -217,3 +222,35 @@ def with_implicit(
     checked = CheckedSystem(as_system(system), ranges, verdicts=True)
     behaviour = Behaviour(cells, properties.values())
     return Problem(name, space, checked, properties, behaviour=behaviour)
+
+
+def as_recorded(problem: Problem, formulas: Mapping[str, str]) -> Problem:
+    """Return a problem with the implicit properties that a run of `fuzz` recorded.
+
+    **Arguments:**
+
+    - `problem`: with its own formulas alone.
+    - `formulas`: of the run, their texts by name.
+
+    **Returns:** the problem itself where the run has no implicit properties.
+    """
+    added = {name: text for name, text in formulas.items() if name not in problem.formulas}
+    ranges = {
+        name.removeprefix(RANGE): _ends(parse(text))
+        for name, text in added.items()
+        if name.startswith(RANGE)
+    }
+    if FINITE not in added or len(added) != 1 + len(ranges) or None in ranges.values():
+        return problem
+    known = {name: ends for name, ends in ranges.items() if ends is not None}
+    return with_implicit(problem, None, None, known, None, problem.name)
+
+
+def _ends(formula: Formula) -> tuple[float, float] | None:
+    """Return the ends of a range from its property; None for another formula."""
+    numbers = [
+        part.right.value
+        for part in formula.subformulas()
+        if isinstance(part, Predicate) and isinstance(part.right, Number)
+    ]
+    return (numbers[0], numbers[1]) if len(numbers) == 2 else None

@@ -1,0 +1,98 @@
+"""`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: follow what was covered."""
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from verifai_jax.cli.arguments import (
+    BACKEND,
+    BATCH,
+    MAX_SECONDS,
+    PICTURES,
+    PRECISION,
+    PROGRESS,
+    SEED,
+    TARGET,
+    fail_on,
+    load_problem,
+    next_folder,
+    split_pairs,
+)
+from verifai_jax.cli.exit_codes import fail_gate
+from verifai_jax.cli.falsify import print_run
+
+
+@click.command()
+@TARGET
+@click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
+@click.option(
+    "--cells",
+    multiple=True,
+    metavar="SIGNAL=LOW:HIGH:COUNT",
+    help="Cells of a signal to cover  [default: the problem's behaviour]",
+)
+@BATCH
+@SEED
+@MAX_SECONDS
+@click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
+@PRECISION
+@BACKEND
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
+)
+@PICTURES
+@PROGRESS
+@fail_on("counterexample", "if a counterexample was found")
+def fuzz(
+    target: str,
+    budget: int,
+    cells: tuple[str, ...],
+    batch: int | None,
+    seed: int,
+    max_seconds: float | None,
+    stop_after: int | None,
+    precision: Literal["float32", "float64"] | None,
+    backend: str | None,
+    folder: Path | None,
+    pictures: bool,
+    progress: bool | None,
+    fail_on: str | None,
+) -> None:
+    """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
+    from verifai_jax.fuzzing import fuzz as run_fuzz
+
+    chosen = {name: _cells(name, text) for name, text in split_pairs("--cells", cells)}
+    problem = load_problem(target)
+    with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+        run = run_fuzz(
+            problem,
+            budget,
+            cells=chosen or None,
+            batch=batch,
+            seed=seed,
+            max_seconds=max_seconds,
+            stop_after=stop_after,
+            folder=place,
+            precision=precision or "float32",
+            backend=backend,
+            progress=progress,
+            target=target,
+        )
+    print_run(run, pictures)
+    if fail_on is not None and run.table.counts.claimed:
+        raise fail_gate()
+
+
+def _cells(name: str, text: str) -> tuple[float, float, int]:
+    """Read LOW:HIGH:COUNT."""
+    try:
+        low, high, count = text.split(":")
+        return float(low), float(high), int(count)
+    except ValueError:
+        raise click.UsageError(
+            f"--cells {name} must be LOW:HIGH:COUNT, such as 0:30:6; got {text!r}"
+        ) from None
