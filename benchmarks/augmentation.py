@@ -1,7 +1,7 @@
 """Ten ways to choose training data for a network that sees cones, over seeds; see RESULTS.md.
 
     python benchmarks/augmentation.py in_distribution [--seeds 5] [--folder augmentations]
-    python benchmarks/augmentation.py shifted [--seeds 5] [--folder augmentations]
+    python benchmarks/augmentation.py shifted [--seeds 5] [--folder augmentations] [--arms A,B,C]
 
 The scene, the network and the closed loop are those of `benchmarks/augmentation_scene.py`.
 `in_distribution`: the base is trained on 1000 images from the whole domain. `shifted`: from a
@@ -40,7 +40,8 @@ def compare(result, metric):
 def run(args, shifted):
     name = "shifted" if shifted else "in_distribution"
     folder = None if args.folder is None else Path(args.folder) / name
-    result = vj.augment(task(shifted), "all", seeds=args.seeds, folder=folder, **OPTIONS)
+    arms = "all" if args.arms is None else args.arms.split(",")
+    result = vj.augment(task(shifted), arms, seeds=args.seeds, folder=folder, **OPTIONS)
     print(result)
     for metric in result.metrics:
         compare(result, metric)
@@ -73,5 +74,6 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=("in_distribution", "shifted"))
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--folder", type=str)
+    parser.add_argument("--arms", help="names, comma-separated; all ten when left out")
     arguments = parser.parse_args()
     run(arguments, arguments.what == "shifted")

@@ -63,7 +63,21 @@ def to_arrow(columns: Columns) -> "pa.RecordBatch":
     """Return rows as a batch of Arrow's."""
     import pyarrow as pa
 
-    return pa.RecordBatch.from_pydict({name: pa.array(each) for name, each in columns.items()})
+    return pa.RecordBatch.from_pydict(
+        {name: column_to_arrow(each) for name, each in columns.items()}
+    )
+
+
+def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
+    """Return a column as Arrow's; texts are texts, and null where absent, even if all are."""
+    import pandas as pd
+    import pyarrow as pa
+
+    if values.dtype != object:
+        return pa.array(values)
+    known = values[~pd.isna(values)]
+    texts = all(isinstance(value, str) for value in known)
+    return pa.array(values, pa.string() if texts else None, from_pandas=True)
 
 
 def checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:

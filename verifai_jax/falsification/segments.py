@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Int
 
 from verifai_jax.core.text import format_error, printable
-from verifai_jax.falsification.columns import ROW, Columns
+from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -171,7 +171,7 @@ def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    arrays = {ROW: pa.array(rows), **{name: pa.array(v) for name, v in columns.items()}}
+    arrays = {ROW: pa.array(rows), **{name: column_to_arrow(v) for name, v in columns.items()}}
     one = pd.DataFrame({name: values[:1] for name, values in columns.items()})
     one.index = pd.Index(rows[:1], name=ROW)
     metadata = pa.Schema.from_pandas(one, preserve_index=True).metadata
