@@ -25,6 +25,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNOR
 SPENT = re.compile(
     r"[\d.,]+ (?:ms|s|min|h)(?= to compile| to simulate| to confirm| to run| of a core)"
     r"|(?<=failing, )[\d.,]+ (?:ms|s|min|h)\b"
+    r"|(?<=simulations in )[\d.,]+ (?:ms|s|min|h)(?=, stopped)"
     r"|[\d.,]+ (?=(?:simulations|steps)/s\b)"
 )
 """Time that the machine needed, and its speed."""

@@ -37,6 +37,7 @@ def notebook(*outputs, tags=()):
             "0.7 s to compile, 0.05 s to simulate (20,670 simulations/s), 0.2 s to confirm",
             "1.9 s to compile, 3 min to simulate (9 simulations/s), 2 min to confirm",
         ),
+        ("48 simulations in 14.3 s, stopped: budget", "48 simulations in 2 min, stopped: budget"),
         ("10 of 10, 0 failing, 1.5 s", "10 of 10, 0 failing, 2 min"),
         ("32,768 steps in 0.2 s of a core", "32,768 steps in 1.5 s of a core"),
         ("a\n-----\n1.5", "a\n------\n1.5001"),
