@@ -26,6 +26,7 @@ PAGES = (
     "blackbox",
     "replays",
     "road",
+    "fuzzing",
 )
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
