@@ -60,6 +60,11 @@ def run(args, shifted):
         result.montage(folder / "added.png")
         if shifted:
             result.plot(folder / "loop.png", "loop_failures")
+    if shifted:
+        loops = result.table.pivot(index="seed", columns="arm", values="loop_failures")
+        for arm in ("none", "base"):
+            half = paired_difference(loops["counterexamples"].to_numpy(), loops[arm].to_numpy() / 2)
+            print(f"loop failures with counterexamples against half of those of {arm}: {half}")
     print(f"\nrules of the error table of seed 0:\n{vj.analysis.rules(result.error_tables[0])}")
     if shifted:
         gaps, _ = least_gaps(None, jax.random.key(1), 10_240, "truth")
