@@ -18,6 +18,7 @@ LAYERS = (
     {"evaluation"},
     {"falsification"},
     {
+        "comparison",
         "counterexamples",
         "estimation",
         "fuzzing",

@@ -27,6 +27,7 @@ PAGES = (
     "replays",
     "road",
     "fuzzing",
+    "compare",
 )
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from verifai_jax.augmentation import augment as augment
     from verifai_jax.certification import Certificates as Certificates
     from verifai_jax.certification import certify as certify
+    from verifai_jax.comparison import Comparison as Comparison
+    from verifai_jax.comparison import compare as compare
     from verifai_jax.core.trace import Status as Status
     from verifai_jax.core.trace import Trace as Trace
     from verifai_jax.core.waveform import Waveform as Waveform
@@ -118,6 +120,10 @@ _NAMES = {
     "certification": (
         "Certificates",
         "certify",
+    ),
+    "comparison": (
+        "Comparison",
+        "compare",
     ),
     "core.trace": (
         "Status",

@@ -17,6 +17,7 @@ import click
 
 from verifai_jax._version import __version__
 from verifai_jax.cli.analyze import analyze
+from verifai_jax.cli.compare import compare
 from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.counterexamples import replay_counterexamples, save_counterexamples
 from verifai_jax.cli.doctor import doctor
@@ -57,6 +58,7 @@ COMMANDS = (
     synthesize,
     save_counterexamples,
     replay_counterexamples,
+    compare,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
 
