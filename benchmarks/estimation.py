@@ -3,6 +3,7 @@
 python benchmarks/estimation.py                     # everything, 20 seeds: about 20 minutes
 python benchmarks/estimation.py --seeds 100 --dims 2 10 --levels 1e-6
 python benchmarks/estimation.py --only at6b --truth 1000000
+python benchmarks/estimation.py --only limit-states   # traps of the literature: 15 minutes
 
 For each problem, dimension and probability: how many of the 95 % intervals hold the truth, the
 standard deviation of estimate over truth, the worst factor, and the methods taken.
@@ -13,6 +14,7 @@ import math
 import time
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, ncx2, norm
@@ -75,6 +77,118 @@ def corner(dim: int, p: float) -> vj.Problem:
     return problem("corner", space, lambda x: jnp.sum(x) - side)
 
 
+def metaballs(x):
+    """Two smooth hills; the failures lie around both (Breitung, 2019)."""
+    a, b = x
+    first = 30 / ((4 * (a + 2) ** 2 / 9 + b**2 / 25) ** 2 + 1)
+    return first + 20 / (((a - 2.5) ** 2 / 4 + (b - 0.5) ** 2 / 25) ** 2 + 1) - 5
+
+
+def four_branch(k: float) -> Callable:
+    """Four failing regions, two curved and two flat (Waarts, 2000)."""
+
+    def robustness(x):
+        a, b = x
+        root = math.sqrt(2.0)
+        curved = 3 + 0.1 * (a - b) ** 2 - jnp.abs(a + b) / root
+        return jnp.minimum(curved, k / root - jnp.abs(a - b))
+
+    return robustness
+
+
+def breitung_trap(x):
+    """A robustness that leads away from the probable failures (Breitung, 2019)."""
+    a, b = x
+    first = jnp.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
+    return jnp.minimum(first, jnp.where(b > 2, 0.5 - 0.1 * b, 2.3 - b))
+
+
+def ring(x):
+    """Five discs around the origin, of unequal distances."""
+    angle = jnp.array([0.0, 1.0, 2.2, 3.5, 5.0])
+    far = jnp.linspace(4.2, 4.5, 5)
+    centres = far[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    return jnp.min(jnp.linalg.norm(x - centres, axis=1)) - 0.5
+
+
+def oscillator(x):
+    """Rest after a rectangular pulse (Bucher and Bourgund, 1990), rarer."""
+    c1, c2, m, r = 1 + 0.1 * x[0], 0.1 + 0.01 * x[1], 1 + 0.05 * x[2], 0.5 + 0.05 * x[3]
+    duration, force = 1 + 0.2 * x[4], 0.6 + 0.1 * x[5]
+    w = jnp.sqrt((c1 + c2) / m)
+    return 3 * r - jnp.abs(2 * force / (m * w**2) * jnp.sin(w * duration / 2))
+
+
+def parabola(x):
+    """A curved surface in many dimensions."""
+    return 4 - x[0] - 0.02 * (jnp.sum(x[1:] ** 2) - 39)
+
+
+def hat(x):
+    """A narrow brim (Schoebi, Sudret and Marelli, 2017)."""
+    return 20 - (x[0] - x[1]) ** 2 - 8 * (x[0] + x[1] - 4) ** 3
+
+
+def himmelblau(x):
+    """Four wells of unequal depths; modified as in the literature on subset simulation."""
+    a, b = 0.75 * x[0] - 0.5, 0.75 * x[1] - 1.5
+    return (a**2 / 1.81 + b - 11) ** 2 + (a + b**2 / 1.81 - 7) ** 2 - 45
+
+
+def product(x):
+    """Four equal regions beside the diagonals."""
+    return 8 - jnp.abs(x[0] * x[1])
+
+
+def two_discs(x):
+    """Two discs of unequal sizes."""
+    first = jnp.linalg.norm(x - jnp.array([3.5, 3.5])) - 1
+    return jnp.minimum(first, jnp.linalg.norm(x - jnp.array([-4.0, 2.0])) - 0.7)
+
+
+def slow_and_fast(x):
+    """Two flat regions, to the likelier of which the robustness falls slowly."""
+    return jnp.minimum(60 * (4.6 - x[0]), 0.05 * (4.3 - x[1]))
+
+
+LIMIT_STATES: dict[str, tuple[Callable, int, float | None]] = {
+    "four-branch, k = 6": (four_branch(6), 2, None),
+    "four-branch, k = 7": (four_branch(7), 2, None),
+    "four-branch, k = 9": (four_branch(9), 2, None),
+    "metaballs": (metaballs, 2, None),
+    "Breitung's trap": (breitung_trap, 2, None),
+    "ring of five": (ring, 2, None),
+    "oscillator": (oscillator, 6, 9.133e-6),  # Importance sampling, known to 0.04 %.
+    "parabola": (parabola, 40, 4.17e-5),  # 834 failures of 2e7.
+    "hat": (hat, 2, None),
+    "Himmelblau": (himmelblau, 2, None),
+    "product": (product, 2, None),
+    "two discs": (two_discs, 2, None),
+    "slow and fast": (slow_and_fast, 2, None),
+}
+"""Robustness, dimension, and the probability; None where a grid gives it."""
+
+
+def by_grid(robustness: Callable, step: float = 0.002, end: float = 8.5) -> float:
+    """The probability that a limit state in two dimensions fails, by the midpoint rule."""
+    places = np.arange(-end, end, step) + step / 2
+    mass = norm.pdf(places) * step
+    rows = jax.jit(jax.vmap(jax.vmap(lambda a, b: robustness(jnp.stack([a, b])) < 0, (None, 0)),
+                            (0, None)))  # fmt: skip
+    total = 0.0
+    for start in range(0, len(places), 250):
+        block = slice(start, start + 250)
+        total += mass[block] @ (np.asarray(rows(places[block], places)) @ mass)
+    return float(total)
+
+
+def limit_state(name: str, budget: int, seeds: int) -> None:
+    """One line of the table, of a limit state of the literature."""
+    robustness, dim, p = LIMIT_STATES[name]
+    p = by_grid(robustness) if p is None else p
+    measured(name, problem(name, features(dim), robustness), dim, p, budget, seeds)
+
+
 PROBLEMS = {
     "half-space": half_space,
     "sphere": sphere,
@@ -90,6 +204,11 @@ def closed_form(name: str, dim: int, p: float, budget: int, seeds: int) -> None:
         known = PROBLEMS[name](dim, p)
     except ValueError:
         return
+    measured(name, known, dim, p, budget, seeds)
+
+
+def measured(name: str, known: vj.Problem, dim: int, p: float, budget: int, seeds: int) -> None:
+    """Estimate with many seeds, and print a line of the table."""
     started, covered, ratio, methods = time.perf_counter(), 0, [], set()
     for seed in range(seeds):
         found = estimate(known, budget=budget, seed=seed, progress=False)
@@ -141,13 +260,15 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=50_000)
     parser.add_argument("--dims", type=int, nargs="+", default=[2, 10, 50])
     parser.add_argument("--levels", type=float, nargs="+", default=[1e-2, 1e-4, 1e-6, 1e-7])
-    parser.add_argument("--only", nargs="+", default=[*PROBLEMS, "at6b"])
+    parser.add_argument("--only", nargs="+", default=[*PROBLEMS, "limit-states", "at6b"])
     parser.add_argument("--truth", type=int, help="Simulations of AT6b by Monte Carlo.")
     options = parser.parse_args()
     print("| problem | d | p | simulations | covered | mean | sd | worst | methods | s |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for name in options.only:
-        if name != "at6b":
+        for trap in LIMIT_STATES if name == "limit-states" else ():
+            limit_state(trap, options.budget, options.seeds)
+        if name in PROBLEMS:
             for dim in options.dims:
                 for p in options.levels:
                     closed_form(name, dim, p, options.budget, options.seeds)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from closed_forms import CASES, closed_form, half_space, normal
 
-from verifai_jax.estimation._estimate import _one_thread
+from verifai_jax.estimation._estimate import one_thread
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
@@ -21,7 +21,7 @@ def answered(
 ):
     limit_state = closed_form(robustness, dim, budget, **options)
     plan = Plan(0.95, chains_for(budget, share), np.zeros(dim, bool))
-    with _one_thread():
+    with one_thread():
         answer = method(limit_state, np.random.default_rng(seed), plan)
     assert limit_state.simulations <= budget
     return answer, limit_state

@@ -14,6 +14,7 @@ import numpy as np
 from verifai_jax._version import __version__
 from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
@@ -29,12 +30,16 @@ from verifai_jax.estimation.methods import (
     estimate_by_monte_carlo,
     estimate_by_splitting,
 )
+from verifai_jax.estimation.monte_carlo import AT_ONCE
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
+
+GRADIENTS_FROM = 8
+"""Continuous coordinates from which the searches for failing regions take gradients."""
 
 
 @suggests_options
@@ -51,6 +56,7 @@ def estimate(
     backend: str | None = None,
     max_seconds: float | None = None,
     progress: bool | None = None,
+    executor: Executor | None = None,
 ) -> Estimate:
     """Estimate the probability, under the prior of the features, that a simulation fails.
 
@@ -74,6 +80,7 @@ def estimate(
     - `max_seconds`: wall-clock seconds after which finished simulations give the estimate.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal and in a
       notebook.
+    - `executor`: whose workers simulate, as in `falsify`; the estimate is the same.
 
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
@@ -99,9 +106,9 @@ def estimate(
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
-    simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed)
+    simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed, executor)
     simulated.compile()
-    with SimulationProgress(problem.name, budget, progress) as bar, _one_thread():
+    with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
         limit_state = LimitState(
             simulated,
             problem.space.dim,
@@ -110,6 +117,8 @@ def estimate(
             constraint=None if problem.space.where is None else _constraint(problem),
             deadline=None if max_seconds is None else started + max_seconds,
             report=bar.update,
+            together=1 if executor is None else AT_ONCE,
+            gradient=simulated.gradient if _differentiates(choice.problem) else None,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:
@@ -162,8 +171,8 @@ def _result(
         notes.append(f"ended early: {limit_state.ended}")
     if answer.method in ("importance", "splitting"):
         notes.append(
-            "the interval does not account for failures far from all that splitting reached; the "
-            "guaranteed bound does"
+            "the interval does not account for failures far from all that splitting and the "
+            "independent searches reached; the guaranteed bound does"
         )
     return Estimate(
         name=problem.name,
@@ -194,12 +203,17 @@ def _result(
     )
 
 
+def _differentiates(problem: Problem) -> bool:
+    """Return whether the searches take gradients: in few dimensions chains do without."""
+    return not problem.black_box and problem.space.levels.count(0) >= GRADIENTS_FROM
+
+
 def _constraint(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
     accepts = problem.space.accepts_points
     return lambda u: np.asarray(accepts(np.asarray(u, np.float32)))
 
 
-def _one_thread() -> AbstractContextManager[object]:
+def one_thread() -> AbstractContextManager[object]:
     """Limit linear algebra to one thread.
 
     Small matrices take ten times as long on threads that other work keeps waiting.

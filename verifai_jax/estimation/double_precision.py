@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -23,6 +24,8 @@ from verifai_jax.problem.problem import Problem
 
 EXACT = 2**24
 """Greatest integer up to which all integers are float32 numbers."""
+TEMPERATURE = 1e-3
+"""Temperature of the smooth robustness that is differentiated."""
 BEYOND = (2.0**-27, 2.0**-32)
 """Two probabilities at which a distribution with an outermost value has the same value."""
 
@@ -36,10 +39,15 @@ class FlattenedFeatures(FeatureSpace):
 
     def __init__(self, space: FeatureSpace, precision: str) -> None:
         self.root, self.where = space.root, None
+        self._original, self._precision = space, precision
         with in_precision(precision):
             form = jax.eval_shape(space.unflatten, jnp.zeros(space.dim, precision))
         self._leaves, self._tree = jax.tree.flatten(form)
         self._ends = np.cumsum([int(np.prod(leaf.shape)) for leaf in self._leaves])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The structure of a pytree is none that every pickler takes.
+        return type(self), (self._original, self._precision)
 
     @property
     def dim(self) -> int:
@@ -69,9 +77,17 @@ class DoublePrecisionEvaluator:
     - `batch`: simulations at once.
     - `precision`: of the simulations, `"float32"` or `"float64"`.
     - `seed`: of the random keys of simulations; as in `falsify`.
+    - `executor`: whose workers simulate; this process when left out.
     """
 
-    def __init__(self, problem: Problem, batch: int, precision: str, seed: int) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        batch: int,
+        precision: str,
+        seed: int,
+        executor: Executor | None = None,
+    ) -> None:
         space = problem.space
         self._held = max(space.levels, default=0) <= EXACT
         if self._held:
@@ -81,8 +97,13 @@ class DoublePrecisionEvaluator:
                 precision,
                 lambda: _with_space(original, FlattenedFeatures(space, precision)),
             )
-        self._evaluator = Evaluator(problem, batch, precision=precision, seed=seed)
+        self._evaluator = Evaluator(
+            problem, batch, precision=precision, seed=seed, executor=executor
+        )
+        self._differentiated: Evaluator | None = None
+        self._problem, self._precision, self._seed = problem, precision, seed
         self._numbers = jax.jit(jax.vmap(lambda u: _flat(space.unflatten(u))))
+        self._pullback = jax.jit(jax.vmap(lambda u, by_numbers: _pulled(space, u, by_numbers)))
         self._batch = batch
         self.clamped = self._clamped(space)
 
@@ -96,6 +117,42 @@ class DoublePrecisionEvaluator:
                 points = np.asarray(self._numbers(padded))[: len(u)]
         verdicts = self._evaluator(points)
         return verdicts.least, verdicts.violated, verdicts.proper
+
+    def gradient(
+        self, u: Float[np.ndarray, "n d"]
+    ) -> tuple[
+        Float[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Float[np.ndarray, "n d"],
+    ]:
+        """Evaluate points, and differentiate their robustness by the coordinates of the cube.
+
+        The derivative is that of the smooth robustness at a temperature so low that only ties
+        between predicates are smoothed.
+        """
+        if self._differentiated is None:
+            self._differentiated = Evaluator(
+                self._problem, self._batch, gradient=True, precision=self._precision,
+                seed=self._seed,
+            )  # fmt: skip
+        points: Any = u
+        padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
+        if self._held:
+            with in_precision("float64"):
+                points = np.asarray(self._numbers(padded))[: len(u)]
+        # Each simulation keeps a random key of its own, by its number.
+        first = self._evaluator.simulations
+        verdicts = self._differentiated(points, TEMPERATURE, first)
+        self._evaluator.simulations = first + len(u)
+        slopes = verdicts.gradient
+        assert slopes is not None
+        slopes = np.asarray(slopes, np.float64)
+        if self._held:
+            slopes = np.pad(slopes, ((0, len(padded) - len(u)), (0, 0)))
+            with in_precision("float64"):
+                slopes = np.asarray(self._pullback(padded, slopes))[: len(u)]
+        return verdicts.least, verdicts.violated, verdicts.proper, slopes
 
     def compile(self) -> None:
         """Compile the program of a batch now."""
@@ -116,6 +173,12 @@ class DoublePrecisionEvaluator:
 def _flat(features: Any) -> Array:
     leaves = [jnp.ravel(leaf).astype(jnp.float64) for leaf in jax.tree.leaves(features)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
+
+
+def _pulled(space: FeatureSpace, u: Array, by_numbers: Array) -> Array:
+    """Return derivatives by the coordinates from those by the plain numbers."""
+    numbers, pull = jax.vjp(lambda point: _flat(space.unflatten(point)), u)
+    return pull(by_numbers.astype(numbers.dtype))[0]
 
 
 def _with_space(problem: Problem, space: FeatureSpace) -> Problem:

@@ -32,6 +32,8 @@ MOST_STAGES = 5
 """Stages that improve the proposal, at most."""
 KEPT = 0.25
 """Share of the previous proposal in the next one, so that no stage can spoil it."""
+ANCHORED = 0.1
+"""Share of the anchors in a proposal, so that no stage forgets a region that a search has found."""
 CHAINS_WORTH = 1.5
 """Independent failures that the states of one splitting chain are worth."""
 ENOUGH = 2500
@@ -58,6 +60,7 @@ class ImportanceSamples:
       reaches.
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
+    - `failures`: the points among them that fail.
     - `proposal`: the mixture that was sampled.
     - `coarse`: relative error by single precision at the end of a coordinate.
     - `acceptance`: share of the prior that the constraint accepts, and its relative error.
@@ -69,6 +72,7 @@ class ImportanceSamples:
     edge: Float[np.ndarray, " n"]
     origin: Int[np.ndarray, " n"]
     failing: Bool[np.ndarray, " n"]
+    failures: Float[np.ndarray, "failures d"]
     proposal: Mixture
     coarse: float
     acceptance: tuple[float, float]
@@ -131,6 +135,8 @@ def fit_proposal(
     points: Float[np.ndarray, "n d"],
     chain_ids: Int[np.ndarray, " n"],
     simulations: int,
+    initial: Mixture | None = None,
+    anchors: Mixture | None = None,
     defensive: float = DEFENSIVE,
 ) -> FittedProposal:
     """Fit a proposal to failures, and improve it by samples of itself.
@@ -140,9 +146,11 @@ def fit_proposal(
     - `points`: failures `[n, d]`, distributed about as the prior's.
     - `chain_ids`: the splitting chain `[n]` that each failure comes from.
     - `simulations`: number of simulations left; each stage takes a share of them.
+    - `initial`: proposal of the first stage; fitted to the failures when left out.
+    - `anchors`: a mixture that keeps a share of every proposal.
     - `defensive`: share of the prior in the proposal.
     """
-    proposal = fit_mixture(points, np.ones(len(points)), chain_ids, rng, defensive)
+    proposal = initial or fit_mixture(points, np.ones(len(points)), chain_ids, rng, defensive)
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposals, zs, failing = [], [], []
     effective, tail, before, left = 0.0, np.inf, 0.0, simulations
@@ -171,6 +179,8 @@ def fit_proposal(
         all_ids = np.append(chain_ids, chain_ids.max() + 1 + np.arange(len(new)))
         proposal = fit_mixture(np.concatenate([points, new]), weight, all_ids, rng, defensive)
         proposal = proposal.join(proposals[-1], KEPT)
+        if anchors is not None:
+            proposal = proposal.join(anchors, ANCHORED)
         if stage and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left
@@ -206,8 +216,8 @@ def sample_proposal(
     outside = np.any((np.abs(z) > OUTERMOST) & clamped, axis=1)
     edge = np.where(outside, HIDDEN * x, 0.0)
     return ImportanceSamples(
-        x, without, edge, origin, scores.failing, proposal, _coarse(z, x), acceptance,
-        limit_state.simulations - started,
+        x, without, edge, origin, scores.failing, z[scores.failing], proposal, _coarse(z, x),
+        acceptance, limit_state.simulations - started,
     )  # fmt: skip
 
 

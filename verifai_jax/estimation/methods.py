@@ -14,11 +14,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
+from verifai_jax.estimation.exploration import COST, GRADIENT_COST, Exploration, explore
+from verifai_jax.estimation.importance import DEFENSIVE
+from verifai_jax.estimation.initial_proposal import (
+    Agreement,
+    around_centres,
+    compare_explorations,
+    join_explorations,
+    mix,
+    proposal_from,
+)
 from verifai_jax.estimation.intervals import log_interval
+from verifai_jax.estimation.mixture import Mixture, fit_mixture
 from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.normal_space import Ended, LimitState
 from verifai_jax.estimation.splitting import (
@@ -34,10 +45,26 @@ LEAST_EFFECTIVE = 60
 """Effective failures that importance sampling has to promise."""
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
-SHARE_OF_LEVEL = 0.09
+STEADY_TAIL = 0.5
+"""Tail index below which the weights have a finite variance."""
+SHARE_OF_LEVEL = 0.06
 """Share of the budget for each level of the splitting that makes the proposal."""
 SHARE_OF_REPLICATE = 0.02
 """Share of the budget for each level of splitting runs that are the estimate themselves."""
+EXPLORATIONS = 2
+"""Independent searches for failures beside splitting."""
+SHARE_OF_EXPLORATION = 0.06
+"""Share of the budget for each of them, at most."""
+MANY_COORDINATES, SHARE_IN_MANY_COORDINATES = 8, 0.1
+"""Coordinates from which chains with gradients take this share: there is more to search."""
+FEWEST_CHAINS = 8
+"""Chains of a search, below which it says too little to be worth its simulations."""
+SHARE_OF_PATHS = 0.03
+"""Share of the budget for paths between the failures of different searches."""
+RESERVED = 0.3
+"""Share of the budget that splitting leaves over where searches have found failures."""
+NOTED_UNSEEN = 0.02
+"""Share of the probability from which a disagreement is noted."""
 EXPLORED = 0.1
 """Share of the simulations left for more failures before the proposal is fitted."""
 CHAIN = 10
@@ -72,6 +99,8 @@ class Answer:
     - `diagnostics`: further numbers of the method.
     - `notes`: surprises, in words.
     - `drawn`: data of the pictures.
+    - `samples`: the weighted samples that the estimate rests on; None where there are none.
+    - `nearest`: least distant failures `[m, d]` that the searches found.
     """
 
     prior: Counts
@@ -84,6 +113,8 @@ class Answer:
     diagnostics: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     drawn: dict[str, Any] = field(default_factory=dict)
+    samples: importance.ImportanceSamples | None = None
+    nearest: Float[np.ndarray, "m d"] | None = None
 
 
 def chains_for(budget: int, share: float) -> int:
@@ -136,20 +167,27 @@ def estimate_automatically(limit_state: LimitState, rng: np.random.Generator, pl
 def estimate_by_importance_sampling(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan, first: FirstLevel | None = None
 ) -> Answer:
-    """Estimate by importance sampling; splitting makes the proposal."""
+    """Estimate by importance sampling; splitting and independent searches make the proposal."""
     first = _first_level(limit_state, rng, plan) if first is None else first
     if first is None:
         return bound_from_pilot(limit_state, plan)
     counts = _counts(first)
-    run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first)
-    if run.stopped is not None:
-        return _bound_only(limit_state, rng, plan, run, counts)
+    run = SplittingRun(stopped="ended")
     try:
-        steps = max(2, round(EXPLORED * limit_state.left / plan.chains))
-        points, chain_ids = explore_failures(limit_state, rng, run, plan.chains, steps)
-        fitted = importance.fit_proposal(limit_state, rng, points, chain_ids, limit_state.left)
+        explorations = _explore(limit_state, rng)
+        reserve = round(RESERVED * limit_state.budget) if explorations else 0
+        run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first, reserve)
+        if run.stopped is not None and not explorations:
+            return _bound_only(limit_state, rng, plan, run, counts)
+        points, chain_ids, proposals = _proposals(limit_state, rng, plan, run, explorations)
+        anchors = around_centres(explorations, DEFENSIVE) if explorations else None
+        fitted = importance.fit_proposal(
+            limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
+        )
         promised = fitted.effective * limit_state.left
         if promised < LEAST_EFFECTIVE:
+            if run.stopped is not None:
+                return _bound_only(limit_state, rng, plan, run, counts)
             answer = _splitting_answer(limit_state, rng, plan, [run], counts)
             answer.notes.append(
                 "no proposal fits the failures well enough for importance sampling (it promises "
@@ -157,22 +195,83 @@ def estimate_by_importance_sampling(
                 "estimate is that of multilevel splitting"
             )
             return answer
+        # A little is left over to see whether the searches agree.
+        size = limit_state.left - round(SHARE_OF_PATHS * limit_state.budget)
         samples = importance.sample_proposal(
-            limit_state, rng, fitted.proposal, limit_state.left, plan.clamped
+            limit_state, rng, fitted.proposal, max(size, 1), plan.clamped
+        )
+        if not samples.x.any():
+            return _without_samples(limit_state, rng, plan, run, counts)
+        found = [exploration.points for exploration in explorations]
+        agreement = compare_explorations(
+            limit_state,
+            rng,
+            samples.failures,
+            samples.x[samples.failing],
+            proposals,
+            [points, *found] if run.stopped is None else found,
         )
     except Ended:
+        return _without_samples(limit_state, rng, plan, run, counts)
+    answer = _importance_answer(samples, run, agreement, counts, plan)
+    answer.samples = samples
+    if explorations:
+        answer.nearest = join_explorations(explorations).nearest
+    return answer
+
+
+def _without_samples(
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun, counts: Counts
+) -> Answer:
+    """Answer by splitting where it is complete, else by a bound."""
+    if run.stopped is None:
         return _splitting_answer(limit_state, rng, plan, [run], counts)
-    if not samples.x.any():
-        return _splitting_answer(limit_state, rng, plan, [run], counts)
-    return _importance_answer(samples, run, counts, plan)
+    return _bound_only(limit_state, rng, plan, run, counts)
+
+
+def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Exploration]:
+    """Search for failures independently; return the searches that found some."""
+    share, cost = SHARE_OF_EXPLORATION, COST
+    if limit_state.gradient is not None and limit_state.dim >= MANY_COORDINATES:
+        share = SHARE_IN_MANY_COORDINATES
+    if limit_state.gradient is not None:
+        cost = GRADIENT_COST
+    chains = int(share * limit_state.budget / cost)
+    if chains < FEWEST_CHAINS:
+        return []
+    found = [explore(limit_state, rng, chains) for _ in range(EXPLORATIONS)]
+    return [exploration for exploration in found if len(exploration.points)]
+
+
+def _proposals(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    plan: Plan,
+    run: SplittingRun,
+    explorations: list[Exploration],
+) -> tuple[np.ndarray, np.ndarray, list[Mixture]]:
+    """Return failures, their chains, and a proposal of splitting and of each exploration."""
+    proposals = [proposal_from(exploration, rng, DEFENSIVE) for exploration in explorations]
+    if run.stopped is not None:
+        # The chains of one exploration stand for the failures, until samples of its proposal do.
+        return explorations[0].points, explorations[0].chain_ids, proposals
+    steps = max(2, round(EXPLORED * limit_state.left / plan.chains))
+    points, chain_ids = explore_failures(limit_state, rng, run, plan.chains, steps)
+    fitted = fit_mixture(points, np.ones(len(points)), chain_ids, rng, DEFENSIVE)
+    return points, chain_ids, [fitted, *proposals]
 
 
 def _importance_answer(
-    samples: importance.ImportanceSamples, run: SplittingRun, counts: Counts, plan: Plan
+    samples: importance.ImportanceSamples,
+    run: SplittingRun,
+    agreement: Agreement,
+    counts: Counts,
+    plan: Plan,
 ) -> Answer:
     mean = samples.mean
     low, high = samples.interval(plan.confidence)
     failing, drawn = samples.defensive_counts
+    high = min(1.0, high / (1 - agreement.unseen))
     answer = Answer(counts, mean.mean, low, high, "importance", mean.effective, mean.cv)
     answer.diagnostics = {
         "tail_index": mean.tail,
@@ -187,15 +286,23 @@ def _importance_answer(
         "acceptance": samples.acceptance[0],
         "levels": list(run.levels),
         "fractions": list(run.fractions),
+        "reached": [float(share) for share in agreement.reached],
+        "unseen": agreement.unseen,
     }
     answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
-    apart = abs(np.log(mean.mean / run.estimate))
-    if apart > 3.5 * np.hypot(UNDERSTATED * run.cv, mean.cv):
-        other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
-        answer.low, answer.high = min(low, other[0]), max(high, other[1])
+    if run.stopped is None:
+        _check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)
+    else:
         answer.notes.append(
-            f"splitting gave {run.estimate:.2g}, which does not agree; the interval is made to "
-            "hold both. More simulations would tell"
+            "splitting reached no failure; the estimate rests on the failures that independent "
+            "searches found"
+        )
+    if agreement.unseen > NOTED_UNSEEN:
+        answer.notes.append(
+            f"independent searches do not agree: {format_percent(agreement.alone)} of the "
+            "probability lies where no more than one of them found failures, so there may be "
+            f"more that none found; the interval allows for {format_percent(agreement.unseen)}. "
+            "A larger budget searches more, and falsify(problem, diverse=...) lists more failures"
         )
     if mean.tail > WORST_TAIL:
         answer.notes.append(
@@ -207,6 +314,35 @@ def _importance_answer(
             f"{format_percent(samples.unresolved)} of them; the interval is wider by that"
         )
     return answer
+
+
+def _check_by_splitting(
+    answer: Answer,
+    run: SplittingRun,
+    reached: float,
+    interval: tuple[float, float],
+    plan: Plan,
+) -> None:
+    """Compare an answer with splitting, as far as splitting reached the same failures."""
+    assert answer.probability is not None
+    if reached < 1 - NOTED_UNSEEN:
+        answer.notes.append(
+            f"splitting alone reached {format_percent(reached)} of the probability; independent "
+            "searches found the rest"
+        )
+    apart = np.log(answer.probability * max(reached, 1e-6) / run.estimate)
+    if abs(apart) <= 3.5 * np.hypot(UNDERSTATED * run.cv, answer.relative_error):
+        return
+    if apart > 0 and answer.diagnostics["tail_index"] < STEADY_TAIL:
+        # Weighted samples are as likely to be too high as too low; chains that few of them lead to
+        # a region, or none, are too low. So steady weights need no wider interval below.
+        return
+    other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
+    answer.low, answer.high = min(interval[0], other[0]), max(interval[1], other[1])
+    answer.notes.append(
+        f"splitting gave {run.estimate:.2g}, which does not agree; the interval is made to "
+        "hold both. More simulations would tell"
+    )
 
 
 def estimate_by_splitting(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:

@@ -35,7 +35,7 @@ MOST_POINTS = 1500
 """Failures that one half of the components is fitted to, at most: more change the fit little."""
 TOGETHER = 0.3
 """Part of the shares that all points decide; points not fitted to decide the rest."""
-LEAST_SHARE = 1e-3
+LEAST_SHARE = 5e-4
 """Share below which a component is dropped."""
 
 
@@ -87,6 +87,10 @@ class Mixture:
     def ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the proposal density over the prior's."""
         return np.exp(log_ratios(self.components, z)) @ self.shares
+
+    def fitted_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Return the density over the prior's without the defensive part."""
+        return np.exp(log_ratios(self.components[1:], z)) @ self.shares[1:]
 
 
 def fit_mixture(

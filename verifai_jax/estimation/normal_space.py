@@ -21,6 +21,16 @@ Evaluate: TypeAlias = Callable[
     tuple[Shaped[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]],
 ]
 """From points `u [n, d]` of the unit cube to robustness, violation, and a proper verdict, `[n]`."""
+Differentiate: TypeAlias = Callable[
+    [Float[np.ndarray, "n d"]],
+    tuple[
+        Shaped[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Float[np.ndarray, "n d"],
+    ],
+]
+"""The same, and the gradient `[n, d]` of the robustness by the coordinates of the unit cube."""
 
 MOST_DRAWN = 4_000_000
 """Points drawn from the prior in search of accepted ones, at most, for each one wanted."""
@@ -42,6 +52,19 @@ class Scores(NamedTuple):
     proper: Bool[np.ndarray, " n"]
 
 
+class Linearized(NamedTuple):
+    """Robustness and gradient at points of normal space, one row each.
+
+    - `score`: as in `Scores`.
+    - `rho`: the robustness itself; NaN without a verdict.
+    - `gradient`: by the coordinates of normal space; zero where it is not finite.
+    """
+
+    score: Float[np.ndarray, " n"]
+    rho: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, "n d"]
+
+
 class Ended(Exception):
     """Time is over, or the user has interrupted; finished simulations count."""
 
@@ -58,6 +81,9 @@ class LimitState:
     - `constraint`: from points `u [n, d]` to the accepted ones `[n]`; none when left out.
     - `deadline`: on the clock of `time.perf_counter`, after which `Ended` is raised.
     - `report`: called after each batch with simulations, failures and the least robustness so far.
+    - `together`: batches that are simulated at a time, where there are several workers.
+    - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
+      out. A simulation with its gradient counts 2.
     """
 
     def __init__(
@@ -69,9 +95,13 @@ class LimitState:
         constraint: Callable[[Float[np.ndarray, "n d"]], Bool[np.ndarray, " n"]] | None = None,
         deadline: float | None = None,
         report: Callable[[int, int, float], None] | None = None,
+        together: int = 1,
+        gradient: Differentiate | None = None,
     ) -> None:
+        self.step = batch * together
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
+        self.gradient = gradient
         self.simulations = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""
@@ -124,22 +154,60 @@ class LimitState:
 
         **Raises:** `Ended` where time is over or the user interrupts; batches before it count.
         """
+        if not len(z):
+            return Scores(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
+        return Scores(*self._in_batches(self._score, z))
+
+    def linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
+        """Simulate points of normal space, and differentiate their robustness.
+
+        **Raises:** `Ended` as for a call; `ValueError` for a limit state without gradients.
+        """
+        if self.gradient is None:
+            raise ValueError("this limit state has no gradient")
+        if not len(z):
+            return Linearized(np.zeros(0), np.zeros(0), np.zeros((0, self.dim)))
+        return Linearized(*self._in_batches(self._linearize, z))
+
+    def _in_batches(
+        self, part_of: Callable[[np.ndarray], tuple[np.ndarray, ...]], z: Float[np.ndarray, "n d"]
+    ) -> list[np.ndarray]:
         parts = []
-        for start in range(0, len(z), self.batch):
+        for start in range(0, len(z), self.step):
             if self.ended or (self.deadline is not None and time.perf_counter() > self.deadline):
                 self.ended = self.ended or "max_seconds"
                 raise Ended
             try:
-                parts.append(self._score(z[start : start + self.batch]))
+                parts.append(part_of(z[start : start + self.step]))
             except KeyboardInterrupt:
                 self.ended = "interrupted"
                 raise Ended from None
-        if not parts:
-            return Scores(np.zeros(0), np.zeros(0, bool), np.zeros(0, bool))
-        return Scores(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+    def _linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
+        assert self.gradient is not None
+        rho, failing, proper, slopes = (np.asarray(p) for p in self.gradient(to_unit_cube(z)))
+        self.simulations += len(z)
+        scores = self._counted(z, rho, failing, proper)
+        with np.errstate(invalid="ignore", over="ignore"):
+            gradient = slopes * np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
+        usable = np.all(np.isfinite(gradient), axis=1, keepdims=True)
+        return Linearized(
+            scores.score, np.asarray(rho, np.float64), np.where(usable, gradient, 0.0)
+        )
 
     def _score(self, z: Float[np.ndarray, "n d"]) -> Scores:
         rho, failing, proper = (np.asarray(part) for part in self.evaluate(to_unit_cube(z)))
+        return self._counted(z, rho, failing, proper)
+
+    def _counted(
+        self,
+        z: Float[np.ndarray, "n d"],
+        rho: Shaped[np.ndarray, " n"],
+        failing: Bool[np.ndarray, " n"],
+        proper: Bool[np.ndarray, " n"],
+    ) -> Scores:
+        """Count these simulations, and return their scores."""
         known = proper & np.isfinite(rho)
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
         score[failing] = -np.inf

@@ -161,6 +161,18 @@ class Estimate:
             return f"shown, unless the method has missed a part of the failures; {prior}"
         return f"open; {prior}"
 
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the estimate as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: of the HTML file.
+        - `options`: of `reports.write_report`: `problem`, `targets`, `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return late("verifai_jax.reports", "write_report")(self, path, **options)
+
     def plot(self, path: str | Path | None = None) -> "Figure":
         """Draw the interval, the splitting levels and the weights, as far as there are any.
 

@@ -76,6 +76,7 @@ def run_splitting(
     per_level: int,
     chains: int,
     first: FirstLevel | None = None,
+    reserve: int = 0,
 ) -> SplittingRun:
     """Run multilevel splitting once.
 
@@ -85,6 +86,7 @@ def run_splitting(
     - `chains`: chains of a level; they start at the lowest points of the previous level.
     - `first`: samples of the prior to begin with, and their score, failing and proper; drawn when
       left out.
+    - `reserve`: simulations that are to be left over.
 
     **Returns:** the run; `stopped` says why it reached no failure.
     """
@@ -110,7 +112,7 @@ def run_splitting(
             if level == -np.inf:
                 run.points, run.chain_ids = z[inside], chain_ids[inside]
                 return run
-            if limit_state.left < per_level - chains:
+            if limit_state.left - reserve < per_level - chains:
                 run.stopped = "budget"
                 return run
             steps = per_level // chains

@@ -1,0 +1,145 @@
+"""Independent searches find regions that splitting leaves, and say what they may have missed."""
+
+import numpy as np
+import pytest
+from closed_forms import closed_form, normal
+from scipy.stats import norm
+
+from verifai_jax.estimation.components import Gaussian, Prior
+from verifai_jax.estimation.exploration import approach_origin, explore
+from verifai_jax.estimation.initial_proposal import (
+    around_centres,
+    compare_explorations,
+    join_explorations,
+)
+from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
+from verifai_jax.estimation.mixture import Mixture
+from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.estimation.paths import connected
+
+
+def metaballs(z):
+    a, b = z.T
+    first = 30 / ((4 * (a + 2) ** 2 / 9 + b**2 / 25) ** 2 + 1)
+    return first + 20 / (((a - 2.5) ** 2 / 4 + (b - 0.5) ** 2 / 25) ** 2 + 1) - 5
+
+
+def breitung(z):
+    """Breitung's discontinuous counterexample for subset simulation (2019)."""
+    a, b = z.T
+    first = np.where(a > 3.5, 4 - a, 0.85 - 0.1 * a)
+    return np.minimum(first, np.where(b > 2, 0.5 - 0.1 * b, 2.3 - b))
+
+
+def two_sides(z):
+    """`z0 > 4` and `z0 < -4.2`; the robustness falls to the second a hundred times as slowly."""
+    return np.minimum(4 - z[:, 0], 0.01 * (4.2 + z[:, 0]))
+
+
+def limit_state(robustness, dim, budget):
+    return closed_form(lambda u: robustness(normal(u)), dim, budget)
+
+
+def with_gradient(robustness, gradient, dim, budget):
+    def evaluate(u):
+        rho = robustness(normal(u))
+        return rho, rho < 0, np.isfinite(rho)
+
+    def differentiate(u):
+        z = normal(u)
+        return *evaluate(u), gradient(z) / norm.pdf(z)
+
+    return LimitState(evaluate, dim, budget, batch=10_000, gradient=differentiate)
+
+
+def test_chains_fail_and_the_nearest_failures_are_those_of_every_region():
+    found = explore(limit_state(two_sides, 3, 10_000), np.random.default_rng(0), 40)
+    assert np.all(two_sides(found.points) < 0)
+    assert np.all(two_sides(found.nearest) < 0)
+    right = found.nearest[found.nearest[:, 0] > 0, 0]
+    left = found.nearest[found.nearest[:, 0] < 0, 0]
+    assert right.min() == pytest.approx(4.0, abs=0.3)
+    assert left.max() == pytest.approx(-4.2, abs=0.3)
+
+
+def test_gradients_lead_to_the_least_distant_failure_in_many_dimensions():
+    a = np.random.default_rng(0).standard_normal(40)
+    a /= np.linalg.norm(a)
+    known = with_gradient(lambda z: 4.0 - z @ a, lambda z: np.broadcast_to(-a, z.shape), 40, 10_000)
+    found = explore(known, np.random.default_rng(1), 10)
+    assert len(found.nearest) == 10
+    assert np.linalg.norm(found.nearest, axis=1) == pytest.approx(4.0, rel=0.01)
+    far = approach_origin(known, 2.0 * found.nearest)
+    assert np.linalg.norm(far, axis=1) == pytest.approx(4.0, rel=0.01)
+
+
+def test_nothing_is_found_where_nothing_fails():
+    found = explore(
+        limit_state(lambda z: 1.0 + 0 * z[:, 0], 2, 10_000), np.random.default_rng(0), 8
+    )
+    assert len(found.points) == len(found.nearest) == 0
+
+
+def test_paths_join_points_of_one_region_only():
+    known = limit_state(two_sides, 2, 1000)
+    a = np.array([[4.5, 0.0], [4.5, 0.0]])
+    b = np.array([[5.0, 2.0], [-4.5, 0.0]])
+    assert connected(known, a, b).tolist() == [True, False]
+    # Around a circle only the arc leads.
+    outside = limit_state(lambda z: 4.0 - np.linalg.norm(z, axis=1), 2, 1000)
+    assert connected(outside, np.array([[4.1, 0.0]]), np.array([[-1.0, 4.0]])).tolist() == [True]
+
+
+def gaussian(*mean):
+    return Mixture(
+        (Prior(2), Gaussian(np.array(mean), np.eye(2), np.ones(2))), np.array([0.1, 0.9])
+    )
+
+
+def test_what_one_exploration_alone_has_reached_widens_the_interval():
+    rng = np.random.default_rng(0)
+    right, left = np.array([[4.5, 0.0]]), np.array([[-4.5, 0.0]])
+    z = np.concatenate([np.repeat(right, 60, axis=0), np.repeat(left, 40, axis=0)])
+    z += 0.1 * rng.standard_normal(z.shape)
+    z = z[two_sides(z) < 0]
+    x = np.full(len(z), 1e-5)
+    known = limit_state(two_sides, 2, 20_000)
+    one, whole = gaussian(4.5, 0), gaussian(4.5, 0).join(gaussian(-4.5, 0), 0.5)
+    points = np.concatenate([right, left])
+    agree = compare_explorations(known, rng, z, x, [whole, whole], [points, points])
+    assert agree.unseen == 0.0
+    assert agree.reached.tolist() == [1.0, 1.0]
+    apart = compare_explorations(known, rng, z, x, [whole, one], [points, right])
+    missed = np.mean(z[:, 0] < 0)
+    assert apart.alone == pytest.approx(missed, abs=0.02)
+    assert apart.unseen == pytest.approx(missed / 2, abs=0.02)
+    assert apart.reached[1] == pytest.approx(1 - missed, abs=0.02)
+
+
+def test_every_region_keeps_a_part_of_the_anchors():
+    known, rng = limit_state(two_sides, 2, 20_000), np.random.default_rng(0)
+    explorations = [explore(known, rng, 30), explore(known, rng, 30)]
+    joined = join_explorations(explorations)
+    assert len(np.unique(joined.chain_ids)) == len(joined.nearest)
+    z, _ = around_centres(explorations, 0.1).sample(rng, 2000)
+    fails = two_sides(z) < 0
+    assert np.sum(fails & (z[:, 0] > 0)) > 50
+    assert np.sum(fails & (z[:, 0] < 0)) > 50
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robustness", "truth"),
+    # By a grid of step 0.002; the second is exact.
+    [(metaballs, 1.128e-5), (breitung, 3.196e-5), (two_sides, norm.sf(4) + norm.sf(4.2))],
+)
+def test_intervals_cover_where_splitting_is_led_away(robustness, truth):
+    covered = 0
+    for seed in range(10):
+        known = limit_state(robustness, 2, 50_000)
+        plan = Plan(0.95, chains_for(50_000, 0.06), np.zeros(2, bool))
+        answer = estimate_automatically(known, np.random.default_rng(seed), plan)
+        covered += answer.low <= truth <= answer.high
+        assert answer.probability == pytest.approx(truth, rel=0.1)
+    # Of 10 intervals with a coverage of 0.95, fewer than 8 hold with probability 0.012.
+    assert covered >= 8

@@ -1,0 +1,178 @@
+"""The first proposal: what splitting and the independent explorations found, each in its place.
+
+    proposals = [proposal_from(exploration, rng) for exploration in explorations]
+    initial = mix(proposals)
+    agreement = compare_explorations(limit_state, rng, failures, weights, proposals, found)
+    agreement.unseen                                # share of the failures that all may have missed
+
+A failing region that one exploration reached keeps a part of the proposal, however few chains are
+there, so that fresh samples can say how probable it is. These samples also tell how much of the
+probability each exploration had reached by itself. What only one of several has reached is a
+measure of what none has, as species seen once are of those not seen yet.
+
+Source: Good, The population frequencies of species and the estimation of population parameters,
+Biometrika 40 (1953); Burnham and Overton, Robust estimation of population size when capture
+probabilities vary among animals, Ecology 60 (1979), equation 4, for the first-order jackknife.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.estimation.components import Component, Gaussian, Prior
+from verifai_jax.estimation.exploration import Exploration
+from verifai_jax.estimation.fitting import fit_gaussian
+from verifai_jax.estimation.mixture import Mixture, fit_mixture
+from verifai_jax.estimation.normal_space import Ended, LimitState
+from verifai_jax.estimation.paths import COST_OF_PATHS, connected
+
+APART = 1.0
+"""Distance below which two least distant failures count as one."""
+MOST_CENTRES = 16
+"""Least distant failures that get components of their own, at most."""
+LEAST_WEIGHT = 0.02
+"""Least weight of a chain or a centre, in parts of the greatest."""
+REACHED = 0.01
+"""Part of the whole proposal's density that an exploration needs, to have reached a point."""
+WORTH_PATHS = 0.01
+"""Share of the probability that only one exploration seems to have reached, from which paths are
+tried."""
+PATHS = 48
+"""Failures from which paths are tried, at most."""
+TRIED, SPACING = 3, 4
+"""Points of an exploration to which paths are tried: the nearest, the fifth, the ninth."""
+MOST_UNSEEN = 0.9
+"""Share of the failures that may count as missed by all explorations, at most."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of explorations about where the failures are.
+
+    - `reached`: for each exploration the share `[k]` of the failure probability that it reached.
+    - `alone`: share of the probability that no more than one exploration reached.
+    - `unseen`: estimated share of the failures that none of them has reached.
+    """
+
+    reached: Float[np.ndarray, " k"]
+    alone: float
+    unseen: float
+
+
+def proposal_from(exploration: Exploration, rng: np.random.Generator, defensive: float) -> Mixture:
+    """Make a proposal of an exploration's failures: fitted ones, and some around each region."""
+    weight = _weigh_chains(exploration)[exploration.chain_ids]
+    fitted = fit_mixture(exploration.points, weight, exploration.chain_ids, rng, defensive)
+    return fitted.join(around_centres([exploration], defensive), 0.5)
+
+
+def around_centres(explorations: Sequence[Exploration], defensive: float) -> Mixture:
+    """Place components around the least distant failures, and over the chains that belong there.
+
+    Regions have about equal parts, so that samples of this mixture say how probable each of them
+    is, whatever the first ones said.
+    """
+    joined = join_explorations(explorations)
+    nearest, weight = joined.nearest, _weigh_chains(joined)
+    d = nearest.shape[1]
+    centres: list[int] = []
+    for row in np.argsort(np.sum(nearest**2, axis=1)):
+        gaps = np.linalg.norm(nearest[centres] - nearest[row], axis=1)
+        if len(centres) < MOST_CENTRES and np.all(gaps > APART):
+            centres.append(int(row))
+    gaps = np.linalg.norm(nearest[:, None] - nearest[centres][None], axis=2)
+    of_chain = gaps.argmin(axis=1)
+    components: list[Component] = []
+    shares: list[float] = []
+    for number, row in enumerate(centres):
+        own = joined.points[of_chain[joined.chain_ids] == number]
+        around: list[Component] = [Gaussian(nearest[row], np.eye(d), np.ones(d))]
+        if len(own) > 2:
+            gaussian = fit_gaussian(own, np.full(len(own), 1 / len(own)))
+            around.append(Gaussian(gaussian.mean, gaussian.axes, 1.3 * gaussian.stds))
+        components += around
+        shares += [weight[row] ** 0.5 / len(around)] * len(around)
+    share = np.array(shares) / sum(shares) * (1 - defensive)
+    return Mixture((Prior(d), *components), np.append(defensive, share))
+
+
+def join_explorations(explorations: Sequence[Exploration]) -> Exploration:
+    """Put the chains of several explorations together."""
+    counts = np.array([len(one.nearest) for one in explorations])
+    first = np.append(0, np.cumsum(counts)[:-1])
+    return Exploration(
+        np.concatenate([one.points for one in explorations]),
+        np.concatenate([one.chain_ids + k for one, k in zip(explorations, first, strict=True)]),
+        np.concatenate([one.nearest for one in explorations]),
+    )
+
+
+def _weigh_chains(exploration: Exploration) -> Float[np.ndarray, " m"]:
+    """Weigh chains by the prior at their least distant failure, tempered and bounded below."""
+    norms = np.sum(exploration.nearest**2, axis=1)
+    return np.maximum(np.exp((norms.min() - norms) / 4), LEAST_WEIGHT)
+
+
+def mix(proposals: Sequence[Mixture]) -> Mixture:
+    """Mix proposals in equal parts."""
+    mixed = proposals[0]
+    for count, proposal in enumerate(proposals[1:], start=2):
+        mixed = mixed.join(proposal, 1 / count)
+    return mixed
+
+
+def compare_explorations(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    z: Float[np.ndarray, "n d"],
+    x: Float[np.ndarray, " n"],
+    proposals: Sequence[Mixture],
+    found: Sequence[Float[np.ndarray, "_ d"]],
+) -> Agreement:
+    """Compare what each exploration had reached by itself.
+
+    A failure counts as reached where the exploration's own proposal is dense, or where a path of
+    failures leads to what it found; the second is simulated, within what is left of the budget.
+
+    **Arguments:**
+
+    - `z`: failures `[n, d]`, drawn from the final proposal.
+    - `x`: their weights `[n]`, prior over proposal density.
+    - `proposals`: one of each exploration.
+    - `found`: failures `[m, d]` of each exploration.
+    """
+    share = x / x.sum()
+    near = np.stack([p.fitted_ratio(z) * x >= REACHED for p in proposals], axis=1)
+    count, reached = len(proposals), share @ near
+    lonely = near.sum(axis=1) <= 1
+    alone = float(share @ lonely)
+    most = limit_state.left // (count * TRIED * COST_OF_PATHS)
+    if count > 1 and alone > WORTH_PATHS and most:
+        rows = rng.choice(len(z), min(most, PATHS), p=np.where(lonely, share, 0.0) / alone)
+        joined = near[rows]
+        with suppress(Ended):  # Then the paths that were simulated count.
+            for number, points in enumerate(found):
+                far = np.flatnonzero(~joined[:, number])
+                joined[far, number] = _leads_to(limit_state, z[rows[far]], points)
+        reached = reached + alone * (joined.mean(axis=0) - near[rows].mean(axis=0))
+        alone *= float(np.mean(joined.sum(axis=1) <= 1))
+    unseen = min(MOST_UNSEEN, (count - 1) / count * alone)
+    return Agreement(np.clip(reached, 0.0, 1.0), alone, unseen)
+
+
+def _leads_to(
+    limit_state: LimitState, z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
+) -> Bool[np.ndarray, " n"]:
+    """Return whether a path of failures leads from each failure to one of the points nearest it."""
+    leads = np.zeros(len(z), bool)
+    if not len(z):
+        return leads
+    gaps = np.sum(z * z, axis=1)[:, None] - 2 * z @ points.T + np.sum(points**2, axis=1)[None]
+    nearest = np.argsort(gaps, axis=1)[:, : TRIED * SPACING : SPACING]
+    for column in nearest.T:
+        rows = np.flatnonzero(~leads)
+        leads[rows] = connected(limit_state, z[rows], points[column[rows]])
+    return leads

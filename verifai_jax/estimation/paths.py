@@ -1,0 +1,59 @@
+"""Paths of failures: whether two failing points belong to one failing region.
+
+    connected(limit_state, a, b)                    # [n], for points a [n, d] and b [n, d]
+
+Two paths are tried: the straight one, which stays inside a convex region, and the arc that turns
+about the origin at the distances of its ends, which follows a region that lies around the prior.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.estimation.normal_space import LimitState
+
+PLACES = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
+"""Places of a path that are simulated, the middle first."""
+OUTWARD = 1.02
+"""Factor on the distances of an arc, so that one along a boundary lies inside."""
+COST_OF_PATHS = 2 * len(PLACES)
+"""Simulations for a pair of points, at most."""
+
+
+def connected(
+    limit_state: LimitState, a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]
+) -> Bool[np.ndarray, " n"]:
+    """Return for each pair of failing points whether one of two paths between them fails.
+
+    **Raises:** `Ended` where time is over.
+    """
+    joined = np.zeros(len(a), bool)
+    for path in (_straight, _arc):
+        rows = np.flatnonzero(~joined)
+        for place in PLACES:
+            if not len(rows):
+                break
+            z = path(a[rows], b[rows], place)
+            fails = np.zeros(len(rows), bool)
+            fits = limit_state.accepts(z)
+            fails[fits] = limit_state(z[fits]).failing
+            rows = rows[fails]
+        joined[rows] = True
+    return joined
+
+
+def _straight(
+    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], place: float
+) -> Float[np.ndarray, "n d"]:
+    return (1 - place) * a + place * b
+
+
+def _arc(
+    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], place: float
+) -> Float[np.ndarray, "n d"]:
+    """Return points of the arcs: the angle and the distance from the origin change evenly."""
+    far_a = np.linalg.norm(a, axis=1, keepdims=True)
+    far_b = np.linalg.norm(b, axis=1, keepdims=True)
+    one, other = a / np.maximum(far_a, 1e-12), b / np.maximum(far_b, 1e-12)
+    angle = np.arccos(np.clip(np.sum(one * other, axis=1, keepdims=True), -1 + 1e-9, 1 - 1e-9))
+    turned = np.sin((1 - place) * angle) * one + np.sin(place * angle) * other
+    return OUTWARD * ((1 - place) * far_a + place * far_b) * turned / np.sin(angle)
