@@ -1,0 +1,72 @@
+"""`verifai-jax modes FILE.py:NAME`: every mode of failure, and how probable it is."""
+
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from verifai_jax.cli.arguments import (
+    BACKEND,
+    BATCH,
+    MAX_SECONDS,
+    ONLY,
+    PLOT,
+    PRECISION,
+    SEED,
+    TARGET,
+    load_problem,
+)
+from verifai_jax.cli.json_output import as_plain, command, give_result
+
+
+@command()
+@TARGET
+@click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
+@click.option("--confidence", type=float, default=0.95, show_default=True)
+@click.option(
+    "--least-share",
+    type=float,
+    default=0.001,
+    show_default=True,
+    help="Part of the failure probability below which a mode is not listed.",
+)
+@SEED
+@ONLY
+@BATCH
+@MAX_SECONDS
+@PRECISION
+@BACKEND
+@PLOT
+def modes(
+    target: str,
+    budget: int,
+    confidence: float,
+    least_share: float,
+    seed: int,
+    only: str | None,
+    batch: int | None,
+    max_seconds: float | None,
+    precision: Literal["float32", "float64"] | None,
+    backend: str | None,
+    plot: Path | None,
+) -> None:
+    """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
+    from verifai_jax.core.text import printable
+    from verifai_jax.failure_modes import modes as run
+
+    found = run(
+        load_problem(target, only),
+        budget,
+        batch=batch,
+        seed=seed,
+        confidence=confidence,
+        least_share=least_share,
+        precision=precision or "float32",
+        backend=backend,
+        max_seconds=max_seconds,
+    )
+    click.echo(printable(str(found)))
+    give_result(**as_plain(found))
+    if plot is not None:
+        found.plot(plot)
+        click.echo(f"  picture      {plot}")

@@ -1,0 +1,334 @@
+"""Every mode of failure, with its probability.
+
+    found = modes(problem, budget=50_000)
+    found = modes(run)                              # begins from the failures of a run as well
+    print(found); found.plot("modes.png"); found[0].animate("mode.gif")
+
+Most of the budget estimates the failure probability, by searches that do not depend on one another,
+splitting and importance sampling (`estimate`). The weighted failures of its last samples are then
+divided into regions by paths of failures. So the probabilities of the modes are parts of one
+estimate, and sum to it.
+"""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int
+
+from verifai_jax.core.checks import check_fraction
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.keys import run_keys
+from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.counterexamples.description import describe_predicate
+from verifai_jax.counterexamples.selection import problem_of
+from verifai_jax.estimation._estimate import one_thread
+from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
+from verifai_jax.estimation.importance import ImportanceSamples
+from verifai_jax.estimation.methods import (
+    SHARE_OF_LEVEL,
+    Answer,
+    Plan,
+    bound_from_pilot,
+    chains_for,
+    estimate_by_importance_sampling,
+)
+from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.replay import replay
+from verifai_jax.failure_modes.naming import name_mode
+from verifai_jax.failure_modes.regions import Regions, find_regions, share_explained
+from verifai_jax.failure_modes.result import Mode, Modes
+from verifai_jax.falsification import simulate
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.validation import check_options
+from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl.formula import Predicate
+from verifai_jax.problem.problem import Problem
+from verifai_jax.statistics.binomial import clopper_pearson
+
+SHARE_OF_ESTIMATE = 0.75
+"""Share of the budget for the probability; the rest divides the failures."""
+SHOWN = 200
+"""Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
+OUTWARD = (1.0, 1.005, 1.02, 1.05)
+"""Factors on a likeliest failure, of which the first that fails again in a run is its row."""
+MOST_OF_RUN = 200
+"""Failures of a given run that the search for modes begins from."""
+
+
+@suggests_options
+def modes(
+    source: Problem | Run,
+    budget: int = 50_000,
+    *,
+    batch: int | None = None,
+    seed: int = 0,
+    confidence: float = 0.95,
+    least_share: float = 0.001,
+    precision: str = "float32",
+    backend: str | None = None,
+    max_seconds: float | None = None,
+    progress: bool | None = None,
+) -> Modes:
+    """Find every mode of failure, with its probability under the prior of the features.
+
+    **Arguments:**
+
+    - `source`: a problem, or a run of one, whose failures are looked at too.
+    - `budget`: simulations at most; one with its gradient counts 2.
+    - `batch`: simulations at once.
+    - `seed`: the same seed gives the same modes on the same machine.
+    - `confidence`: of all intervals, between 0 and 1.
+    - `least_share`: part of the failure probability below which a region is not listed.
+    - `precision`, `backend`: as in `falsify`.
+    - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
+    - `progress`: True draws a progress bar, False none; None draws one on a terminal.
+
+    **Returns:** the modes, the most probable first; none where no failure was found or failures
+    could not be weighed, and a note says so.
+
+    **Raises:** `TypeError` for something that is no problem or run; `ValueError` for options out of
+    range, or a run that was loaded without its problem.
+    """
+    started = time.perf_counter()
+    if not isinstance(source, Problem | Run):
+        raise TypeError(f"modes needs a Problem or a run of one; got {type(source).__name__}")
+    problem = problem_of(source) if isinstance(source, Run) else source
+    check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
+    check_fraction("confidence", confidence)
+    check_fraction("least_share", least_share)
+    in_precision(precision)
+    problem.space.check_where()
+    chains = chains_for(round(SHARE_OF_ESTIMATE * budget), SHARE_OF_LEVEL)
+    batch = min(chains if batch is None else batch, budget)
+    chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
+    chosen.problem.check()
+    simulated = DoublePrecisionEvaluator(chosen.problem, batch, precision, seed)
+    simulated.compile()
+    rng = np.random.default_rng(seed)
+    with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
+        limit_state = LimitState(
+            simulated,
+            problem.space.dim,
+            round(SHARE_OF_ESTIMATE * budget),
+            batch,
+            constraint=_constraint(problem.space),
+            deadline=None if max_seconds is None else started + max_seconds,
+            report=bar.update,
+            gradient=simulated.gradient if _has_slopes(chosen.problem) else None,
+        )
+        plan = Plan(confidence, chains, simulated.clamped)
+        try:
+            answer = estimate_by_importance_sampling(limit_state, rng, plan)
+        except KeyboardInterrupt:
+            limit_state.ended = "interrupted"
+            answer = bound_from_pilot(limit_state, plan)
+        limit_state.budget = int(budget)
+        regions, unexplained = _divide(limit_state, rng, answer, _failures_of(source), plan)
+    bound = answer.prior.upper_bound(confidence)
+    listed, rest, run = (), 0.0, None
+    if regions is not None and answer.samples is not None:
+        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
+        listed, rest, run = _list_modes(numbers, rng, answer.samples, regions)
+    notes = list(answer.notes)
+    if answer.probability is not None and not listed:
+        notes.append(
+            "the failures could not be weighed one by one, so the probability is not divided into "
+            "modes; a larger budget may fit a proposal to them"
+        )
+    known = answer.probability is not None
+    return Modes(
+        name=problem.name,
+        modes=listed,
+        probability=answer.probability,
+        low=answer.low if known else 0.0,
+        high=answer.high if known else bound,
+        confidence=confidence,
+        unexplained=unexplained,
+        rest=rest,
+        simulations=limit_state.simulations,
+        budget=int(budget),
+        upper_bound=bound,
+        notes=tuple(dict.fromkeys(notes)),
+        run=run,
+        seconds=time.perf_counter() - started,
+    )
+
+
+class _Numbers:
+    """Settings of one call that the listing of modes needs."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        seed: int,
+        precision: str,
+        backend: str | None,
+        confidence: float,
+        least_share: float,
+    ) -> None:
+        self.problem, self.seed, self.precision, self.backend = problem, seed, precision, backend
+        self.confidence, self.least_share = confidence, least_share
+
+
+def _has_slopes(problem: Problem) -> bool:
+    return not problem.black_box and 0 in problem.space.levels
+
+
+def _constraint(space: FeatureSpace) -> Any:
+    if space.where is None:
+        return None
+    accepts = space.accepts_points
+    return lambda u: np.asarray(accepts(np.asarray(u, np.float32)))
+
+
+def _failures_of(source: Problem | Run) -> Float[np.ndarray, "n d"] | None:
+    """Return failures of a given run in normal space; None for a problem."""
+    from scipy.special import ndtri
+
+    if not isinstance(source, Run) or source.problem is None:
+        return None
+    rows = source.table.counterexamples
+    if not len(rows):
+        return None
+    rows = rows.sort_values("rho").head(MOST_OF_RUN)
+    points = np.asarray(source.problem.space.points(rows), np.float64)
+    return ndtri(np.clip(points, 1e-8, 1 - 1e-8))
+
+
+def _divide(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    answer: Answer,
+    more: Float[np.ndarray, "n d"] | None,
+    plan: Plan,
+) -> tuple[Regions | None, tuple[float, float]]:
+    """Divide the weighted failures into regions; also the share that no region explains."""
+    nothing = (0.0, 1.0)
+    if answer.samples is None or not answer.samples.x.any():
+        return None, nothing
+    samples = answer.samples
+    x = samples.x[samples.failing]
+    share = x / x.sum()
+    z = samples.failures
+    nearest = [part for part in (answer.nearest, more) if part is not None]
+    starts = np.concatenate(nearest) if nearest else z[:0]
+    try:
+        regions = find_regions(limit_state, rng, z, share, _failing(limit_state, starts))
+        joined, tried = share_explained(limit_state, rng, regions, z, share)
+    except (Ended, KeyboardInterrupt):
+        return None, nothing
+    interval = clopper_pearson(tried - joined, tried, plan.confidence)
+    return regions, (interval.low, interval.high)
+
+
+def _failing(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "_ d"]:
+    return z[limit_state(z).failing] if len(z) else z
+
+
+def _list_modes(
+    numbers: _Numbers, rng: np.random.Generator, samples: ImportanceSamples, regions: Regions
+) -> tuple[tuple[Mode, ...], float, Run | None]:
+    """Return the modes in the order of their probability, what is left, and their simulations."""
+    problem, whole = numbers.problem, samples.mean.mean
+    of_sample = np.full(len(samples.x), -1)
+    of_sample[samples.failing] = regions.assign(samples.failures)
+    parts = [_part_of(samples, of_sample == k) for k in range(regions.count)]
+    masses = np.array([float(part.x.sum()) for part in parts]) / float(samples.x.sum())
+    order = [int(k) for k in np.argsort(-masses, kind="stable") if masses[k] >= numbers.least_share]
+    rest = whole * max(0.0, float(1 - masses[order].sum()))
+    if not order:
+        return (), rest, None
+    design = regions.design_points[order]
+    likeliest = _columns(problem.space, design)
+    prior = _columns(problem.space, rng.standard_normal((5 * SHOWN, problem.space.dim)))
+    run, rows = _simulate(numbers, design)
+    key = run_keys(numbers.seed)[1]
+    listed = []
+    of_failure = of_sample[samples.failing]
+    for number, k in enumerate(order):
+        chance = np.where(of_failure == k, samples.x[samples.failing], 0.0)
+        drawn = rng.choice(len(chance), SHOWN, p=chance / chance.sum())
+        failures = _columns(problem.space, samples.failures[drawn])
+        low, high = parts[k].interval(numbers.confidence)
+        features = {str(name): value for name, value in likeliest.iloc[number].items()}
+        rho, cause = _cause(numbers, features, key)
+        listed.append(
+            Mode(
+                number=number,
+                name=name_mode(failures, prior),
+                probability=parts[k].mean.mean,
+                low=low,
+                high=high,
+                share=float(masses[k]),
+                features=features,
+                distance=float(np.linalg.norm(design[number])),
+                rho=rho,
+                cause=cause,
+                failures=failures,
+                row=rows[number],
+                problem=problem,
+                run=run,
+                key=key,
+                precision=numbers.precision,
+            )
+        )
+    return tuple(listed), rest, run
+
+
+def _part_of(samples: ImportanceSamples, own: Bool[np.ndarray, " n"]) -> ImportanceSamples:
+    """Return the samples with the weights of one region only."""
+    return replace(
+        samples,
+        x=np.where(own, samples.x, 0.0),
+        edge=np.where(own, samples.edge, 0.0),
+        without=np.zeros_like(samples.without),
+    )
+
+
+def _columns(space: FeatureSpace, z: Float[np.ndarray, "n d"]) -> pd.DataFrame:
+    """Return the features at points of normal space as columns of a table."""
+    with in_precision("float64"):
+        features = jax.tree.map(np.asarray, jax.vmap(space.unflatten)(to_unit_cube(z)))
+    return pd.DataFrame(space.rows(features))
+
+
+def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> tuple[Run, list[int | None]]:
+    """Simulate the likeliest failures and points just beyond; return the failing row of each."""
+    count = len(design)
+    points = np.concatenate([factor * design for factor in OUTWARD])
+    frame = _columns(numbers.problem.space, points)
+    run = simulate(
+        numbers.problem,
+        frame,
+        seed=numbers.seed,
+        precision=numbers.precision,
+        backend=numbers.backend,
+        progress=False,
+    )
+    failing = set(run.table.counterexamples.index)
+    rows: list[int | None] = []
+    for k in range(count):
+        tried: Int[np.ndarray, " n"] = np.arange(k, len(points), count)
+        rows.append(next((int(row) for row in tried if row in failing), None))
+    return run, rows
+
+
+def _cause(numbers: _Numbers, features: dict[str, Any], key: Any) -> tuple[float, str]:
+    """Return the robustness at features, and the formula and predicate that decide, in words."""
+    replayed = replay(numbers.problem, features, key, None, numbers.precision)
+    rho = min(replayed.rho.values())
+    try:
+        why = replayed.explain()
+    except ValueError:
+        return rho, ""
+    at = f"{why.time:.4g} s"
+    predicate = why.predicate
+    if isinstance(predicate, Predicate):
+        return rho, describe_predicate(predicate, why, at)
+    return rho, f"at {at} {predicate} decides"

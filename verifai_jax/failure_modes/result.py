@@ -1,0 +1,244 @@
+"""The result of `modes`: failing regions with their probabilities, in words and numbers."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Array, Key
+
+from verifai_jax.core.figure import Figure
+from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_percent
+from verifai_jax.counterexamples import explain, shrink
+from verifai_jax.counterexamples._explain import Explained
+from verifai_jax.counterexamples._shrink import Shrunk
+from verifai_jax.evaluation.replay import Replay, replay
+from verifai_jax.falsification.run import Run
+from verifai_jax.problem.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """One failing region.
+
+    - `number`: its place in the order of probability; 0 is the most probable one.
+    - `name`: conditions in words that set it apart from the prior.
+    - `probability`: of a failure in it, under the prior.
+    - `low`, `high`: the interval, at the confidence of the result.
+    - `share`: its part of the whole failure probability.
+    - `features`: its likeliest failure under the prior (the design point).
+    - `distance`: of that point from the middle of the prior, in standard deviations of normal
+      space (the reliability index).
+    - `rho`: robustness there.
+    - `cause`: the formula and the predicate that decide there, in words; empty without a verdict.
+    - `failures`: features of failures of this mode, distributed as the prior's, one a row.
+    - `row`: row of `Modes.run` that fails at, or just beyond, the likeliest failure; None where
+      none does.
+    """
+
+    number: int
+    name: str
+    probability: float
+    low: float
+    high: float
+    share: float
+    features: dict[str, Any]
+    distance: float
+    rho: float
+    cause: str
+    failures: pd.DataFrame = field(repr=False)
+    row: int | None
+    problem: Problem = field(repr=False)
+    run: Run = field(repr=False)
+    key: Key[Array, ""] = field(repr=False)
+    precision: str = "float32"
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """`(low, high)`."""
+        return self.low, self.high
+
+    def replay(self, precision: str | None = None) -> Replay:
+        """Simulate the likeliest failure again, and keep the trace."""
+        columns: Mapping[str, Any] = self.features
+        return replay(self.problem, columns, self.key, None, precision or self.precision)
+
+    def animate(self, path: str | Path | None = None) -> Any:
+        """Draw the likeliest failure as an animated GIF.
+
+        **Arguments:**
+
+        - `path`: of a file to write too; none when left out.
+
+        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        """
+        return self.replay().animate(path)
+
+    def explain(self, nominal: Mapping[str, Any] | None = None) -> Explained:
+        """Explain the likeliest failure: predicate, instant, and the features that matter.
+
+        **Raises:** `ValueError` where it does not fail when it is simulated again.
+        """
+        return explain(self.run, self._row(), nominal=nominal)
+
+    def shrink(
+        self,
+        nominal: Mapping[str, Any] | None = None,
+        by: Literal["count", "distance"] = "count",
+        budget: int = 2000,
+    ) -> Shrunk:
+        """Search the least departure from nominal that still fails in this mode.
+
+        It stays on the side of nominal on which the likeliest failure lies.
+
+        **Raises:** `ValueError` where that does not fail when it is simulated again, or a feature
+        has no nominal value.
+        """
+        return shrink(
+            self.run, self._row(), nominal=nominal, by=by, budget=budget, others=False, stay=True
+        )
+
+    def _row(self) -> int:
+        if self.row is None:
+            raise ValueError(
+                f"the likeliest failure of mode {self.number} of {self.problem.name!r} does not "
+                "fail when it is simulated again with another random key"
+            )
+        return self.row
+
+    def __str__(self) -> str:
+        return (
+            f"mode {self.number}: {self.name}: probability {self.probability:.3g} "
+            f"({self.low:.3g} to {self.high:.3g})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """All failing regions that were found, the most probable first.
+
+    - `name`: of the problem.
+    - `modes`: the regions.
+    - `probability`, `low`, `high`: of any failure, as `estimate` gives it; None without an
+      estimate, with 0 and the guaranteed bound.
+    - `confidence`: of all intervals.
+    - `unexplained`: share of the failures that no path of failures joins to a mode, from below to
+      above: the interval of a count.
+    - `rest`: probability of further regions that are too improbable to be listed.
+    - `simulations`, `budget`: used and allowed.
+    - `upper_bound`: guaranteed, by samples of the prior alone.
+    - `notes`: surprises, in words.
+    - `run`: simulations of the likeliest failures, as `falsify` keeps them.
+    - `seconds`: wall-clock time.
+    """
+
+    name: str
+    modes: tuple[Mode, ...]
+    probability: float | None
+    low: float
+    high: float
+    confidence: float
+    unexplained: tuple[float, float]
+    rest: float
+    simulations: int
+    budget: int
+    upper_bound: float
+    notes: tuple[str, ...]
+    run: Run | None = field(repr=False)
+    seconds: float = math.nan
+
+    def __len__(self) -> int:
+        return len(self.modes)
+
+    def __iter__(self) -> Iterator[Mode]:
+        return iter(self.modes)
+
+    @overload
+    def __getitem__(self, number: int) -> Mode: ...
+    @overload
+    def __getitem__(self, number: slice) -> tuple[Mode, ...]: ...
+    def __getitem__(self, number: int | slice) -> "Mode | tuple[Mode, ...]":
+        return self.modes[number]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row a mode: its numbers, its name, and the features of its likeliest failure."""
+        return pd.DataFrame(
+            [
+                {
+                    "mode": mode.number,
+                    "name": mode.name,
+                    "probability": mode.probability,
+                    "low": mode.low,
+                    "high": mode.high,
+                    "share": mode.share,
+                    "distance": mode.distance,
+                    "cause": mode.cause,
+                    **mode.features,
+                }
+                for mode in self.modes
+            ]
+        )
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the probabilities with their intervals, and the failures of each mode.
+
+        **Arguments:**
+
+        - `path`: file that the picture is written to, if given.
+
+        **Returns:** the Matplotlib figure.
+        """
+        return late("verifai_jax.plotting.modes", "plot_modes")(self, path)
+
+    def __str__(self) -> str:
+        sure = format_percent(self.confidence)
+        if self.probability is None:
+            lines = [
+                f"{self.name}: no mode of failure found; a failure has probability "
+                f"{self.upper_bound:.2g} at most ({sure} bound)"
+            ]
+        else:
+            lines = [
+                f"{self.name}: fails with probability {self.probability:.3g} ({sure} interval "
+                f"{self.low:.3g} to {self.high:.3g}), in {len(self.modes)} "
+                f"mode{'s' if len(self.modes) != 1 else ''}"
+            ]
+        for mode in self.modes:
+            lines.append(
+                f"  {mode.number}  {format_percent(mode.share)} of the failures: "
+                f"{mode.probability:.3g} ({mode.low:.3g} to {mode.high:.3g})  {mode.name}"
+            )
+            if mode.cause:
+                lines.append(f"     {mode.cause}")
+            lines.append(
+                f"     likeliest at {_listed(mode.features)}, {mode.distance:.3g} standard "
+                "deviations out"
+            )
+        if self.modes:
+            low, high = self.unexplained
+            lines.append(
+                f"  unexplained  {format_percent(low)} to {format_percent(high)} of the failures "
+                f"are joined to none of these; {self.rest:.2g} is the probability of regions too "
+                "improbable to be listed"
+            )
+        lines.append(
+            f"  simulations  {self.simulations:,} of {self.budget:,}, {self.seconds:.1f} s"
+        )
+        lines += [f"  note         {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def _listed(features: Mapping[str, Any], most: int = 6) -> str:
+    """Write features in one line, the first few of many."""
+    parts = [
+        f"{name} = {value:.4g}" if isinstance(value, float | np.floating) else f"{name} = {value}"
+        for name, value in list(features.items())[:most]
+    ]
+    return ", ".join(parts) + (", ..." if len(features) > most else "")
