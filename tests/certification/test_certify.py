@@ -1,6 +1,7 @@
 """Certificates of policies whose failure probability is known: `y = x - t` fails where x > t."""
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -73,6 +74,23 @@ def test_verdicts_of_known_rates(certificates):
     # Equally safe; the one with more room in the attack is named.
     assert certificates.safest == 0
     assert certificates.stopped == "decided"
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("traced", [True, False])
+def test_certificates_from_workers_are_the_same(traced):
+    policies = POLICIES if traced else [lambda x, t=t: x - t for t in THRESHOLDS]
+    options = {"p": 0.1, "samples": 64, "seed": 3, "attack_simulations": 64}
+    here = certify(problem_of, policies, **options)
+    with ThreadPoolExecutor(2) as executor:
+        there = certify(problem_of, policies, **options, executor=executor)
+    assert here.safest == there.safest
+    for one, other in zip(here.rows, there.rows, strict=True):
+        assert (one.failures, one.simulations, one.rate) == (
+            other.failures, other.simulations, other.rate,
+        )  # fmt: skip
+        assert one.worst_robustness == other.worst_robustness
+        np.testing.assert_array_equal(one.counterexamples["rho"], other.counterexamples["rho"])
 
 
 @pytest.mark.thorough

@@ -58,12 +58,12 @@ def killed_after(patch, rounds, problem, folder):
     save, advance, left = Rounds.save, Rounds.advance, [rounds]
     tables = []
 
-    def next_round(self, most):
+    def next_round(self, most, *limit):
         tables.append(self.table)
         if not left[0]:
             raise Killed
         left[0] -= 1
-        advance(self, most)
+        advance(self, most, *limit)
 
     patch.setattr(Rounds, "advance", next_round)
     patch.setattr(Rounds, "save", lambda self, seldom=False: save(self))

@@ -81,7 +81,15 @@ def test_learns_continuous_actions_from_observations_of_another_scale():
 
 @pytest.mark.thorough
 def test_same_seed_same_policy_and_other_values_reuse_the_program(compiled):
-    first, again = (train(Recall(), SMALL, seed=1, steps=8_000) for _ in range(2))
+    calls = []
+    first = train(Recall(), SMALL, seed=1, steps=8_000)
+    again = train(
+        Recall(), SMALL, seed=1, steps=8_000, checkpoints=[300],
+        callbacks=[lambda *call: calls.append(call)],
+    )  # fmt: skip
+    # Once for each update, whatever is computed at once.
+    assert [step for step, _ in calls] == again.steps.tolist()
+    assert [values["mean_return"] for _, values in calls] == again.mean_return.tolist()
     for a, b in zip(jax.tree.leaves(first.policy), jax.tree.leaves(again.policy), strict=True):
         np.testing.assert_array_equal(a, b)
     other = train(Recall(), SMALL, seed=2, steps=8_000)

@@ -1,6 +1,7 @@
 """Sweeps of a toy: what is trained, what is remembered, and that interruptions change nothing."""
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
@@ -74,6 +75,23 @@ def test_one_row_a_policy(whole):
 
 
 @pytest.mark.thorough
+def test_callbacks_see_each_policy_twice_also_from_the_cache(tmp_path):
+    calls = [[], []]
+    for seen in calls:
+        result = sweep(
+            drifting(), configurations=2, samples=64, folder=tmp_path / "sweep",
+            callbacks=[lambda *call, seen=seen: seen.append(call)],
+        )  # fmt: skip
+    assert calls[0] == calls[1]
+    table = result.record.columns
+    assert [step for step, _ in calls[0]] == list(range(1, 2 * len(table["seed"]) + 1))
+    certified = [values for _, values in calls[0] if "failures" in values]
+    assert [v["failures"] for v in certified] == table["failures"].tolist()
+    assert [v["nominal_return"] for v in certified] == table["nominal_return"].tolist()
+    assert [v["environment_steps"] for v in certified] == table["steps"].tolist()
+
+
+@pytest.mark.thorough
 def test_rows_are_what_a_training_of_their_own_gives(whole):
     for row in (0, 1, 11, 20):
         cell = {name: column[row] for name, column in whole.record.columns.items()}
@@ -90,6 +108,17 @@ def test_rows_are_what_a_training_of_their_own_gives(whole):
     returns = np.float64(whole.record.curves[0, 0].mean_return)
     expected = [np.nan, returns[1], returns[3]]
     np.testing.assert_array_equal(whole.record.columns["training_return"][:3], expected)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("halving", [None, Halving(2.0)])
+def test_trainings_on_workers_give_the_same_table(halving):
+    options = {"configurations": 4, "samples": 32, "halving": halving}
+    study = drifting({"rate": vj.LogUniform(0.01, 1.0), "limit": vj.Box(0.05, 9.0)}, seeds=2)
+    here = sweep(study, **options)
+    with ThreadPoolExecutor(2) as executor:
+        there = sweep(study, **options, executor=executor)
+    same_tables(here, there)
 
 
 def test_nominal_returns_are_those_of_the_task_itself():

@@ -19,6 +19,7 @@ from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.executors import Executor
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -52,6 +53,7 @@ def certify(
     remember: Remember | None = None,
     progress: ProgressReport | None = None,
     devices: Sequence[Any] | None = None,
+    executor: Executor | None = None,
 ) -> Certificates:
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
@@ -77,6 +79,7 @@ def certify(
       gives, or gave under this key.
     - `progress(done, total, text)`: called with the simulations so far. `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
+    - `executor`: whose workers simulate, as in `falsify`; the certificates are the same.
 
     Ctrl-C returns what is known. The same seed gives the same certificates, bit for bit on one
     machine, whatever the order of the policies, the number of devices or what a memo holds.
@@ -91,7 +94,13 @@ def certify(
     lanes = LANES if samples >= LANES else max(8, 1 << (samples - 1).bit_length())
     enable_compile_cache()  # Before the search compiles, too.
     blocks = Blocks(
-        problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices
+        problem_of,
+        policies,
+        seed=seed,
+        lanes=lanes,
+        remember=remember,
+        devices=devices,
+        executor=executor,
     )
     attacker = check_attack(blocks.problem, attack)
     rounds = -(-attack_simulations // lanes)

@@ -10,12 +10,14 @@ whatever is chosen for, in whatever order, a memo gives what a simulation would.
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.certification.executor_simulator import ExecutorSimulator
 from verifai_jax.certification.policy_groups import digest, group_policies
 from verifai_jax.certification.simulators import (
     SeparateSimulators,
@@ -23,6 +25,7 @@ from verifai_jax.certification.simulators import (
     problem_with,
     shared_simulator,
 )
+from verifai_jax.core.executors import Executor, Shipment, ship
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -68,6 +71,7 @@ class Blocks:
     - `seed`: of the samples and of the random keys of simulations.
     - `lanes`: samples in a block.
     - `devices`: JAX devices to use; all of this process when left out.
+    - `executor`: whose workers simulate; this process when left out.
 
     **Raises:** `ProblemError` as `Problem.check` does, naming the policy, before anything compiles;
     `ValueError` for policies whose problems have other features than the first.
@@ -82,6 +86,7 @@ class Blocks:
         lanes: int,
         remember: Remember | None = None,
         devices: Sequence[Any] | None = None,
+        executor: Executor | None = None,
     ) -> None:
         self.lanes = lanes
         self._notes: list[str] = []
@@ -109,12 +114,19 @@ class Blocks:
         if first is None:
             raise ValueError("there is no policy to certify")
         self.problem, self.space = first, first.space
+        shipment = None if executor is None else _shipment(problem_of, executor)
         for numbers, group, problems in plans:
-            simulator: Simulator = (
-                SeparateSimulators(problems, lanes)
-                if group is None
-                else shared_simulator(problem_of, group, lanes, self.space.dim, devices)
-            )
+            simulator: Simulator
+            if executor is not None and shipment is not None:
+                own = [policies[number] for number in numbers] if group is None else group.weights
+                structure = None if group is None else group.structure
+                simulator = ExecutorSimulator(
+                    shipment, own, structure, lanes, self.space.dim, executor
+                )
+            elif group is None:
+                simulator = SeparateSimulators(problems, lanes)
+            else:
+                simulator = shared_simulator(problem_of, group, lanes, self.space.dim, devices)
             for number in numbers:
                 self._owner[number] = len(self._simulators)
             places = {number: place for place, number in enumerate(numbers)}
@@ -132,7 +144,7 @@ class Blocks:
         """Decisions and errors that a user should know of."""
         notes = list(self._notes)
         for simulator, places in self._simulators:
-            if isinstance(simulator, SeparateSimulators):
+            if isinstance(simulator, SeparateSimulators | ExecutorSimulator):
                 messages = simulator.messages
                 notes += [
                     f"a simulation of policy {number} raised {messages[place]}"
@@ -225,6 +237,19 @@ class Blocks:
             )
             return False
         return True
+
+
+def _shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
+    """Return what is sent of `problem_of`, once, so that workers keep its programs."""
+    try:
+        return _known_shipment(problem_of, executor)
+    except TypeError:  # One of them cannot be hashed.
+        return ship(problem_of, executor)
+
+
+@lru_cache(maxsize=8)
+def _known_shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
+    return ship(problem_of, executor)
 
 
 class _Samples:

@@ -11,7 +11,7 @@ not on the other blocks or the number of devices.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, Protocol
 
@@ -260,7 +260,7 @@ def _spread(
 class SeparateSimulators:
     """Simulators of each policy by itself, for host systems and code that needs the numbers."""
 
-    def __init__(self, problems: Sequence[Problem], lanes: int) -> None:
+    def __init__(self, problems: Sequence[Problem] | Mapping[int, Problem], lanes: int) -> None:
         self.lanes = lanes
         self.messages: dict[int, str] = {}  # Of each policy the first that a simulation left.
         self._problems = problems

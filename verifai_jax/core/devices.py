@@ -8,7 +8,9 @@ for compiled programs, or `off`).
 """
 
 import os
+import platform
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -47,6 +49,22 @@ def spread_over_devices(
         # A user's scan need not say that its carry differs between devices.
         check_vma=False,
     )
+
+
+@cache
+def describe_processor() -> str:
+    """Describe what decides the last digits of results: processor, device and version of JAX."""
+    device = jax.local_devices()[0]
+    kind = device.device_kind
+    if device.platform == "cpu":
+        kind = platform.processor() or platform.machine()
+        try:
+            lines = Path("/proc/cpuinfo").read_text().splitlines()
+        except OSError:
+            lines = []
+        names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        kind = next(names, kind)
+    return f"{kind} with JAX {jax.__version__}"
 
 
 def split_sharding(devices: Sequence[Device]) -> NamedSharding:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.compilation import Compilation, compile_soon, tracing
+from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
@@ -71,6 +71,8 @@ class Engine:
       the run and the number of the first row.
     - `alone`: whether the engine takes one row at a time, which compiles without `jax.vmap` and so
       takes less time; with `own_keys` only.
+    - `lanes`: rows that a device works on together; as the system says when left out.
+    - `effort`: how much XLA does to make its programs fast.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
     """
@@ -86,18 +88,21 @@ class Engine:
         inputs: Inputs | None = None,
         own_keys: bool = False,
         alone: bool = False,
+        lanes: int | None = None,
+        effort: Effort = "most",
     ) -> None:
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
         self.goals: Goals | None = goals_of(problem.formulas.values()) if clauses else None
         self.precision, self.own_keys, self.alone = precision, own_keys, alone
+        self.effort: Effort = effort
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
-        per_device = -(-batch // len(self.devices))
         self.together = problem.system.lanes
-        self.chunks = -(-per_device // self.together)
-        self.lanes = -(-per_device // self.chunks)
+        self.chunks, self.lanes = chunks_and_lanes(problem, batch, len(self.devices))
+        if lanes is not None:
+            self.chunks, self.lanes = -(-batch // (lanes * len(self.devices))), lanes
         self.padded = self.lanes * self.chunks * len(self.devices)
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
@@ -255,7 +260,8 @@ class Engine:
         differentiates = self.gradient and mode == "evaluate"
         name = "gradients" if differentiates else self.inputs.purpose
         with tracing():
-            self._compiling[mode] = compile_soon(name, self._trace(mode).lower())
+            lowered = self._trace(mode).lower()
+            self._compiling[mode] = compile_soon(name, lowered, self.effort)
         self.compile_seconds += time.perf_counter() - started
 
     def _trace(self, mode: Mode) -> jax.stages.Traced:
@@ -400,6 +406,13 @@ class Engine:
         coordinates = self.inputs.coordinates(row, shared, self.precision)
         features, system = self.inputs.simulated(coordinates, row, shared)
         return boolean_semantics(self.problem, system(features, key))
+
+
+def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:
+    """Return into how many chunks a device's share of a batch is cut, and the rows of one."""
+    per_device = -(-batch // max(1, min(devices, batch)))
+    chunks = -(-per_device // problem.system.lanes)
+    return chunks, -(-per_device // chunks)
 
 
 def _pad(rows: np.ndarray, count: int) -> np.ndarray:

@@ -4,8 +4,8 @@
     verdicts = evaluate(u)                              # u [n, d], any n: Verdicts
 
 Every verb that simulates points stands on this: it says which points, and gets verdicts. The
-evaluator takes the engine that suits the problem, compiled or on the host. Each simulation has a
-random key of its own, by its number.
+evaluator takes the engine that suits the problem, compiled or on the host, or sends points to the
+workers of an executor. Each simulation has a random key of its own, by its number.
 """
 
 from typing import Any
@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.evaluation.engine import Engine, engine_for
+from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -33,6 +35,9 @@ class Evaluator:
     - `precision`: `"float32"` or `"float64"`.
     - `seed`: of the random keys of simulations; as in `falsify`.
     - `journal`: of rows in flight, for a problem on the host.
+    - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
+      left out.
+    - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     """
 
     def __init__(
@@ -45,13 +50,20 @@ class Evaluator:
         precision: str = "float32",
         seed: int = 0,
         journal: Journal | None = None,
+        executor: Executor | None = None,
+        target: str | None = None,
     ) -> None:
         self.problem, self.batch = problem, batch
-        self.engine: Engine | HostEngine = (
-            HostEngine(problem, precision, journal)
-            if problem.black_box
-            else engine_for(problem, batch, gradient, precision, clauses)
-        )
+        self.engine: Engine | HostEngine | ExecutorEngine
+        if executor is not None:
+            self.engine = ExecutorEngine(
+                problem, batch, executor, gradient=gradient, clauses=clauses,
+                precision=precision, journal=journal, target=target,
+            )  # fmt: skip
+        elif problem.black_box:
+            self.engine = HostEngine(problem, precision, journal)
+        else:
+            self.engine = engine_for(problem, batch, gradient, precision, clauses)
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -89,6 +101,9 @@ class Evaluator:
         """
         start = self.simulations if first is None else first
         count, parts = len(u), []
+        if isinstance(self.engine, ExecutorEngine) and count:
+            self.simulations = start + count
+            return self.engine.evaluate(u, self.key, start, temperature)
         for begin in range(0, count, self.batch):
             block = slice(begin, begin + self.batch)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
@@ -100,3 +115,12 @@ class Evaluator:
         if not parts:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)
         return Verdicts.concatenate(parts)
+
+    def submit(self, u: Float[Any, "n d"], first: int) -> Pending:
+        """Send points to the workers of the executor; `result` of what it returns waits for them.
+
+        **Raises:** `TypeError` for an evaluator without an executor.
+        """
+        if not isinstance(self.engine, ExecutorEngine):
+            raise TypeError("points are sent to workers only by an evaluator with an executor")
+        return self.engine.submit(u, self.key, first)

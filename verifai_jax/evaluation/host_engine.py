@@ -81,6 +81,8 @@ class HostEngine:
     - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
     - `system`: simulated instead of the problem's own, such as one with a finer step.
     - `monitor`: one that is compiled already for the same formulas.
+    - `least`: rows that features are computed of together at least, a power of two, so that few
+      rows get theirs from the program that many would.
     """
 
     def __init__(
@@ -91,8 +93,10 @@ class HostEngine:
         *,
         system: System | None = None,
         monitor: HostMonitor | None = None,
+        least: int = 1,
     ) -> None:
         self.problem, self.precision, self.journal = problem, precision, journal
+        self.least = least
         self.system = problem.system if system is None else system
         self.monitor = HostMonitor(problem) if monitor is None else monitor
         self.compile_seconds = 0.0
@@ -118,7 +122,10 @@ class HostEngine:
         """
         with in_precision(self.precision):
             u = np.asarray(rows)
-            features, keys, seeds = self._prepare(_power_of_two(u), key, np.int32(first))
+            points = _power_of_two(u)
+            if len(points) < self.least:
+                points = np.concatenate([u, np.repeat(u[-1:], self.least - len(u), axis=0)])
+            features, keys, seeds = self._prepare(points, key, np.int32(first))
             features = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(u)], features)
             return self._verdicts(features, keys[: len(u)], np.asarray(seeds)[: len(u)], u, first)
 

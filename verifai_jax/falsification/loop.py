@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.ahead import Ahead
 from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.table import ErrorTable
@@ -41,6 +43,7 @@ class Rounds:
 
     `found` counts the counterexamples that are claimed, `violating` the simulations that violate
     the property, and `without_verdict` those that have none; `best` is the least robustness.
+    `first` are points that are simulated before the search proposes any.
     `record_checksum` is that of the run's record, for the checkpoints.
     `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
     which they were.
@@ -56,7 +59,11 @@ class Rounds:
         precision: str = "float32",
         folder: Path | None = None,
         confirm: bool = False,
+        executor: Executor | None = None,
+        target: str | None = None,
+        first: Float[np.ndarray, "n d"] | None = None,
     ) -> None:
+        self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
         self.precision, self.folder = precision, folder
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
@@ -68,6 +75,8 @@ class Rounds:
             precision=precision,
             seed=seed,
             journal=self._journal,
+            executor=executor,
+            target=target,
         )
         # Derivatives of clauses are wanted of few points, now and then: compiled when they are.
         self._differentiate = (
@@ -78,6 +87,8 @@ class Rounds:
                 clauses=True,
                 precision=precision,
                 seed=seed,
+                executor=executor,
+                target=target,
             )
             if search.wants_clauses
             else None
@@ -93,6 +104,8 @@ class Rounds:
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
+        self._sends_ahead = executor is not None and not search.learns
+        self._ahead: Ahead | None = None
         self._saved = time.perf_counter()
 
     def compile(self, resumed: bool = False) -> None:
@@ -137,9 +150,20 @@ class Rounds:
         return (*self.evaluate.notes, *more, *raised)
 
     @property
+    def numbers(self) -> dict[str, float]:
+        """Plain numbers of the run so far, for callbacks."""
+        return {
+            "simulations": len(self.table),
+            "violating": self.violating,
+            "counterexamples": self.found,
+            "without_verdict": self.without_verdict,
+            "least_robustness": self.best,
+        }
+
+    @property
     def exhausted(self) -> bool:
         """True where a finite search has come to its end."""
-        return self._proposals.exhausted
+        return self._proposals.exhausted and (self._ahead is None or self._ahead.empty)
 
     @property
     def acceptance(self) -> float | None:
@@ -148,15 +172,30 @@ class Rounds:
             return None
         return self._proposals.accepted / max(self._proposals.proposed, 1)
 
-    def advance(self, most: int) -> None:
-        """Ask, evaluate, tell and store at most `most` simulations."""
+    def advance(self, most: int, limit: int | None = None) -> None:
+        """Ask, evaluate, tell and store at most `most` simulations.
+
+        - `limit`: simulations of the whole run, up to which points may be sent ahead to workers.
+        """
         first = len(self.table)
-        points = self._proposals.next(most)
+        verdicts: Verdicts | None = None
+        # The number of rows alone says how many of them are still to come, so resuming goes on.
+        given = self.first[first : first + most]
+        if len(given):
+            points = given
+        elif self._sends_ahead:
+            if self._ahead is None:
+                limit = first + most if limit is None else limit
+                self._ahead = Ahead(self._proposals, self.evaluate, self.batch, limit, first)
+            points, verdicts = self._ahead.next()
+        else:
+            points = self._proposals.next(most)
         if not len(points):
             self._proposals.tell_refused()
             self._keep()
             return
-        verdicts = self._verdicts(points, first)
+        if verdicts is None:
+            verdicts = self._verdicts(points, first)
         columns = self._columns(verdicts)
         marks = None
         if self._marks is not None:
@@ -173,13 +212,23 @@ class Rounds:
             # A search that took them for failures would stay with them.
             objective = np.where(refused, told, objective)
             verdicts = _raised(verdicts, refused)
-        self._tell(objective, verdicts, marks)
+        if len(given):
+            self._proposals.warm_start(
+                given[verdicts.proper], objective[verdicts.proper].astype(np.float32)
+            )
+        else:
+            self._tell(objective, verdicts, marks)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
+
+    def close(self) -> None:
+        """Cancel what workers have been sent ahead and have not begun."""
+        if self._ahead is not None:
+            self._ahead.close()
 
     def _tell(
         self,
@@ -303,8 +352,9 @@ class Rounds:
     def _keep(self) -> None:
         """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
         objective = {} if self._objective is None else self._objective.state
+        ahead = self._ahead
         self.checkpoint = {
-            **self._proposals.checkpoint(),
+            **(self._proposals.checkpoint() if ahead is None else ahead.checkpoint),
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }

@@ -43,6 +43,7 @@ ADDED = (
     "confirm",
     "confirm_seconds",
     "checked",
+    "first",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (

@@ -6,13 +6,14 @@
 Hyper-parameters that change no shape re-use the program.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration
 from verifai_jax.rl.policy import Policy
@@ -55,6 +56,7 @@ def train(
     seed: int = 0,
     steps: int = 200_000,
     checkpoints: Sequence[int] = (),
+    callbacks: Iterable[Callback] = (),
 ) -> Training:
     """Train a policy on a task.
 
@@ -68,6 +70,9 @@ def train(
     - `seed`: of all randomness of the training.
     - `steps`: environment steps, rounded up to whole updates.
     - `checkpoints`: environment steps at which to keep the policy too.
+    - `callbacks`: functions called for each update, in groups every two seconds, with the
+      environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
+      an episode ended in it.
 
     **Returns:** the policy with its learning curve.
 
@@ -75,7 +80,18 @@ def train(
     the task's actions, no steps, or checkpoints outside of the training.
     """
     algorithm = PPO() if algorithm is None else algorithm
-    run = BatchedTraining([Configuration(task, algorithm, steps, seed)])
+    called, reported = check_callbacks(callbacks), 0
+
+    def watch(_: int, curve: Float[np.ndarray, " updates"]) -> None:
+        nonlocal reported
+        for update in range(reported, len(curve)):
+            values = {"update": update + 1, "mean_return": float(curve[update])}
+            notify(called, (update + 1) * algorithm.steps_per_update, values)
+        reported = len(curve)
+
+    run = BatchedTraining(
+        [Configuration(task, algorithm, steps, seed)], watch=watch if called else None
+    )
     reached = []
     ordered = sorted(set(checkpoints))
     for at in ordered:

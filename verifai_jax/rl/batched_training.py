@@ -115,6 +115,7 @@ class BatchedTraining:
     - `configurations`: the runs; numbers below are places in this sequence.
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
+    - `watch`: called every few seconds with the number of each run and its learning curve so far.
 
     **Raises:** `ValueError` for a configuration that cannot train.
     """
@@ -125,7 +126,9 @@ class BatchedTraining:
         *,
         devices: Sequence[Device] | None = None,
         per_device: int | None = None,
+        watch: Callable[[int, Float[np.ndarray, " updates"]], None] | None = None,
     ) -> None:
+        self._watch = watch
         for configuration in configurations:
             configuration.check()
         self.configurations = list(configurations)
@@ -226,6 +229,10 @@ class BatchedTraining:
             self._rates[structure] = took / updates
             seconds += took
             done += updates
+            if self._watch is not None:
+                so_far = np.asarray(curves)
+                for place, number in enumerate(numbers):
+                    self._watch(number, so_far[place, :done])
         share = seconds / max(1, -(-len(numbers) // len(devices)))
         for place, number in enumerate(numbers):
             before = self._lanes.get(number)

@@ -8,7 +8,7 @@ checkpoint, the return of a policy, a part of a certification. Killed at any mom
 with the same folder, it reads the finished ones, computes the rest, and gives the same table.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,9 @@ from verifai_jax._version import __version__
 from verifai_jax.certification.attack import check_attack
 from verifai_jax.certification.result import Certificates
 from verifai_jax.core.cache import Arrays, Cache, locked_cache
+from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.executors import Executor
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
@@ -64,6 +66,8 @@ def sweep(
     max_seconds: float | None = None,
     progress: bool | None = None,
     note: Mapping[str, Any] | None = None,
+    callbacks: Iterable[Callback] = (),
+    executor: Executor | None = None,
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify their policies.
 
@@ -93,6 +97,11 @@ def sweep(
     - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
       notebook.
     - `note`: plain data that is stored in the folder beside the work.
+    - `callbacks`: functions called for each policy when its return is known, and again when its
+      safety is, with the number of calls so far and a dictionary of plain numbers; work that is
+      read from the folder counts too.
+    - `executor`: whose workers train and simulate, as in `falsify`; the table is the same. With
+      `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
 
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
@@ -115,6 +124,7 @@ def sweep(
         episodes=episodes,
         max_seconds=max_seconds,
     )
+    called = check_callbacks(callbacks)
     study.check()
     check_attack(study.untrained_problem(), attack)
     proposer = make_proposer(
@@ -144,7 +154,9 @@ def sweep(
             cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
-        running = _RunningSweep(study, options, cache, clock, halving, attack)
+        running = _RunningSweep(
+            study, options, cache, clock, halving, attack, called, executor=executor
+        )
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
 
 
@@ -170,6 +182,9 @@ class _RunningSweep:
     clock: Clock
     halving: Halving | None
     attack: str | Search
+    callbacks: tuple[Callback, ...] = ()
+    calls: int = 0
+    executor: Executor | None = None
     runs: TrainingRuns = field(init=False)
     configurations: list[_Configuration] = field(default_factory=list)
     numbers: dict[str, int] = field(default_factory=dict)
@@ -178,7 +193,7 @@ class _RunningSweep:
     safety: dict[tuple[int, int], PolicySafety] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.runs = TrainingRuns(self.study, self.cache, self.clock)
+        self.runs = TrainingRuns(self.study, self.cache, self.clock, self.executor)
 
     def run(self, proposer: Proposer) -> SweepRecord:
         """Train and certify, or as much of it as there is time for."""
@@ -249,6 +264,7 @@ class _RunningSweep:
     def _measure_returns(self, runs: Sequence[int]) -> None:
         """Measure the nominal returns of all checkpoints of training runs that have none yet."""
         missing: list[tuple[int, int]] = []
+        before = len(self.returns)
         for run in runs:
             for rung in range(self.runs.rungs(run)):
                 if not self._is_finite((run, rung)) or (run, rung) in self.returns:
@@ -267,6 +283,23 @@ class _RunningSweep:
                 entries[self._return_name(*missing[i])] = {"return": np.asarray(value, np.float64)}
             self.cache.put(entries)
             self.clock.check()
+        for place in list(self.returns)[before:]:
+            self._notify(place, {"nominal_return": self.returns[place]})
+
+    def _notify(self, place: tuple[int, int], values: Mapping[str, float]) -> None:
+        """Call the callbacks with numbers of a policy."""
+        run, rung = place
+        training, checkpoint = self.runs.runs[run], self.runs.checkpoint(run, rung)
+        assert checkpoint is not None
+        number = next(n for n, one in enumerate(self.configurations) if run in one.runs)
+        self.calls += 1
+        about = {
+            "configuration": number,
+            "training_seed": training.seed,
+            "environment_steps": training.checkpoints[rung],
+            "training_return": checkpoint.training_return,
+        }
+        notify(self.callbacks, self.calls, {**about, **values})
 
     def _return_name(self, run: int, rung: int) -> str:
         return f"return/{self.runs.cache_name(run, rung)}"
@@ -371,6 +404,15 @@ class _RunningSweep:
                 progress=self.clock.show,
             )
         self.safety = dict(zip(places, report.policies, strict=True))
+        for place, safety in self.safety.items():
+            numbers = {
+                "failures": safety.failures,
+                "simulations": safety.simulations,
+                "failure_low": safety.low,
+                "failure_high": safety.high,
+                "worst_robustness": safety.worst,
+            }
+            self._notify(place, {"nominal_return": self.returns[place], **numbers})
         return report.certificates
 
     def _certify_policies(
@@ -403,6 +445,7 @@ class _RunningSweep:
             attack_simulations=attack_simulations,
             remember=remember,
             progress=progress,
+            executor=self.executor,
         )
 
     # The record

@@ -328,6 +328,18 @@ class Sweep:
     def _repr_html_(self) -> str:
         return format_html(self.findings)
 
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the sweep: one HTML file, and its claims as JSON beside it.
+
+        **Arguments:**
+
+        - `path`: of the HTML file.
+        - `options`: of `reports.write_report`: `units` and `reasons` of hyper-parameters.
+
+        **Returns:** the path.
+        """
+        return late("verifai_jax.reports", "write_report")(self, path, **options)
+
     def plot(self, path: str | Path | None = None) -> "Figure":
         """Draw return against failure probability, learning curves and importances.
 

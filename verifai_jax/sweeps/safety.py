@@ -11,6 +11,7 @@ from typing import NamedTuple
 from verifai_jax.certification._certify import certify
 from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.cache import Arrays
+from verifai_jax.core.executors import Executor
 from verifai_jax.problem.problem import Problem
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
@@ -68,6 +69,7 @@ def certify_policies(
     attack_simulations: int,
     remember: Callable[[str, Callable[[], Arrays]], Arrays],
     progress: Callable[[int, int, str], None] | None,
+    executor: Executor | None = None,
 ) -> SafetyReport:
     """Attack and certify policies; arguments are those of `certify`."""
     certificates = certify(
@@ -82,6 +84,7 @@ def certify_policies(
         attack_simulations=attack_simulations,
         remember=remember,
         progress=progress,
+        executor=executor,
     )
     return SafetyReport(certificates, [_safety(certificates[i]) for i in range(len(policies))])
 

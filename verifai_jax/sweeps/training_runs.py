@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from verifai_jax.core.cache import Arrays, Cache, CacheError
+from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration, policy_structure
 from verifai_jax.rl.policy import Policy
 from verifai_jax.sweeps.clock import Clock, OutOfTime
@@ -85,10 +86,18 @@ class TrainingRuns:
     - `study`: the study that is swept.
     - `cache`: stores each run at each checkpoint.
     - `clock`: times the training, and ends it.
+    - `executor`: whose workers train; this process when left out.
     """
 
-    def __init__(self, study: Study, cache: Cache, clock: Clock) -> None:
+    def __init__(
+        self, study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
+    ) -> None:
         self.study, self.cache, self.clock = study, cache, clock
+        self._executor = executor
+        self._shipment: Shipment[Study] | None = None
+        if executor is not None:
+            check_executor(executor)
+            self._shipment = ship(study, executor)
         self.runs: list[TrainingRun] = []
         self.errors: dict[int, str] = {}
         self._checkpoints: dict[tuple[int, int], RunCheckpoint] = {}
@@ -155,6 +164,9 @@ class TrainingRuns:
             else:
                 place = (id(self._batches[number][0]), self.structure(number))
                 waiting.setdefault(place, []).append(number)
+        if self._executor is not None:
+            self._train_on_workers(list(waiting.values()), rung)
+            return
         for group in waiting.values():
             # Of one length, so that devices finish together.
             group.sort(key=lambda n: (self.runs[n].checkpoints[-1], n))
@@ -177,6 +189,35 @@ class TrainingRuns:
         if trainable:
             batch = BatchedTraining([configuration for _, configuration in trainable])
             self._batches.update({n: (batch, place) for place, (n, _) in enumerate(trainable)})
+
+    def _train_on_workers(self, groups: list[list[int]], rung: int) -> None:
+        """Train runs on the workers of the executor, each from its beginning; caches each."""
+        assert self._executor is not None
+        blocks = []
+        for group in groups:
+            size = self._batches[group[0]][0].per_device
+            blocks += [group[start : start + size] for start in range(0, len(group), size)]
+        futures = []
+        for block in blocks:
+            work = []
+            for number in block:
+                run = self.runs[number]
+                work.append((dict(run.values), run.seed, run.checkpoints[: rung + 1]))
+            futures.append(self._executor.submit(train_block, self._shipment, work))
+
+        def ended(place: int, results: list[list[Arrays] | str]) -> None:
+            for number, result in zip(blocks[place], results, strict=True):
+                if isinstance(result, str):
+                    self.errors[number] = result
+                    continue
+                self.cache.put({self.cache_name(number, at): a for at, a in enumerate(result)})
+                for at, arrays in enumerate(result):
+                    if (number, at) not in self._checkpoints:
+                        self._set_checkpoint(number, at, arrays)
+                        self.clock.advance(self._steps(number, at) - self._steps(number, at - 1))
+            self.clock.check()
+
+        gather(futures, ended)
 
     def _train_group(self, numbers: list[int], rung: int, further: bool) -> None:
         """Train runs that share a program from checkpoint to checkpoint, caching each."""
@@ -258,6 +299,39 @@ class TrainingRuns:
 
     def _steps(self, number: int, rung: int) -> int:
         return self.runs[number].checkpoints[rung] if rung >= 0 else 0
+
+
+def train_block(
+    shipment: Shipment[Study], work: Sequence[tuple[Mapping[str, Any], int, tuple[int, ...]]]
+) -> list[list[Arrays] | str]:
+    """Train runs side by side from their beginning; called by a worker.
+
+    **Arguments:**
+
+    - `shipment`: with the study.
+    - `work`: of each run its hyper-parameters, its seed, and the steps of its checkpoints.
+
+    **Returns:** of each run the arrays of its checkpoints, or the error that ended it in one line.
+    """
+    trainer = shipment.thing.trainer
+    found: list[list[Arrays] | str] = []
+    try:
+        batch = BatchedTraining([trainer.configuration(values, seed) for values, seed, _ in work])
+        arrays: list[list[Arrays]] = [[] for _ in work]
+        for at in range(max(len(checkpoints) for _, _, checkpoints in work)):
+            steps = {i: each[at] for i, (_, _, each) in enumerate(work) if at < len(each)}
+            for i in batch.advance(steps):
+                arrays[i].append(_encode(batch.policy(i), Curve(*batch.curve(i)), batch.seconds(i)))
+        found += arrays
+    except MemoryError:
+        raise
+    except Exception as error:
+        if len(work) == 1:
+            return [_one_line(error)]
+        # Alone, the run that causes the error shows.
+        for each in work:
+            found += train_block(shipment, [each])
+    return found
 
 
 def _encode(policy: Policy, curve: Curve, seconds: float) -> Arrays:

@@ -1,0 +1,63 @@
+"""`verifai-jax merge runs/balance-parts/*`: one run of the parts of a job array."""
+
+from contextlib import nullcontext
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.arguments import PICTURES, PROGRESS, load_problem, next_folder
+from verifai_jax.cli.falsify import print_run
+from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
+from verifai_jax.cli.json_output import command
+
+
+@command()
+@click.argument(
+    "folders", metavar="PARTS...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
+@click.option(
+    "--problem",
+    "target",
+    metavar="FILE.py:NAME",
+    help="Problem of the parts  [default: the one they record]",
+)
+@click.option("--only", metavar="NAMES", help="Features that vary, as in the parts.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
+)
+@PICTURES
+@PROGRESS
+@fail_on(
+    counterexample="if a counterexample was found",
+    rate="unless the failure rate is shown to be at most P; needs parts of --search uniform",
+)
+def merge(
+    folders: tuple[Path, ...],
+    target: str | None,
+    only: str | None,
+    folder: Path | None,
+    pictures: bool,
+    progress: bool | None,
+    fail_on: Gate | None,
+) -> None:
+    """Make one run of PARTS, the folders that `falsify --shard` has written."""
+    from verifai_jax.core.targets import target_of_project
+    from verifai_jax.falsification.shards import merge as merge_parts
+    from verifai_jax.falsification.shards import read_shard
+
+    if target is None:
+        target = target_of_project(
+            read_shard(folders[0]).get("target"),
+            folders[0],
+            kind="problem",
+            remedy="--problem specs/FILE.py:NAME",
+        )
+    problem = load_problem(target, only)
+    with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+        run = merge_parts(folders, problem, folder=place, progress=progress)
+    print_run(run, pictures)
+    high = None if run.failure_rate is None else run.failure_rate.high
+    failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(fail_on, high)}
+    check_gate(fail_on, failed)

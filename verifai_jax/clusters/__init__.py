@@ -1,0 +1,10 @@
+"""Executors of clusters: `connect` by an address, and an adapter for Ray."""
+
+from verifai_jax.clusters.connection import connect as connect
+from verifai_jax.clusters.ray_executor import RayExecutor as RayExecutor
+
+__all__ = ["RayExecutor", "connect"]
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,292 @@
+"""Verdicts from the workers of an executor: rows are cut into blocks, and put together in order.
+
+    engine = ExecutorEngine(problem, batch=1024, executor=client.get_executor())
+    engine.evaluate(u, key, first=0)                    # Verdicts, as of `engine.Engine`
+    pending = engine.submit(u, key, first=0)            # the same in two steps
+    pending.result()
+
+What a row gives depends on its point and its number alone, so that it does not matter how many
+workers there are, in which order they end, and which of them died and had their blocks run again by
+the executor. Blocks are as long as takes about a second, as measured.
+"""
+
+from collections import deque
+from itertools import pairwise
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.core.devices import describe_processor
+from verifai_jax.core.executors import Executor, Future, check_executor, count_workers, gather, ship
+from verifai_jax.core.programs import Slot
+from verifai_jax.evaluation.engine import chunks_and_lanes
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
+from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block
+from verifai_jax.problem.problem import Problem
+
+SECONDS = 1.0
+"""Seconds that a block takes, about, unless the executor says `seconds_per_block`."""
+AT_FIRST = 8
+"""Units of a compiled block, before it is known how long one takes."""
+TOGETHER = 128
+"""Rows of a host system that simulates batches, of which a block is a multiple."""
+WORTH_KEEPING = 0.01
+"""Seconds of a simulation from which on finished rows are journalled before their batch is."""
+IN_FLIGHT = 3
+"""Blocks on their way for each worker, so that none waits for the next one."""
+MOST_AHEAD = 1 << 22
+"""Rows at most that are on their way at a time."""
+
+SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
+"""The problem as it is sent, by kind of executor and target."""
+
+
+class ExecutorEngine:
+    """Evaluates any number of rows on the workers of an executor; see the module's docstring.
+
+    **Arguments:**
+
+    - `problem`: a checked one, on the backend it is to run on.
+    - `batch`: rows of a batch on one machine, which says how many lanes go together.
+    - `executor`: with `submit`.
+    - `gradient`, `clauses`, `precision`: as of `engine.Engine`.
+    - `journal`: of rows in flight, for a problem on the host.
+    - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
+
+    **Raises:** `TypeError` for what is no executor; `ValueError` for one that cannot work here, or
+    that cannot send the problem.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        batch: int,
+        executor: Executor,
+        *,
+        gradient: bool = False,
+        clauses: bool = False,
+        precision: str = "float32",
+        journal: Journal | None = None,
+        target: str | None = None,
+    ) -> None:
+        check_executor(executor)
+        self.problem, self.executor, self.precision = problem, executor, precision
+        self.compile_seconds = 0.0
+        self._journal = journal if problem.black_box else None
+        self._shipment = problem.programs.get(
+            SHIPMENTS,
+            (type(executor).__module__ + type(executor).__name__, target),
+            lambda: ship(problem, executor, target, identity),
+        )
+        form = jax.eval_shape(problem.space.unflatten, problem.space.point_form)
+        self._features: Any = jax.tree.structure(form)
+        _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
+        least = 1 << (batch - 1).bit_length()
+        backend = problem.system.backend if problem.system.backends else None
+        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend)
+        self.unit = lanes
+        if problem.black_box:
+            self.unit = TOGETHER if problem.system.can_simulate_batch else 1
+        self.padded = lanes
+        self._seconds: float | None = None  # Of a row, once one is known.
+        self._notes: dict[str, None] = {}
+        self._recalling: HostEngine | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Decisions of the workers' engines that a user may not expect, and other processors."""
+        return tuple(self._notes)
+
+    @property
+    def block(self) -> int:
+        """Rows of a block that takes about `SECONDS`."""
+        if self._seconds is None:
+            return self.unit * (1 if self.problem.black_box else AT_FIRST)
+        wanted = getattr(self.executor, "seconds_per_block", SECONDS)
+        rows = int(min(wanted / max(self._seconds, 1e-9), MOST_AHEAD // 8))
+        return max(self.unit, rows - rows % self.unit)
+
+    @property
+    def ahead(self) -> int:
+        """Rows on their way that keep all workers busy."""
+        return min(MOST_AHEAD, IN_FLIGHT * count_workers(self.executor) * self.block)
+
+    def begin_compiling(self) -> None:
+        """Do nothing: the workers compile, with their first block."""
+
+    def compile(self) -> None:
+        """Do nothing, as `begin_compiling`."""
+
+    def evaluate(
+        self,
+        rows: Float[Any, "n d"],
+        key: Key[Array, ""],
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
+    ) -> Verdicts:
+        """Simulate and evaluate rows on the workers; arguments as of `engine.Engine.evaluate`."""
+        return self.submit(rows, key, first, temperature).result()
+
+    def submit(
+        self,
+        rows: Float[Any, "n d"],
+        key: Key[Array, ""],
+        first: int = 0,
+        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
+    ) -> "Pending":
+        """Send rows to the workers, and return what waits for their verdicts."""
+        u = np.ascontiguousarray(rows, np.float32)
+        pending = Pending(self, u, key, first, np.asarray(temperature, np.float32))
+        pending.send()
+        return pending
+
+    def send(self, *arguments: Any) -> Future:
+        """Send one block to a worker: words of the key, first number, points, temperatures.
+
+        **Raises:** `ValueError` where it cannot be sent.
+        """
+        try:
+            return self.executor.submit(evaluate_block, self._shipment, self.mode, *arguments)
+        except (TypeError, AttributeError, OSError) as error:
+            raise ValueError(
+                f"the problem {self.problem.name!r} cannot be sent to the workers: {error}"
+            ) from error
+
+    def step(self, count: int) -> int:
+        """Return the rows of the next block of so many: all workers have one, for not too long."""
+        share = -(-count // count_workers(self.executor))
+        rows = min(self.block, max(share, self.block // 8))
+        return -(-rows // self.unit) * self.unit
+
+    def runs(self, u: Float[np.ndarray, "n d"], first: int) -> list[tuple[int, int, bool]]:
+        """Cut rows into those that the journal knows already and others, in their order."""
+        known = set() if self._journal is None else set(self._journal.recall(first, u))
+        if not known:
+            return [(0, len(u), False)] if len(u) else []
+        flags = np.array([i in known for i in range(len(u))])
+        ends = [0, *(np.flatnonzero(flags[1:] != flags[:-1]) + 1).tolist(), len(u)]
+        return [(a, b, bool(flags[a])) for a, b in pairwise(ends)]
+
+    def recall(self, u: Float[np.ndarray, "n d"], key: Key[Array, ""], first: int) -> Verdicts:
+        """Return the verdicts of rows that the journal knows."""
+        if self._recalling is None:
+            self._recalling = HostEngine(
+                self.problem, self.precision, self._journal, least=self.mode.least
+            )
+        return self._recalling.evaluate(u, key, first)
+
+    def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
+        """Return the verdicts of one block, and remember what it tells of its worker."""
+        verdicts = Verdicts(
+            **{name: result[name] for name in ARRAYS if name in result},
+            features=jax.tree.unflatten(self._features, result["leaves"]),
+            messages=result["messages"],
+        )
+        count = len(verdicts.status)
+        if count >= self.unit or self._seconds is None:
+            self._seconds = result["seconds"] / count
+        here = describe_processor()
+        if result["processor"] != here:
+            self._notes[
+                f"some rows were simulated on {result['processor']}, which is not the kind of "
+                f"processor here ({here}): their last digits may differ from those of a run here"
+            ] = None
+        self._notes.update(dict.fromkeys(result["notes"]))
+        if self._journal is not None and result["seconds"] > WORTH_KEEPING * count:
+            for i in range(count):
+                marks = None if verdicts.marks is None else verdicts.marks[i]
+                message = "" if verdicts.messages is None else verdicts.messages[i]
+                holds = np.array(not verdicts.violated[i])
+                row = RowVerdict(verdicts.rho[i], int(verdicts.status[i]), holds, message, marks)
+                self._journal.add(first + i, u[i], row)
+        return verdicts
+
+
+class Pending:
+    """Rows on their way; `result` waits for them, once.
+
+    A few blocks for each worker are on their way at a time, so that the size of later ones follows
+    from how long the first have taken.
+
+    **Arguments:**
+
+    - `engine`: that sends them.
+    - `u`: their points.
+    - `key`, `first`: as of `ExecutorEngine.submit`.
+    - `temperature`: one for all rows, or one each.
+    """
+
+    def __init__(
+        self,
+        engine: ExecutorEngine,
+        u: Float[np.ndarray, "n d"],
+        key: Key[Array, ""],
+        first: int,
+        temperature: Float[np.ndarray, "*n"],
+    ) -> None:
+        self._engine, self._u, self._key, self._first = engine, u, key, first
+        self._temperature, self._words = temperature, np.asarray(jax.random.key_data(key))
+        runs = engine.runs(u, first)
+        self._known = [(begin, end) for begin, end, known in runs if known]
+        self._unsent = deque((begin, end) for begin, end, known in runs if not known)
+        self._sent: list[tuple[int, int, Future]] = []
+        self._ended = 0
+        self._verdicts: Verdicts | None = None
+
+    def send(self) -> list[Future]:
+        """Send blocks until each worker has a few, and return those that are new."""
+        most = self._ended + IN_FLIGHT * count_workers(self._engine.executor)
+        already = len(self._sent)
+        while self._unsent and len(self._sent) < most:
+            begin, end = self._unsent.popleft()
+            left = end - begin + sum(b - a for a, b in self._unsent)
+            stop = min(begin + self._engine.step(left), end)
+            if stop < end:
+                self._unsent.appendleft((stop, end))
+            some = self._temperature
+            some = some[begin:stop] if some.ndim else float(some)
+            future = self._engine.send(self._words, self._first + begin, self._u[begin:stop], some)
+            self._sent.append((begin, stop, future))
+        return [future for _, _, future in self._sent[already:]]
+
+    def result(self) -> Verdicts:
+        """Return the verdicts in the order of the rows.
+
+        **Raises:** `WorkerError` where a worker died and its block was not run again; what an
+        evaluation raised otherwise. What is queued is then cancelled.
+        """
+        if self._verdicts is None:
+            found: dict[int, Verdicts] = {}
+            for begin, stop in self._known:
+                u = self._u[begin:stop]
+                found[begin] = self._engine.recall(u, self._key, self._first + begin)
+
+            def ended(place: int, result: dict[str, Any]) -> None:
+                begin, stop, _ = self._sent[place]
+                u = self._u[begin:stop]
+                found[begin] = self._engine.receive(result, u, self._first + begin)
+                self._ended += 1
+
+            gather([future for _, _, future in self._sent], ended, self.send)
+            self._verdicts = Verdicts.concatenate([found[begin] for begin in sorted(found)])
+        return self._verdicts
+
+    def cancel(self) -> None:
+        """Take what has not begun out of the queue."""
+        self._unsent.clear()
+        for _, _, future in self._sent:
+            future.cancel()
+
+
+def identity(problem: Problem) -> dict[str, str]:
+    """Return the texts that tell a problem from another one: name, formulas and features."""
+    return {
+        "name": problem.name,
+        "formulas": str({name: str(formula) for name, formula in problem.formulas.items()}),
+        "features": str(tuple(problem.space.columns)),
+        "levels": str(tuple(problem.space.levels)),
+    }

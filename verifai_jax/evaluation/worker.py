@@ -1,0 +1,139 @@
+"""One block of rows of a problem, from points to verdicts: the work of an executor's worker.
+
+    executor.submit(evaluate_block, shipment, mode, key, first, u, temperature)
+
+A worker keeps the problem and what it has compiled for it between blocks, and compiled programs on
+its disk (`VERIFAI_JAX_CACHE`). Blocks are worked through with as many lanes on a device as on one
+machine, so that their bits do not depend on how the rows were cut.
+"""
+
+import threading
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, UInt32
+
+from verifai_jax.core.devices import describe_processor
+from verifai_jax.core.executors import Shipment
+from verifai_jax.core.keys import as_key
+from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.programs import Slot
+from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.problem.problem import Problem
+
+ARRAYS = ("rho", "status", "violated", "gradient", "clauses", "clause_gradients", "marks")
+"""Parts of verdicts that come back as arrays under their names."""
+
+
+class BlockMode(NamedTuple):
+    """The way in which blocks are evaluated; the same for all of a run.
+
+    - `lanes`: rows that a device works on together.
+    - `gradient`, `clauses`, `precision`: as of `Engine`.
+    - `least`: rows that a host system's features are computed of together.
+    - `backend`: of a system that has several.
+    """
+
+    lanes: int
+    gradient: bool
+    clauses: bool
+    precision: str
+    least: int
+    backend: str | None
+
+
+ENGINES: Slot[tuple[BlockMode, int], Engine] = Slot("engines of blocks")
+"""Engines by mode and number of devices."""
+HOST_ENGINES: Slot[BlockMode, HostEngine] = Slot("host engines of blocks")
+
+# An executor may work in threads of one process. A compiled block keeps all cores busy by itself,
+# and a simulator is not made for two simulations at a time.
+_computing = threading.Lock()
+
+
+@reproducible_settings()
+def evaluate_block(
+    shipment: Shipment[Problem],
+    mode: BlockMode,
+    key: UInt32[np.ndarray, "2"],
+    first: int,
+    u: Float[np.ndarray, "n d"],
+    temperature: Float[np.ndarray, " n"] | float,
+) -> dict[str, Any]:
+    """Simulate and evaluate the rows `first` to `first + n - 1`; called by a worker.
+
+    **Arguments:**
+
+    - `shipment`: with the problem.
+    - `mode`: how.
+    - `key`: words of the run's random key.
+    - `first`: number of the first row.
+    - `u`: points of the unit cube.
+    - `temperature`: of the smooth robustness, one for all or one each.
+
+    **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
+    `seconds` without compilation; the `processor`; the engine's `notes`.
+    """
+    problem = shipment.thing
+    if mode.backend is not None:
+        problem = problem.on_backend(mode.backend)
+    with _computing:
+        if problem.black_box:
+            verdicts, seconds, notes = _on_host(problem, mode, key, first, u)
+        else:
+            verdicts, seconds, notes = _compiled(problem, mode, key, first, u, temperature)
+    result: dict[str, Any] = {
+        name: value for name in ARRAYS if (value := getattr(verdicts, name)) is not None
+    }
+    result["leaves"] = [np.asarray(leaf) for leaf in jax.tree.leaves(verdicts.features)]
+    result |= {"messages": verdicts.messages, "seconds": seconds, "notes": notes}
+    return result | {"processor": describe_processor()}
+
+
+def _on_host(
+    problem: Problem,
+    mode: BlockMode,
+    key: UInt32[np.ndarray, "2"],
+    first: int,
+    u: Float[np.ndarray, "n d"],
+) -> tuple[Verdicts, float, tuple[str, ...]]:
+    engine = problem.programs.get(
+        HOST_ENGINES, mode, lambda: HostEngine(problem, mode.precision, least=mode.least)
+    )
+    started = time.perf_counter()
+    verdicts = engine.evaluate(u, as_key(key), first)
+    return verdicts, time.perf_counter() - started, engine.notes
+
+
+def _compiled(
+    problem: Problem,
+    mode: BlockMode,
+    key: UInt32[np.ndarray, "2"],
+    first: int,
+    u: Float[np.ndarray, "n d"],
+    temperature: Float[np.ndarray, " n"] | float,
+) -> tuple[Verdicts, float, tuple[str, ...]]:
+    devices = jax.local_devices()
+    devices = devices[: max(1, min(len(devices), -(-len(u) // mode.lanes)))]
+    step = mode.lanes * len(devices)
+    engine = problem.programs.get(
+        ENGINES,
+        (mode, len(devices)),
+        lambda: Engine(
+            problem, step, mode.gradient, devices, mode.precision, mode.clauses, lanes=mode.lanes
+        ),
+    )
+    engine.compile()
+    started, compiled, parts = time.perf_counter(), engine.compile_seconds, []
+    for begin in range(0, len(u), step):
+        some = temperature
+        if isinstance(temperature, np.ndarray) and temperature.ndim:
+            some = temperature[begin : begin + step]
+        points = u[begin : begin + step]
+        parts.append(engine.evaluate(points, as_key(key), first + begin, some))
+    seconds = time.perf_counter() - started - (engine.compile_seconds - compiled)
+    return Verdicts.concatenate(parts), seconds, engine.notes

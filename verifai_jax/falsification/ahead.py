@@ -1,0 +1,119 @@
+"""Rounds on their way to the workers of an executor, for a search that does not learn.
+
+    ahead = Ahead(proposals, evaluate, batch=1024, limit=1_000_000, first=0)
+    points, verdicts = ahead.next()                     # of one round, in their order
+
+Such a search can be asked for the points of many rounds before the verdicts of the first are there,
+so that no worker waits. The checkpoint is that of the last round that was taken: what is on its way
+when the run ends is as if it had never been proposed.
+"""
+
+from collections import deque
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.search.proposals import Proposals
+
+
+class _Round(NamedTuple):
+    """One round: its points, its place among those that were sent together, the state behind it."""
+
+    points: Float[Any, "n d"]
+    pending: Pending
+    begin: int
+    checkpoint: dict[str, Any]
+
+
+class Ahead:
+    """The rounds that are on their way; see the module's docstring.
+
+    **Arguments:**
+
+    - `proposals`: of a search that does not learn.
+    - `evaluate`: with an executor.
+    - `batch`: rows of a round.
+    - `limit`: rows of the whole run.
+    - `first`: number of the next row.
+    """
+
+    def __init__(
+        self, proposals: Proposals, evaluate: Evaluator, batch: int, limit: int, first: int
+    ) -> None:
+        assert isinstance(evaluate.engine, ExecutorEngine)
+        self._proposals, self._evaluate, self._engine = proposals, evaluate, evaluate.engine
+        self._batch, self._limit, self._next = batch, limit, first
+        self._rounds: deque[_Round] = deque()
+        self._failure: Exception | None = None
+        self.checkpoint = proposals.checkpoint()
+
+    @property
+    def empty(self) -> bool:
+        """True where no round is on its way."""
+        return not self._rounds
+
+    def next(self) -> tuple[Float[Any, "n d"], Verdicts | None]:
+        """Return the points of the next round and their verdicts; no points where there are none.
+
+        **Raises:** what proposing or evaluating this round raises.
+        """
+        self._fill()
+        if not self._rounds:
+            if self._failure is not None:
+                raise self._failure
+            return np.zeros((0, self._proposals.cube.dim), np.float32), None
+        each = self._rounds[0]
+        whole = each.pending.result()
+        self._rounds.popleft()
+        self.checkpoint = each.checkpoint
+        part = slice(each.begin, each.begin + len(each.points))
+        return each.points, _rows(whole, part)
+
+    def close(self) -> None:
+        """Cancel what is queued, and put the proposals back behind the last round taken."""
+        if self._rounds or self._failure is not None:
+            for each in self._rounds:
+                each.pending.cancel()
+            self._rounds.clear()
+            self._proposals.restore(self.checkpoint)
+
+    def _fill(self) -> None:
+        """Propose and send rounds until enough rows are on their way."""
+        waiting = sum(len(each.points) for each in self._rounds)
+        while waiting < max(self._engine.ahead, 1) and self._failure is None:
+            group: list[tuple[Any, dict[str, Any]]] = []
+            count = 0
+            # Small rounds go together, in one block.
+            while count < self._engine.block and self._next + count < self._limit:
+                try:
+                    most = min(self._batch, self._limit - self._next - count)
+                    points = np.asarray(self._proposals.next(most))
+                except Exception as error:
+                    self._failure = error  # Raised when the rounds before it are stored.
+                    break
+                if not len(points):
+                    break
+                group.append((points, self._proposals.checkpoint()))
+                count += len(points)
+            if not group:
+                return
+            pending = self._evaluate.submit(np.concatenate([p for p, _ in group]), self._next)
+            begin = 0
+            for points, checkpoint in group:
+                self._rounds.append(_Round(points, pending, begin, checkpoint))
+                begin += len(points)
+            self._next += count
+            waiting += count
+
+
+def _rows(verdicts: Verdicts, part: slice) -> Verdicts:
+    if part.start == 0 and part.stop == len(verdicts.status):
+        return verdicts
+    messages = None if verdicts.messages is None else verdicts.messages[part]
+    rows: Verdicts = jax.tree.map(lambda leaf: leaf[part], verdicts._replace(messages=None))
+    return rows._replace(messages=messages)

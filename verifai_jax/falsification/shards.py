@@ -1,0 +1,425 @@
+"""One run as a job array: each job simulates a part of the rows, `merge` makes the run of them.
+
+    simulate_shard(problem, Shard(3, 16), "uniform", 10_000_000, folder="parts/3")
+    merge(sorted(Path("parts").iterdir()), problem, folder="runs/merged")
+
+For searches that do not learn: their points depend on the seed and their number alone, so every
+job can tell its own. What it simulates lies in files of a few thousand rows, each with a checksum
+in its name; a job that was killed goes on where it was. Merging is the run itself, which takes from
+the files what it would have simulated: its table, its confirmations and its record are those of one
+machine.
+"""
+
+import io
+import json
+import re
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax import search as searches
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.devices import describe_processor
+from verifai_jax.core.keys import run_keys
+from verifai_jax.core.locks import LOCK
+from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.seals import is_intact, sealed
+from verifai_jax.core.text import one_line
+from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.engine import chunks_and_lanes
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.executor_engine import TOGETHER
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.evaluation.worker import ARRAYS
+from verifai_jax.falsification._falsify import falsify
+from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.segments import write_whole
+from verifai_jax.falsification.validation import (
+    adapt_search,
+    check_options,
+    check_search,
+    locked,
+    usual_batch,
+    writing,
+)
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.search.proposals import Proposals
+
+RECORD = "shard.json"
+"""Name of the file that says which run, and which part of it."""
+_BLOCK = re.compile(r"block-(\d{12})-(\d{12})-([0-9a-f]{8})\.npz")
+_OPTIONS = (
+    "name", "formulas", "features", "search", "budget", "batch", "seed", "precision", "backend",
+    "confirm", "target",
+)  # fmt: skip
+"""Entries of the record that are the same for all parts of a run."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The part `number` of `of` parts of a run, counted from 1.
+
+    **Raises:** `ValueError` for a part that there is not.
+    """
+
+    number: int
+    of: int
+
+    def __post_init__(self) -> None:
+        check_count("of", self.of)
+        if not 1 <= self.number <= self.of:
+            raise ValueError(
+                f"a shard is one of 1 to {self.of}, as in 3/{self.of}; got {self.number}"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> "Shard":
+        """Read a shard as a person writes it, `3/16`.
+
+        **Raises:** `ValueError` for other text.
+        """
+        match = re.fullmatch(r"(\d+)/(\d+)", text.strip())
+        if match is None or not int(match[2]):
+            raise ValueError(f"a shard is written as 3/16, the third of sixteen; got {text!r}")
+        return cls(int(match[1]), int(match[2]))
+
+    def rows(self, budget: int, unit: int) -> range:
+        """Return its rows of so many, cut at multiples of `unit`."""
+        ends = [budget * i // self.of // unit * unit for i in (self.number - 1, self.number)]
+        return range(ends[0], budget if self.number == self.of else ends[1])
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
+
+@reproducible_settings()
+def simulate_shard(
+    problem: Problem,
+    shard: Shard,
+    search: str | Search = "uniform",
+    budget: int = 10_000,
+    *,
+    folder: str | Path,
+    batch: int | None = None,
+    seed: int = 0,
+    precision: str = "float32",
+    backend: str | None = None,
+    confirm: bool = True,
+    progress: bool | None = None,
+    target: str | None = None,
+) -> int:
+    """Simulate one part of a run into a folder; a part that was begun there is completed.
+
+    **Arguments:**
+
+    - `shard`: the part.
+    - `folder`: of this part alone.
+    - the others as in `falsify`, the same for all parts; `confirm` is done when they are merged.
+
+    **Returns:** the number of simulations of this part.
+
+    **Raises:** `ValueError` for a search that learns, a system with several backends of which none
+    is named, a folder with another part; as `falsify` otherwise.
+    """
+    check_options(budget, 1 if batch is None else batch, seed, None, None)
+    search = check_search(problem, search)
+    if search.learns:
+        names = [name for name in searches.names() if not searches.named(name).learns]
+        raise ValueError(
+            f"search {search!r} learns from all rows, so that no part of it can be simulated by "
+            f"itself; use one that does not ({', '.join(names)}), or a cluster"
+        )
+    if problem.system.backends and backend is None:
+        raise ValueError(
+            "every part must be simulated by the same backend, and none is named; give backend=, "
+            f"one of {', '.join(problem.system.backends)}"
+        )
+    usual = usual_batch(search, budget, None, not problem.black_box)
+    batch = min(usual if batch is None else batch, budget)
+    problem = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)[0]
+    problem.check()
+    search, _ = adapt_search(problem, search)
+    place = Path(folder)
+    record = {
+        "name": problem.name,
+        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+        "features": list(problem.space.columns),
+        "search": searches.to_json(search),
+        "budget": int(budget),
+        "batch": int(batch),
+        "seed": int(seed),
+        "precision": precision,
+        "backend": backend,
+        "confirm": confirm,
+        "target": target,
+        "shard": [shard.number, shard.of],
+    }
+    with writing(place):
+        place.mkdir(parents=True, exist_ok=True)
+    with locked(place):
+        _claim(place, record)
+        rows = shard.rows(budget, _unit(problem, batch))
+        _simulate(problem, search, rows, record, place, progress, str(shard))
+    return len(rows)
+
+
+def _unit(problem: Problem, batch: int) -> int:
+    if problem.black_box:
+        return TOGETHER if problem.system.can_simulate_batch else 1
+    return chunks_and_lanes(problem, batch, len(jax.local_devices()))[1]
+
+
+def _simulate(
+    problem: Problem,
+    search: Search,
+    rows: range,
+    record: Mapping[str, Any],
+    place: Path,
+    progress: bool | None,
+    shard: str,
+) -> None:
+    """Simulate these rows, but for those whose files are there already."""
+    batch, budget = record["batch"], record["budget"]
+    evaluate = Evaluator(problem, batch, precision=record["precision"], seed=record["seed"])
+    key, space = run_keys(record["seed"])[0], problem.space
+    proposals = Proposals(search, space.cube, batch, key, space.constraint, 0)
+    done = set()
+    for block, path in list(_blocks(place)):
+        if _is_whole(path):
+            done.add((block.start, block.stop))
+        else:
+            path.unlink()  # It is made anew.
+    first = simulated = found = 0
+    best = float("nan")
+    with SimulationProgress(f"{problem.name} {shard}", len(rows), progress) as bar:
+        while first < rows.stop and not proposals.exhausted:
+            points = proposals.next(min(batch, budget - first))
+            begin, stop = max(first, rows.start), min(first + len(points), rows.stop)
+            if begin < stop:
+                if (begin, stop) not in done:
+                    u = np.asarray(points, np.float32)[begin - first : stop - first]
+                    verdicts = evaluate(u, first=begin)
+                    _write(place, begin, u, verdicts)
+                    found += int(verdicts.violated.sum())
+                    best = float(np.fmin(best, np.fmin.reduce(verdicts.least)))
+                simulated += stop - begin
+                bar.update(simulated, found, best)
+            first += len(points)
+
+
+def _claim(place: Path, record: Mapping[str, Any]) -> None:
+    """Write the record of a part, or refuse the folder of another one."""
+    if (place / RECORD).exists():
+        known = read_shard(place)
+        for name, value in json.loads(json.dumps(record)).items():
+            if known[name] != value:
+                raise ValueError(
+                    f"{place} holds another part: its {name} is {one_line(str(known[name]))}, "
+                    f"here {one_line(str(value))}; give another folder"
+                )
+        return
+    if {path.name for path in place.iterdir()} - {LOCK}:
+        raise ValueError(f"folder {str(place)!r} is not empty; a part of a run needs a new one")
+    with writing(place):
+        write_whole(place / RECORD, json.dumps(sealed(record), indent=2).encode())
+
+
+def read_shard(folder: Path) -> dict[str, Any]:
+    """Read the record of a part of a run.
+
+    **Raises:** `FileNotFoundError` where there is none; `ValueError` for one that is damaged.
+    """
+    file = folder / RECORD
+    if not file.is_file():
+        raise FileNotFoundError(
+            f"no part of a run in {folder}: it has no {RECORD}; give folders that "
+            "verifai-jax falsify --shard has written"
+        )
+    try:
+        record = json.loads(file.read_text())
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged: it is not JSON") from error
+    if not isinstance(record, dict) or not is_intact(record):
+        raise ValueError(f"{file} is damaged: its content has changed since it was written")
+    return record
+
+
+def _write(place: Path, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
+    arrays: dict[str, Any] = {"u": u, "processor": np.array(describe_processor())}
+    for name in ARRAYS:
+        if (value := getattr(verdicts, name)) is not None:
+            arrays[name] = value
+    for i, leaf in enumerate(jax.tree.leaves(verdicts.features)):
+        arrays[f"leaf{i}"] = np.asarray(leaf)
+    if verdicts.messages is not None:
+        arrays["messages"] = np.array(verdicts.messages, dtype=str)
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    data = content.getvalue()
+    stop = first + len(u)
+    with writing(place):
+        write_whole(place / f"block-{first:012d}-{stop:012d}-{zlib.crc32(data):08x}.npz", data)
+
+
+def _blocks(place: Path) -> Iterator[tuple[range, Path]]:
+    for path in sorted(place.iterdir()):
+        if (match := _BLOCK.fullmatch(path.name)) is not None:
+            yield range(int(match[1]), int(match[2])), path
+
+
+def _is_whole(path: Path) -> bool:
+    return path.name.endswith(f"-{zlib.crc32(path.read_bytes()):08x}.npz")
+
+
+@lru_cache(maxsize=4)
+def _read(path: Path) -> dict[str, np.ndarray]:
+    data = path.read_bytes()
+    if not path.name.endswith(f"-{zlib.crc32(data):08x}.npz"):
+        raise ValueError(
+            f"{path} is damaged: its bytes have changed; run its part again, which makes it anew"
+        )
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+class _StoredRows:
+    """An executor that has simulated already: what a run asks for is in the files of the parts."""
+
+    _max_workers = 1
+
+    def __init__(self, blocks: Sequence[tuple[range, Path]]) -> None:
+        self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
+        """Return a future with the stored rows in place of those that `function` would simulate."""
+        first, u = arguments[3], arguments[4]
+        future: Future[dict[str, Any]] = Future()
+        try:
+            parts = list(self._parts(first, u))
+        except _OtherPointsError:
+            if len(u) > 1:
+                future.set_exception(
+                    ValueError(
+                        f"rows {first} to {first + len(u) - 1} of the parts are not at the points "
+                        "of this search: they are of another version of the problem or of "
+                        "verifai_jax"
+                    )
+                )
+                return future
+            # The nominal features, which are looked at beside the rows.
+            future.set_result(function(*arguments))
+            return future
+        except Exception as error:
+            future.set_exception(error)
+            return future
+        result: dict[str, Any] = {
+            name: np.concatenate([part[name] for part in parts])
+            for name in ARRAYS
+            if name in parts[0]
+        }
+        leaves = [name for name in parts[0] if name.startswith("leaf")]
+        result["leaves"] = [
+            np.concatenate([part[f"leaf{i}"] for part in parts]) for i in range(len(leaves))
+        ]
+        messages = [str(text) for part in parts for text in part.get("messages", ())]
+        result["messages"] = messages if "messages" in parts[0] else None
+        others = {str(part["processor"]) for part in parts} - {describe_processor()}
+        processor = min(others, default=describe_processor())
+        future.set_result(result | {"seconds": 0.0, "notes": (), "processor": processor})
+        return future
+
+    def _parts(self, first: int, u: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
+        at = first
+        for rows, path in self._blocks:
+            if rows.stop <= at or rows.start > at or at >= first + len(u):
+                continue
+            stored = _read(path)
+            stop = min(rows.stop, first + len(u))
+            cut = slice(at - rows.start, stop - rows.start)
+            if not np.array_equal(stored["u"][cut], u[at - first : stop - first]):
+                raise _OtherPointsError
+            yield {
+                name: values if values.ndim == 0 else values[cut] for name, values in stored.items()
+            }
+            at = stop
+        if at < first + len(u):
+            raise ValueError(f"row {at} is in none of the parts: one is not finished")
+
+
+class _OtherPointsError(Exception):
+    """Stored rows are not at the points asked for."""
+
+
+def merge(
+    folders: Sequence[str | Path],
+    problem: Problem,
+    *,
+    folder: str | Path | None = None,
+    progress: bool | None = None,
+) -> Run:
+    """Make one run of its parts: the table is the one of one machine, bit for bit.
+
+    **Arguments:**
+
+    - `folders`: of all parts.
+    - `problem`: of the run.
+    - `folder`: of the merged run; in memory when left out.
+    - `progress`: as in `falsify`.
+
+    **Returns:** the run.
+
+    **Raises:** `ValueError` for parts of different runs, a part that is missing, there twice or not
+    finished, and another problem; `FileNotFoundError` for a folder without a part.
+    """
+    if not folders:
+        raise ValueError("there is no part to merge")
+    places = [Path(place) for place in folders]
+    records = [read_shard(place) for place in places]
+    first, of = records[0], records[0]["shard"][1]
+    for place, record in zip(places, records, strict=True):
+        for name in _OPTIONS:
+            if record[name] != first[name]:
+                raise ValueError(
+                    f"{place} is a part of another run than {places[0]}: its {name} is "
+                    f"{one_line(str(record[name]))}, there {one_line(str(first[name]))}"
+                )
+    numbers = [record["shard"] for record in records]
+    twice = sorted({number for number, _ in numbers if numbers.count([number, of]) > 1})
+    missing = sorted(set(range(1, of + 1)) - {number for number, _ in numbers})
+    if any(each != of for _, each in numbers) or twice or missing:
+        what = f"part {twice[0]} is there twice" if twice else "they are cut in different numbers"
+        if missing:
+            listed = ", ".join(f"{number}/{of}" for number in missing[:8])
+            what = f"{listed}{', ...' if len(missing) > 8 else ''} missing"
+        raise ValueError(f"a run of {of} parts needs each of them once: {what}")
+    own = {name: str(formula) for name, formula in problem.formulas.items()}
+    if own != first["formulas"] or list(problem.space.columns) != first["features"]:
+        raise ValueError(
+            f"the parts are of the problem {first['name']!r} with other formulas or features than "
+            f"{problem.name!r} has now"
+        )
+    stored = _StoredRows([block for place in places for block in _blocks(place)])
+    return falsify(
+        problem,
+        searches.from_json(first["search"]),
+        first["budget"],
+        batch=first["batch"],
+        seed=first["seed"],
+        folder=folder,
+        precision=first["precision"],
+        backend=first["backend"],
+        confirm=first["confirm"],
+        progress=progress,
+        target=first["target"],
+        executor=stored,
+    )
