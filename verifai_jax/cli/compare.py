@@ -1,12 +1,22 @@
 """`verifai-jax compare specs/old.py:balance specs/new.py:balance --margin 0.002`."""
 
+from pathlib import Path
+
 import click
 
-from verifai_jax.cli.arguments import MAX_SECONDS, SEED, TARGET, fail_on, load_problem
-from verifai_jax.cli.exit_codes import fail_gate
+from verifai_jax.cli.arguments import (
+    CLUSTER,
+    MAX_SECONDS,
+    REPORT,
+    SEED,
+    TARGET,
+    on_cluster,
+)
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import as_plain, command, give_result
 
 
-@click.command()
+@command()
 @TARGET
 @click.argument("candidates", nargs=-1, required=True)
 @click.option(
@@ -22,7 +32,9 @@ from verifai_jax.cli.exit_codes import fail_gate
 @click.option("--budget", type=int, default=100_000, show_default=True, help="Simulations at most.")
 @SEED
 @MAX_SECONDS
-@fail_on("regression", "if a candidate fails more often, by more than the margin")
+@CLUSTER
+@REPORT
+@fail_on(regression="if a candidate fails more often, by more than the margin")
 def compare(
     target: str,
     candidates: tuple[str, ...],
@@ -31,22 +43,55 @@ def compare(
     budget: int,
     seed: int,
     max_seconds: float | None,
-    fail_on: str | None,
+    cluster: str | None,
+    report: Path | None,
+    fail_on: Gate | None,
 ) -> None:
-    """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs."""
-    from verifai_jax.comparison import compare as run_compare
-    from verifai_jax.core.text import printable
+    """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
-    named = {name: load_problem(name) for name in candidates}
-    result = run_compare(
-        load_problem(target),
-        named,
-        margin=margin,
-        confidence=confidence,
-        budget=budget,
-        seed=seed,
-        max_seconds=max_seconds,
-    )
+    specs/FILE.py:NAME@REVISION is the problem as it was at a revision of git; the checkout is not
+    touched.
+    """
+    from verifai_jax.comparison import compare as run_compare
+    from verifai_jax.core.revisions import load_at_revision
+    from verifai_jax.core.text import printable
+    from verifai_jax.problem import Problem
+
+    with on_cluster(cluster) as executor:
+        result = run_compare(
+            target,
+            {name: name for name in candidates},
+            margin=margin,
+            confidence=confidence,
+            budget=budget,
+            seed=seed,
+            max_seconds=max_seconds,
+            executor=executor,
+        )
     click.echo(printable(str(result)))
-    if fail_on is not None and result.regression:
-        raise fail_gate()
+    if report is not None:
+        with load_at_revision(target, Problem) as baseline:
+            path = result.report(report, problem=baseline, targets=(target, *candidates))
+        click.echo(f"  report       {path}")
+    give_result(
+        baseline=result.baseline,
+        verdict=result.verdict,
+        regression=result.regression,
+        candidates=[
+            {
+                "name": one.name,
+                "verdict": one.verdict,
+                "margin": one.margin,
+                "difference": one.rates.estimate,
+                "both_fail": one.both,
+                **as_plain(one.rates),
+            }
+            for one in result.candidates
+        ],
+        simulations=result.simulations,
+        stopped=result.stopped,
+        seconds=result.seconds,
+        seed=result.seed,
+        notes=result.notes,
+    )
+    check_gate(fail_on, {"regression": result.regression})

@@ -8,18 +8,18 @@ from verifai_jax.cli.arguments import (
     PROBLEM,
     RUN,
     TARGET,
-    fail_on,
     load_judged_run,
     load_problem,
     split_pairs,
 )
-from verifai_jax.cli.exit_codes import fail_gate
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 CORPUS = "counterexamples"
 """Usual folder of a corpus."""
 
 
-@click.command("save-counterexamples")
+@command("save-counterexamples")
 @RUN
 @click.option(
     "--into",
@@ -40,17 +40,18 @@ def save_counterexamples(
     """Write counterexamples of the run in RUN as small files that can be replayed for ever."""
     run = load_judged_run(folder, target)
     paths = run.save_counterexamples(into, most=most, shrink=shrink, budget=budget)
+    give_result(problem=run.name, files=paths)
     for path in paths:
         click.echo(str(path))
 
 
-@click.command("replay-counterexamples")
+@command("replay-counterexamples")
 @TARGET
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path), default=Path(CORPUS))
 @click.option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
-@fail_on("counterexample", "unless every one is simulated and fixed")
+@fail_on(counterexample="unless every one is simulated and fixed")
 def replay_counterexamples(
-    target: str, folder: Path, rename: tuple[str, ...], fail_on: str | None
+    target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None
 ) -> None:
     """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
     from verifai_jax.core.text import printable
@@ -59,5 +60,5 @@ def replay_counterexamples(
     names = dict(split_pairs("--rename", rename))
     result = replay(load_problem(target), folder, rename=names)
     click.echo(printable(str(result)))
-    if fail_on is not None and not result.passed:
-        raise fail_gate()
+    give_result(problem=result.problem, passed=result.passed, counterexamples=result.table)
+    check_gate(fail_on, {"counterexample": not result.passed})

@@ -10,6 +10,7 @@ that one may stop as soon as they decide (`statistics.paired_rates`).
 
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import jax
@@ -20,8 +21,10 @@ from jaxtyping import Array, Bool, Float, Key
 from verifai_jax.comparison.result import UNDECIDED, Compared, Comparison, judge
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.revisions import load_at_revision, split_revision
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -31,7 +34,7 @@ from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BLOCK = 1024
 """Points of the cube that are drawn at once."""
-FIRST, MOST = 256, 4096
+FIRST, MOST = 64, 4096
 """Pairs between two looks, at first and at most; each time twice as many."""
 BATCH = 512
 """Simulations at once."""
@@ -40,8 +43,8 @@ BATCH = 512
 @suggests_options
 @reproducible_settings()
 def compare(
-    baseline: Problem,
-    candidates: Problem | Mapping[str, Problem],
+    baseline: Problem | str,
+    candidates: Problem | str | Mapping[str, Problem | str],
     *,
     margin: float = 0.0,
     confidence: float = 0.95,
@@ -49,6 +52,7 @@ def compare(
     seed: int = 0,
     max_seconds: float | None = None,
     precision: str = "float32",
+    executor: Executor | None = None,
 ) -> Comparison:
     """Compare failure rates of problems on common random samples, and stop when it is decided.
 
@@ -59,7 +63,8 @@ def compare(
 
     **Arguments:**
 
-    - `baseline`: the problem to compare with.
+    - `baseline`: the problem to compare with: itself, `FILE.py:NAME`, or `FILE.py:NAME@REVISION`
+      for the problem as it was at a revision of git.
     - `candidates`: another one with the same feature space, or several by name.
     - `margin`: difference of failure probabilities that does not matter, from 0 on.
     - `confidence`: probability with which all verdicts hold.
@@ -67,23 +72,65 @@ def compare(
     - `seed`: of the samples; the same seed gives the same pairs.
     - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
     - `precision`: as in `falsify`.
+    - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
 
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
 
     **Raises:** before anything is simulated, `TypeError` for something that is no `Problem`;
-    `ProblemError` for other feature spaces; `ValueError` for numbers out of range.
+    `ProblemError` for other feature spaces; `ValueError` for numbers out of range, and for targets
+    that cannot be loaded.
     """
+    with ExitStack() as loaded:
+
+        def problem(given: Problem | str) -> Problem:
+            if not isinstance(given, str):
+                return given
+            if executor is not None and split_revision(given)[1] is not None:
+                raise ValueError(
+                    f"{given} cannot be simulated by workers, which import the modules of the "
+                    "project as they are today; compare revisions on this machine, without executor"
+                )
+            return loaded.enter_context(load_at_revision(given, Problem))
+
+        target = baseline if isinstance(baseline, str) else None
+        first = problem(baseline)
+        given: Mapping[str, Problem | str]
+        if isinstance(candidates, str):
+            given = {candidates: candidates}
+        elif isinstance(candidates, Problem):
+            other = getattr(first, "name", "") != candidates.name
+            given = {candidates.name if other else "candidate": candidates}
+        else:
+            given = candidates
+        named = {name: problem(candidate) for name, candidate in given.items()}
+        return _compare(
+            first, named, target, margin, confidence, budget, seed, max_seconds, precision, executor
+        )
+
+
+def _compare(
+    baseline: Problem,
+    named: Mapping[str, Problem],
+    target: str | None,
+    margin: float,
+    confidence: float,
+    budget: int,
+    seed: int,
+    max_seconds: float | None,
+    precision: str,
+    executor: Executor | None,
+) -> Comparison:
+    """Compare problems; see `compare`."""
     started = time.perf_counter()
-    named = {"candidate": candidates} if isinstance(candidates, Problem) else dict(candidates)
-    if isinstance(candidates, Problem) and candidates.name != baseline.name:
-        named = {candidates.name: candidates}
     _check(baseline, named, margin, confidence, budget)
     check_count("seed", seed, 0)
     problems = {None: baseline, **named}
     evaluators = {}
     for name, problem in problems.items():
         chosen = resolved(problem, batch=BATCH, budget=budget, precision=precision).problem
-        evaluators[name] = Evaluator(chosen, BATCH, precision=precision, seed=seed)
+        evaluators[name] = Evaluator(
+            chosen, BATCH, precision=precision, seed=seed, executor=executor
+        )
     notes = _notes(baseline, named)
     each = 1 - (1 - confidence) / len(named)
     tallies = {name: _Tally() for name in named}
@@ -115,7 +162,7 @@ def compare(
     if not any(tally.pairs for tally in tallies.values()):
         raise ProblemError("no pair was simulated, so that nothing can be compared")
     return Comparison(
-        baseline.name,
+        target or baseline.name,
         tuple(_compared(baseline.space, n, t, each, margin) for n, t in tallies.items()),
         spent,
         stopped,

@@ -1,6 +1,7 @@
 """The result of a comparison: how often each fails, by how much they differ, and where."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.lazy import late
@@ -106,6 +107,18 @@ class Comparison:
     def regression(self) -> bool:
         """True where a candidate is worse by more than the margin."""
         return any(candidate.verdict == WORSE for candidate in self.candidates)
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the comparison as HTML, and its claims as JSON.
+
+        **Arguments:**
+
+        - `path`: of the HTML file.
+        - `options`: of `reports.write_report`: `problem`, `targets`, `units`, `reasons`.
+
+        **Returns:** the path.
+        """
+        return late("verifai_jax.reports", "write_report")(self, path, **options)
 
     def __str__(self) -> str:
         confidence = self.candidates[0].rates.confidence

@@ -128,7 +128,7 @@ def user_line(error: BaseException) -> UserLine | None:
 def defined_at(function: Callable[..., object] | None) -> str:
     """Write where a function is defined, ` (sim.py, line 3)`; empty where it is not known."""
     code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
-    if not isinstance(code, CodeType) or not _is_user_file(code.co_filename):
+    if not isinstance(code, CodeType) or not is_user_file(code.co_filename):
         return ""
     return f" ({_shown_file(code.co_filename)}, line {code.co_firstlineno})"
 
@@ -141,7 +141,7 @@ def source_line(traceback: object) -> str | None:
     - `traceback`: of the operation, as JAX keeps it: frames from the innermost one on.
     """
     for frame in getattr(traceback, "frames", ()):
-        if _is_user_file(frame.file_name):
+        if is_user_file(frame.file_name):
             return f"{_shown_file(frame.file_name)}, line {frame.line_num}"
     return None
 
@@ -306,11 +306,12 @@ def _is_of_user(frame: FrameType) -> bool:
     file = frame.f_code.co_filename
     # Functions that dataclasses make belong to the module of the class.
     module = frame.f_globals.get("__file__") if file == "<string>" else None
-    return _is_user_file(file) and (module is None or _is_user_file(module))
+    return is_user_file(file) and (module is None or is_user_file(module))
 
 
 @cache
-def _is_user_file(file: str) -> bool:
+def is_user_file(file: str) -> bool:
+    """Return whether a file is a user's: neither this package nor Python nor installed."""
     if file.startswith("<") and not file.startswith(("<stdin", "<string", "<ipython")):
         return False
     if "ipykernel_" in file:

@@ -9,6 +9,7 @@ how to see it again. Nothing in it is executed: the problem comes from whoever r
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -75,7 +76,8 @@ class SavedCounterexample:
         content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
         if self.target is not None:
             content["reproduce"] = f"verifai-jax replay-counterexamples {self.target} {path}"
-        partial = path.with_suffix(".json.part")
+        # Tests of one problem may write it at once, each in a process of its own.
+        partial = path.with_suffix(f".{os.getpid()}.part")
         partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         partial.replace(path)
         return path

@@ -1,0 +1,141 @@
+"""`--json`: the result of a command as one JSON object, for programs.
+
+    @command()
+    def estimate(...):
+        ...
+        give_result(probability=found.probability, low=found.low, high=found.high)
+
+With `--json` the standard output is that object alone; what people read goes to the standard error
+stream. Numbers that are not finite are null.
+"""
+
+import contextlib
+import functools
+import json
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from verifai_jax._version import __version__
+
+_RESULT = "verifai_jax.result"
+
+
+class ReportingCommand(click.Command):
+    """A command with the option `--json`."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.params.append(
+            click.Option(
+                ["--json", "as_json"],
+                is_flag=True,
+                help="Write the result as JSON, and what people read to the error stream.",
+            )
+        )
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, and print its result where that is asked for."""
+        if not ctx.params.pop("as_json"):
+            return super().invoke(ctx)
+        try:
+            with contextlib.redirect_stdout(sys.stderr):
+                return super().invoke(ctx)
+        finally:
+            # A gate that failed, or no verdict at all, has a result too.
+            if _RESULT in ctx.meta:
+                about = {"command": ctx.info_name, "version": __version__}
+                click.echo(json.dumps(about | ctx.meta[_RESULT], indent=2, allow_nan=False))
+
+
+command = functools.partial(click.command, cls=ReportingCommand)
+"""Decorator of a sub-command."""
+
+
+def give_result(**values: object) -> None:
+    """Set entries of the present command's result.
+
+    **Arguments:**
+
+    - `values`: of anything that `as_plain` knows.
+    """
+    context = click.get_current_context(silent=True)
+    if context is not None:
+        context.meta.setdefault(_RESULT, {}).update({n: as_plain(v) for n, v in values.items()})
+
+
+def as_plain(value: object) -> Any:
+    """Return a value as JSON has it: tables as lists of rows, dataclasses as objects.
+
+    Fields of a dataclass that are not part of its `repr` are left out, as is what has no plain
+    form.
+    """
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): as_plain(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_plain(entry) for entry in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        shown = {field.name: getattr(value, field.name) for field in fields(value) if field.repr}
+        return {name: as_plain(entry) for name, entry in shown.items() if _has_form(entry)}
+    if hasattr(value, "to_dict"):
+        # A table has its rows, and a row its entries.
+        table: Any = value
+        whole = table.reset_index().to_dict("records") if hasattr(table, "columns") else None
+        return as_plain(table.to_dict() if whole is None else whole)
+    if hasattr(value, "tolist"):
+        array: Any = value
+        return as_plain(array.tolist())
+    return str(value)
+
+
+def _has_form(value: object) -> bool:
+    simple = value is None or isinstance(
+        value, bool | int | str | float | Path | Mapping | list | tuple
+    )
+    return simple or is_dataclass(value) or hasattr(value, "tolist") or hasattr(value, "to_dict")
+
+
+def describe_run(run: Any) -> dict[str, Any]:
+    """Return what a run found, as plain data."""
+    counts, rate = run.table.counts, run.failure_rate
+    best = None
+    if counts.without_verdict < run.simulations:
+        row = run.best
+        best = {
+            "row": int(row.name),
+            "robustness": float(row["rho"]),
+            "features": {name: row[name] for name in run.table.features},
+            "violated": bool(row["violated"]),
+            "verdict": row.get("verdict", ""),
+        }
+    return {
+        "problem": run.name,
+        "target": run.target,
+        "formulas": run.formulas,
+        "simulations": run.simulations,
+        "violating": counts.violating,
+        "counterexamples": counts.claimed,
+        "verdicts": run.verdict_counts,
+        "without_verdict": counts.without_verdict,
+        "failure_rate": rate,
+        "worst": best,
+        "search": run.search,
+        "seed": run.seed,
+        "stopped": run.stopped,
+        "compile_seconds": run.compile_seconds,
+        "run_seconds": run.run_seconds,
+        "folder": run.folder,
+        "table": run.table_path,
+        "notes": run.notes,
+    }
