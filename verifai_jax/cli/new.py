@@ -1,0 +1,40 @@
+"""`verifai-jax new my_project`: a small project that works, to be changed into one's own."""
+
+from importlib import resources
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.json_output import command, give_result
+
+FILES = {
+    "README.md": "README.md.txt",
+    "pendulum.py": "pendulum.py.txt",
+    "spec.py": "spec.py.txt",
+    "test_spec.py": "test_spec.py.txt",
+    ".gitignore": "gitignore.txt",
+}
+"""Files of a new project, and the texts they are made of."""
+
+
+@command()
+@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+def new(folder: Path) -> None:
+    """Write a small project into FOLDER: a system, a specification, and tests of it."""
+    there = sorted(name for name in FILES if (folder / name).exists())
+    if there:
+        raise click.UsageError(
+            f"{folder} has {', '.join(there)} already, which would be written over; "
+            "give a folder that does not exist yet"
+        )
+    if folder.exists() and not folder.is_dir():
+        raise click.UsageError(f"{folder} is a file; give a folder that does not exist yet")
+    folder.mkdir(parents=True, exist_ok=True)
+    templates = resources.files("verifai_jax.cli").joinpath("new_project")
+    for name, template in FILES.items():
+        text = templates.joinpath(template).read_text(encoding="utf-8")
+        text = text.replace("$name", folder.resolve().name)
+        (folder / name).write_text(text, encoding="utf-8")
+    give_result(folder=folder, files=list(FILES))
+    click.echo(f"  written      {folder}")
+    click.echo(f"  next         cd {folder} && verifai-jax falsify spec.py:upright")

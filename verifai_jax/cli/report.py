@@ -1,0 +1,89 @@
+"""`verifai-jax report runs/balance-1`: the evidence report on a folder of results."""
+
+from pathlib import Path
+
+import click
+
+from verifai_jax.cli.arguments import (
+    PROBLEM,
+    is_sweep,
+    load_problem,
+    load_run,
+    read_run,
+    split_pairs,
+)
+from verifai_jax.cli.json_output import command, give_result
+
+
+@command()
+@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+@PROBLEM
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="HTML",
+    help="File to write  [default: report.html in the folder]",
+)
+@click.option("--unit", "units", multiple=True, metavar="FEATURE=UNIT", help="Unit of a feature.")
+@click.option(
+    "--reason", "reasons", multiple=True, metavar="FEATURE=TEXT", help="Reason of its range."
+)
+@click.option("--traces", type=int, help="Rows simulated beforehand at most  [default: chosen]")
+@click.option(
+    "--studies/--no-studies",
+    default=None,
+    help="Explain and shrink the worst failure  [default: unless it takes long]",
+)
+@click.option(
+    "--modes",
+    type=int,
+    metavar="SIMULATIONS",
+    help="Add all ways of failing of a run and their probabilities, by so many simulations.",
+)
+@click.option(
+    "--without-problem", is_flag=True, help="Simulate nothing: report what the folder says."
+)
+def report(
+    folder: Path,
+    target: str | None,
+    output: Path | None,
+    units: tuple[str, ...],
+    reasons: tuple[str, ...],
+    traces: int | None,
+    studies: bool | None,
+    modes: int | None,
+    without_problem: bool,
+) -> None:
+    """Write the evidence report on a run or a sweep: one HTML file, and its claims as JSON.
+
+    FOLDER may also be a file that `estimate --json` or `compare --json` wrote.
+    """
+    from verifai_jax.reports.document import claims_path, write_report
+
+    problem, output = None, output or folder / "report.html"
+    if folder.is_file():
+        from verifai_jax.reports.stored import read_result
+
+        problem = None if target is None else load_problem(target)
+        result = read_result(folder, None if problem is None else problem.space)
+        output = folder.with_suffix(".html") if output == folder / "report.html" else output
+    elif is_sweep(folder):
+        from verifai_jax.sweeps.result import load_sweep
+
+        result = load_sweep(folder)
+    else:
+        result = read_run(folder) if without_problem else load_run(folder, target)
+    path = write_report(
+        result,
+        output,
+        units=dict(split_pairs("--unit", units)),
+        reasons=dict(split_pairs("--reason", reasons)),
+        traces=traces,
+        studies=studies,
+        modes=modes,
+        problem=problem,
+        targets=() if target is None else (target,),
+    )
+    give_result(report=path, claims=claims_path(path))
+    click.echo(f"  report       {path}")
+    click.echo(f"  claims       {claims_path(path)}")

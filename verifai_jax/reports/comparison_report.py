@@ -1,0 +1,159 @@
+"""The report on a comparison: which candidate fails more often, by how much, and where."""
+
+from collections.abc import Sequence
+
+from verifai_jax.comparison.result import BETTER, SAME, WORSE, Comparison
+from verifai_jax.core.text import format_percent
+from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.markup import Markup, bullets, element, paragraph, preformatted, table
+from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.provenance import Input, chained, project_inputs
+from verifai_jax.reports.run_question import About, space_table
+from verifai_jax.reports.sections import (
+    MODEL,
+    answers_section,
+    claims_section,
+    problem_content,
+    provenance_content,
+)
+from verifai_jax.reports.words import number
+
+PAIRED = (
+    "Both sides of a pair have the same features, drawn independently from the prior, and the same "
+    "random key; the interval holds whenever sampling stops."
+)
+"""Assumption of the interval of a difference."""
+MOST_PAIRS = 10
+"""Pairs in which only one side fails that are listed."""
+
+
+def comparison_page(
+    comparison: Comparison, about: About, problem: Problem | None, targets: Sequence[str]
+) -> Page:
+    """Make the report on a comparison.
+
+    **Arguments:**
+
+    - `comparison`: the comparison.
+    - `about`: units and reasons of the features.
+    - `problem`: the baseline; None where it is not at hand.
+    - `targets`: names of baseline and candidates on the command line, whose files are hashed.
+    """
+    inputs: dict[str, Input] = {}
+    for target in targets:
+        inputs |= {each.name: each for each in project_inputs(target)}
+    links = tuple(chained(inputs.values()))
+    first = comparison.candidates[0]
+    sure = format_percent(1 - len(comparison.candidates) * (1 - first.rates.confidence))
+    headline = (
+        "; ".join(f"{each.name} is {each.verdict}" for each in comparison.candidates)
+        + f", compared with {comparison.baseline}. All verdicts hold together at {sure}."
+    )
+    claims = [
+        Claim(
+            f"C{i + 1}",
+            f"{each.name} is {each.verdict} compared with {comparison.baseline}: {each.rates}.",
+            (f"{each.rates.pairs:,} pairs of simulations",),
+            (MODEL, PAIRED),
+        )
+        for i, each in enumerate(comparison.candidates)
+    ]
+    rows = [
+        (
+            each.name,
+            each.verdict,
+            str(each.rates),
+            f"{each.rates.pairs:,}",
+            f"{each.rates.only_second:,}",
+            f"{each.rates.only_first:,}",
+            f"{each.both:,}",
+            f"{each.rates.undecided:,}",
+        )
+        for each in comparison.candidates
+    ]
+    heads = ["candidate", "verdict", "difference", "pairs", "only it fails"]
+    heads += ["only the baseline fails", "both fail", "without both verdicts"]
+    asked = space_table(first.space, {}, about)
+    without = sum(each.rates.undecided for each in comparison.candidates)
+    python = (
+        f"vj.compare(baseline, candidates, margin={first.margin}, seed={comparison.seed}, "
+        f"budget={comparison.simulations})"
+    )
+    sections = (
+        answers_section(
+            [
+                ("What was claimed?", headline, "claims"),
+                ("What was varied, and what was the prior?", "see the table", "asked"),
+                ("How many simulations were there?", f"{comparison.simulations:,}", "found"),
+                ("How many pairs had no two verdicts?", f"{without:,}", "limits"),
+                ("Which assumption is under the intervals?", PAIRED, "limits"),
+                ("With which seed?", str(comparison.seed), "reproduce"),
+            ]
+        ),
+        Section(
+            "asked",
+            "What was asked",
+            (
+                paragraph(
+                    f"Whether a candidate fails more often than {comparison.baseline}, by more "
+                    f"than {100 * first.margin:g} points."
+                ),
+                *([asked] if problem is None else problem_content(problem, about)),
+            ),
+        ),
+        Section("found", "What was found", (table(heads, rows), *_pairs(comparison))),
+        Section(
+            "limits",
+            "What was not shown",
+            (
+                bullets(
+                    [
+                        f"In {without:,} pairs a side has no verdict: they widen the intervals in "
+                        "both directions.",
+                        "Single failures were not replayed more closely.",
+                        f"Sampling was ended by: {comparison.stopped}.",
+                        MODEL,
+                        PAIRED,
+                        *comparison.notes,
+                    ]
+                ),
+            ),
+        ),
+        claims_section(claims),
+        Section(
+            "reproduce",
+            "How to reproduce it",
+            (preformatted(python), *provenance_content(links)),
+        ),
+    )
+    tones = {WORSE: "fails", BETTER: "holds", SAME: "holds"}
+    return Page(
+        title=f"{comparison.baseline}: evidence report on a comparison",
+        headline=headline,
+        tone=tones.get(comparison.verdict, "open"),
+        sections=sections,
+        claims=claims_json(comparison.baseline, claims, links[-1].chain if links else ""),
+    )
+
+
+def _pairs(comparison: Comparison) -> list[Markup]:
+    """Write some pairs in which only one side fails."""
+    content = []
+    for each in comparison.candidates:
+        if not len(each.discordant):
+            continue
+        names = [str(name) for name in each.discordant.columns if name != "worse"]
+        rows = [
+            [
+                each.name if bool(row["worse"]) else comparison.baseline,
+                *(number(row[name]) for name in names),
+            ]
+            for row in each.discordant.head(MOST_PAIRS).to_dict("records")
+        ]
+        content += [
+            element("h3", f"Pairs in which only one of {each.name} and the baseline fails"),
+            paragraph(f"{len(rows):,} of {len(each.discordant):,}, in the order of sampling."),
+            table(["fails", *names], rows),
+        ]
+    return content

@@ -1,0 +1,100 @@
+"""Reports as files: one HTML file, and its claims as JSON beside it.
+
+write_report(run, "balance.html")               # balance.html and balance.claims.json
+write_report(sweep, "sweep.html")               # a sweep, an estimate, a comparison
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.comparison.result import Comparison
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.errors import check_names
+from verifai_jax.estimation.result import Estimate
+from verifai_jax.falsification.run import Run
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.comparison_report import comparison_page
+from verifai_jax.reports.estimate_report import estimate_page
+from verifai_jax.reports.page import render
+from verifai_jax.reports.run_question import About
+from verifai_jax.reports.run_report import run_page
+from verifai_jax.reports.sweep_report import sweep_page
+from verifai_jax.sweeps.result import Sweep
+
+
+def write_report(
+    result: Any,
+    path: str | Path,
+    *,
+    units: Mapping[str, str] | None = None,
+    reasons: Mapping[str, str] | None = None,
+    traces: int | None = None,
+    studies: bool | None = None,
+    modes: int | None = None,
+    problem: Problem | None = None,
+    targets: Sequence[str] = (),
+) -> Path:
+    """Write the evidence report on a result as one HTML file, and its claims as JSON beside it.
+
+    **Arguments:**
+
+    - `result`: a run, a sweep, an estimate or a comparison. The failures of a run that has its
+      problem are simulated again.
+    - `path`: of the HTML file; the claims go to the same name with the ending `.claims.json`.
+    - `units`: of features, by name.
+    - `reasons`: why a feature has the range that it has, by name.
+    - `traces`: rows of a run that are simulated beforehand at most; 24 by default, 5 for a black
+      box that takes long.
+    - `studies`: whether the worst failure of a run is explained and shrunk; by default unless the
+      system is a black box that takes long.
+    - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
+      `vj.modes` finds them; none when left out.
+    - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
+    - `targets`: names of these problems, as `FILE.py:NAME`: their files are hashed.
+
+    **Returns:** the path of the HTML file.
+
+    **Raises:** `UnknownNameError` for a unit or a reason of a feature that there is not;
+    `ValueError` for a number of simulations that is none;
+    `TypeError` for something that is no result.
+    """
+    path, about = Path(path), About(units or {}, reasons or {})
+    if modes is not None:
+        check_count("modes", modes)
+    match result:
+        case Run():
+            space = result.problem.space if result.problem else None
+            _check(about, space, result.table.features)
+            page = run_page(result, about, traces, studies, modes)
+        case Sweep():
+            _check(about, result.space, result.hyperparameters)
+            page = sweep_page(result, about)
+        case Estimate():
+            _check(about, None if problem is None else problem.space, ())
+            page = estimate_page(result, about, problem, *targets[:1] or [None])
+        case Comparison():
+            _check(about, result.candidates[0].space, ())
+            page = comparison_page(result, about, problem, targets)
+        case _:
+            kind = type(result).__name__
+            raise TypeError(
+                f"a report is on a run, a sweep, an estimate or a comparison; got {kind}"
+            )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(render(page), encoding="utf-8", newline="\n")
+    claims = json.dumps(page.claims, indent=2, allow_nan=False)
+    claims_path(path).write_text(claims + "\n", encoding="utf-8", newline="\n")
+    return path
+
+
+def claims_path(path: Path) -> Path:
+    """Return the path of the claims of a report."""
+    return path.with_suffix(".claims.json")
+
+
+def _check(about: About, space: FeatureSpace | None, columns: Sequence[str]) -> None:
+    known = [*([] if space is None else space.domains), *columns]
+    check_names("feature", [*about.units, *about.reasons], list(dict.fromkeys(known)))

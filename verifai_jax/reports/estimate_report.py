@@ -1,0 +1,138 @@
+"""The report on an estimate: the probability, its interval, the bound that rests on the prior."""
+
+from verifai_jax.core.text import format_percent
+from verifai_jax.estimation.result import METHODS, Estimate
+from verifai_jax.problem.problem import Problem
+from verifai_jax.reports.claims import Claim, claims_json
+from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
+from verifai_jax.reports.page import Page, Section
+from verifai_jax.reports.provenance import chained, project_inputs
+from verifai_jax.reports.run_question import About
+from verifai_jax.reports.sections import (
+    MODEL,
+    NOT_SEEN,
+    SAMPLES,
+    answers_section,
+    claims_section,
+    problem_content,
+    provenance_content,
+)
+from verifai_jax.reports.studies import png
+
+
+def estimate_page(
+    estimate: Estimate, about: About, problem: Problem | None, target: str | None
+) -> Page:
+    """Make the report on an estimate.
+
+    **Arguments:**
+
+    - `estimate`: the estimate.
+    - `about`: units and reasons of the features.
+    - `problem`: what was asked; None where it is not at hand.
+    - `target`: its name on the command line, whose files are hashed.
+    """
+    links = tuple(chained(project_inputs(target)))
+    chain = links[-1].chain if links else ""
+    sure = format_percent(estimate.confidence)
+    interval = f"{estimate.low:.3g} to {estimate.high:.3g}"
+    bound = f"{estimate.upper_bound:.2g}"
+    if estimate.probability is None:
+        headline = f"No estimate of the failure probability; at most {bound}, at {sure}."
+    else:
+        headline = (
+            f"Fails with probability {estimate.probability:.3g} ({sure} interval {interval}); "
+            f"guaranteed at most {bound}."
+        )
+    method = METHODS.get(estimate.method or "", "none that gave an estimate")
+    assumptions = [MODEL, SAMPLES]
+    if estimate.method not in (None, "monte_carlo"):
+        assumptions.append(NOT_SEEN)
+    claims = [
+        Claim("C1", headline, (f"{estimate.simulations:,} simulations",), tuple(assumptions)),
+        Claim(
+            "C2",
+            f"The failure probability is at most {bound} at {sure}.",
+            (
+                f"{estimate.prior_failures:,} failures and {estimate.prior_no_verdict:,} without a "
+                f"verdict in {estimate.prior_simulations:,} samples of the prior",
+            ),
+            (MODEL, SAMPLES),
+        ),
+    ]
+    if estimate.p0 is not None:
+        shown = estimate.upper_bound <= estimate.p0
+        words = "is shown" if shown else "is not shown by samples of the prior alone"
+        sentence = f"That the probability is below {estimate.p0:g} {words}."
+        claims.append(Claim("C3", sentence, ("the guaranteed bound",), (MODEL, SAMPLES)))
+    numbers: list[tuple[str, Child]] = [
+        ("simulations", f"{estimate.simulations:,} of {estimate.budget:,}"),
+        ("failing", f"{estimate.failures:,}"),
+        ("without a verdict", f"{estimate.no_verdict:,}"),
+        ("method", method),
+        ("interval", f"{interval}, at {sure}"),
+        ("guaranteed bound", f"{bound}, at {sure}"),
+        ("independent samples of the prior", f"{estimate.prior_simulations:,}"),
+        ("failures among these", f"{estimate.prior_failures:,}"),
+        ("without a verdict among these", f"{estimate.prior_no_verdict:,}"),
+        ("relative error", format_percent(estimate.relative_error)),
+    ]
+    asked = [] if problem is None else problem_content(problem, about)
+    prior = "not stated" if problem is None else "see the table of features"
+    steps = [f"seed {estimate.seed}", f"precision {estimate.precision}"]
+    steps += [f"backend {estimate.backend}"] if estimate.backend else []
+    python = (
+        f"vj.estimate(problem, budget={estimate.budget}, seed={estimate.seed}, "
+        f"confidence={estimate.confidence}, precision={estimate.precision!r})"
+    )
+    without = (
+        f"{estimate.no_verdict:,} simulations have no verdict; the upper ends take those of the "
+        "prior's samples for failing."
+    )
+    sections = (
+        answers_section(
+            [
+                ("What was claimed?", headline, "claims"),
+                ("What was the prior?", prior, "asked"),
+                ("How many simulations were there?", f"{estimate.simulations:,}", "found"),
+                ("How many had no verdict?", f"{estimate.no_verdict:,}", "limits"),
+                ("Which assumption is under the interval?", assumptions[-1], "limits"),
+                ("With which seed?", ", ".join(steps), "reproduce"),
+            ]
+        ),
+        Section(
+            "asked",
+            "What was asked",
+            (paragraph(f"How probable a failure of {estimate.name} is, under the prior."), *asked),
+        ),
+        Section(
+            "found",
+            "What was found",
+            (
+                table(["number", "value"], numbers),
+                picture(png(estimate.plot()), "The interval, and what the method saw"),
+            ),
+        ),
+        Section(
+            "limits",
+            "What was not shown",
+            (bullets([without, *assumptions, *estimate.notes]),),
+        ),
+        claims_section(claims),
+        Section(
+            "reproduce",
+            "How to reproduce it",
+            (
+                preformatted(python),
+                paragraph(f"Made with verifai_jax {estimate.version}."),
+                *provenance_content(links),
+            ),
+        ),
+    )
+    return Page(
+        title=f"{estimate.name}: evidence report on a probability",
+        headline=headline,
+        tone="open",
+        sections=sections,
+        claims=claims_json(estimate.name, claims, chain),
+    )

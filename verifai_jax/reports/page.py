@@ -1,0 +1,96 @@
+"""A page from its sections: one HTML file that needs nothing else, with or without JavaScript.
+
+render(page)                                        # the text of the file
+
+Its policy of content allows the pictures inside of it, and one style sheet and one script by their
+hashes: nothing is loaded, nothing is sent, and no text that came into the page can run.
+"""
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+from verifai_jax._version import __version__
+from verifai_jax.reports.markup import Markup, bullets, data_block, element, join
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page: `anchor` that links lead to, `title`, and `content` below it."""
+
+    anchor: str
+    title: str
+    content: tuple[Markup, ...]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A report before it is written.
+
+    - `title`: of the page.
+    - `headline`: the finding in a sentence.
+    - `tone`: `"fails"`, `"holds"` or `"open"`: how the headline is marked.
+    - `sections`: in their order.
+    - `claims`: as plain data.
+    - `view`: data of the interactive table; None without one.
+    """
+
+    title: str
+    headline: str
+    tone: str
+    sections: tuple[Section, ...]
+    claims: Mapping[str, Any]
+    view: Mapping[str, Any] | None = field(default=None, repr=False)
+
+
+def asset(name: str) -> str:
+    """Return the text of a file that lies beside this one."""
+    return resources.files("verifai_jax.reports").joinpath(name).read_text(encoding="utf-8")
+
+
+def render(page: Page) -> str:
+    """Write a page as HTML."""
+    style = asset("page.css") + asset("view.css")
+    script = "" if page.view is None else asset("view.js") + asset("page.js")
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            "img-src data:",
+            f"style-src {_source(style)}",
+            f"script-src {_source(script)}" if script else "script-src 'none'",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+    head = join(
+        element("meta", charset="utf-8"),
+        # Written by hand: its name has a hyphen and a capital.
+        Markup(f'<meta http-equiv="Content-Security-Policy" content="{policy}">'),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="generator", content=f"verifai_jax {__version__}"),
+        element("title", page.title),
+        Markup(f"<style>{style}</style>"),
+    )
+    links = bullets(element("a", each.title, href=f"#{each.anchor}") for each in page.sections)
+    parts = [
+        element("h1", page.title),
+        element("p", page.headline, class_=f"headline {page.tone}"),
+        element("nav", links, aria_label="sections"),
+    ]
+    parts += [
+        element("section", element("h2", each.title), each.content, id=each.anchor)
+        for each in page.sections
+    ]
+    blocks = [data_block("claims-json", page.claims)]
+    if page.view is not None:
+        blocks += [data_block("table-view", page.view), Markup(f"<script>{script}</script>")]
+    body = join(element("main", parts), blocks)
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
+
+
+def _source(text: str) -> str:
+    """Return the hash by which the policy of a page allows a style sheet or a script."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

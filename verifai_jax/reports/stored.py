@@ -1,0 +1,115 @@
+"""Estimates and comparisons as `verifai-jax estimate --json` and `compare --json` wrote them.
+
+result = read_result(Path("estimate.json"))         # an Estimate or a Comparison
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.comparison.result import Compared, Comparison
+from verifai_jax.core.text import one_line
+from verifai_jax.estimation.result import METHODS, Estimate
+from verifai_jax.features import FeatureSpace
+from verifai_jax.statistics.paired_rates import PairedRates
+
+NOT_FINITE = ("effective", "relative_error")
+"""Numbers of an estimate that JSON has as null where they are not finite."""
+OPTIONAL = ("probability", "method", "p0", "backend")
+"""Entries of an estimate that may be null."""
+
+
+def read_result(file: Path, space: FeatureSpace | None = None) -> Estimate | Comparison:
+    """Read an estimate or a comparison from the JSON that a command wrote.
+
+    **Arguments:**
+
+    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`.
+    - `space`: of the problems that were compared, which the JSON does not have.
+
+    **Returns:** the result; a comparison without its single pairs.
+
+    **Raises:** `FileNotFoundError` where there is no such file; `ValueError` for anything else than
+    such a result.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        data = None
+    commands = {"estimate": _estimate, "compare": lambda each: _comparison(each, space)}
+    if not isinstance(data, dict) or data.get("command") not in commands:
+        raise ValueError(
+            f"{file} is no result of verifai-jax estimate --json or verifai-jax compare --json"
+        )
+    try:
+        return commands[data["command"]](data)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{file} is damaged: {one_line(str(error))} is missing, or of another form"
+        ) from None
+
+
+def _estimate(data: Mapping[str, Any]) -> Estimate:
+    values = _values(Estimate, data)
+    for name in NOT_FINITE:
+        values[name] = math.nan if values.get(name) is None else float(values[name])
+    for name in ("low", "high", "confidence", "upper_bound"):
+        values[name] = float(values[name])
+    if values["method"] not in (None, *METHODS):
+        raise KeyError("method")
+    values["notes"] = tuple(map(str, values.get("notes", ())))
+    return Estimate(**values)
+
+
+def _comparison(data: Mapping[str, Any], space: FeatureSpace | None) -> Comparison:
+    import pandas as pd
+
+    if space is None:
+        raise ValueError(
+            "a comparison does not say what its features are; give a problem that was compared: "
+            "--problem FILE.py:NAME"
+        )
+    candidates = tuple(
+        Compared(
+            str(each["name"]),
+            PairedRates(**_values(PairedRates, each)),
+            int(each["both_fail"]),
+            float(each["margin"]),
+            pd.DataFrame(),
+            pd.DataFrame(),
+            space,
+        )
+        for each in data["candidates"]
+    )
+    if not candidates:
+        raise KeyError("candidates")
+    return Comparison(
+        str(data["baseline"]),
+        candidates,
+        int(data["simulations"]),
+        str(data["stopped"]),
+        float(data["seconds"]),
+        int(data["seed"]),
+        tuple(map(str, data["notes"])),
+    )
+
+
+def _values(kind: type, data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries that are fields of a class, each of the kind of its annotation."""
+    values = {}
+    for field in fields(kind):
+        if field.name not in data:
+            if field.default is MISSING and field.default_factory is MISSING:
+                raise KeyError(field.name)
+            continue
+        value = data[field.name]
+        if value is None and field.name not in (*OPTIONAL, *NOT_FINITE):
+            raise KeyError(field.name)
+        wanted = {int: int, float: (int, float), str: str}.get(field.type)
+        if wanted is not None and value is not None and not isinstance(value, wanted):
+            raise TypeError(field.name)
+        values[field.name] = value
+    return values

@@ -1,0 +1,202 @@
+"""Studies that a report adds to a run: failures with pictures, their reason, least form, analysis.
+
+studies = study(run, traces=24)
+studies.failures[0].replay                      # the worst one, simulated again
+studies.left_out                                # what was not done, and why
+"""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+
+from verifai_jax.analysis import Analysis, analyze
+from verifai_jax.core.figure import Figure
+from verifai_jax.core.text import format_error, one_line
+from verifai_jax.counterexamples import Explained, Shrunk, explain, shrink
+from verifai_jax.evaluation.replay import Replay
+from verifai_jax.failure_modes import Modes
+from verifai_jax.failure_modes import modes as find_modes
+from verifai_jax.falsification.run import Run
+from verifai_jax.plotting.animation import animate
+from verifai_jax.plotting.mujoco_scene import can_draw
+from verifai_jax.reports.view import rows_to_trace, trace_data
+
+Result = TypeVar("Result")
+
+MOST_FAILURES = 5
+"""Failures that are shown one by one."""
+TRACES = 24
+"""Rows that are simulated beforehand, unless that takes long."""
+TRACES_OF_A_BLACK_BOX = 5
+"""Rows that are simulated beforehand where a simulation may take long."""
+STUDIED = 2000
+"""Simulations that explaining and shrinking take at most."""
+PATIENCE = 60.0
+"""Seconds of so many simulations above which a black box takes long."""
+WORST = "The worst failure could not"
+"""What is said of a study of it that raised, at first."""
+MODES = "The ways of failing could not be found"
+"""What is said where the search for them raised."""
+LARGEST_ANIMATION = 1_500_000
+"""Bytes of an animation at most."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A failure that a report shows: `number` in the report, `row`, `why` it is shown, `replay`.
+
+    The replay is None for a run that was loaded without its problem.
+    """
+
+    number: int
+    row: int
+    why: str
+    replay: Replay | None = None
+
+
+@dataclass(frozen=True)
+class Studies:
+    """The studies of a run that its report shows.
+
+    - `failures`: a few, the worst first.
+    - `traces`: data of rows that were simulated beforehand, by number.
+    - `animation`: of the first failure, a GIF; None without one.
+    - `explained`, `shrunk`: of the worst failure; None where that was not possible.
+    - `analysis`: of the table.
+    - `modes`: ways of failing with their probabilities; None where they were not asked for.
+    - `left_out`: what was not done and why, as whole sentences.
+    """
+
+    failures: tuple[Failure, ...]
+    traces: dict[int, dict[str, Any]]
+    animation: bytes | None
+    explained: Explained | None
+    shrunk: Shrunk | None
+    analysis: Analysis
+    modes: Modes | None = None
+    left_out: tuple[str, ...] = field(default=())
+
+
+def study(
+    run: Run, traces: int | None = None, studies: bool | None = None, modes: int | None = None
+) -> Studies:
+    """Study a run for its report: everything is decided by the run and its seed.
+
+    **Arguments:**
+
+    - `run`: the run.
+    - `traces`: rows simulated beforehand at most; chosen when left out.
+    - `studies`: whether the worst failure is explained and shrunk, which takes up to 2000
+      simulations; by default unless the system is a black box that takes long.
+    - `modes`: simulations spent on all ways of failing and their probabilities; none when left out.
+    """
+    left_out: list[str] = []
+    found = analyze(run)
+    rows = _failures_to_show(run, found)
+    problem = run.problem
+    if problem is None:
+        left_out.append(
+            "The run was read without its problem, so that nothing was simulated again: there are "
+            "no traces, no explanation and no shrunk form."
+        )
+        failures = [Failure(i + 1, row, why) for i, (row, why) in enumerate(rows)]
+        return Studies(tuple(failures), {}, None, None, None, found, left_out=tuple(left_out))
+    slow = problem.black_box and STUDIED * run.run_seconds > PATIENCE * run.simulations
+    if traces is None:
+        traces = TRACES_OF_A_BLACK_BOX if slow else TRACES
+    failures, data = [], {}
+    for i, (row, why) in enumerate(rows):
+        again = run.replay(row) if i < max(traces, 1) else None
+        failures.append(Failure(i + 1, row, why, again))
+        if again is not None and i < traces:
+            data[row] = trace_data(again, f"row {row}: failure {i + 1}")
+    for row, label in rows_to_trace(run, traces, [row for row, _ in rows]).items():
+        if row not in data:
+            data[row] = trace_data(run.replay(row), label)
+    worst = failures[0].replay if failures else None
+    animation = None if worst is None else _animated(worst, left_out)
+    explained = shrunk = None
+    if failures and (studies if studies is not None else not slow):
+        explained = _attempt(
+            f"{WORST} be explained", lambda: explain(run, failures[0].row), left_out
+        )
+        shrunk = _attempt(f"{WORST} be shrunk", lambda: shrink(run, failures[0].row), left_out)
+    elif failures:
+        left_out.append("The worst failure was not explained and not shrunk, as was asked.")
+        if studies is None:
+            left_out[-1] = (
+                "The worst failure was not explained and not shrunk, since simulations of this "
+                "black box take long; studies=True does both."
+            )
+    ways = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
+    return Studies(
+        tuple(failures), data, animation, explained, shrunk, found, ways, tuple(left_out)
+    )
+
+
+def _modes(run: Run, budget: int) -> Modes:
+    assert run.problem is not None
+    return find_modes(
+        run.problem,
+        budget,
+        seed=run.seed,
+        precision=run.precision,
+        backend=run.backend,
+        progress=False,
+    )
+
+
+def _failures_to_show(run: Run, found: Analysis) -> list[tuple[int, str]]:
+    failing = run.table.counterexamples
+    if not len(failing):
+        return []
+    numbers = failing.index.to_numpy()
+    by_rho = numbers[np.argsort(failing["rho"].to_numpy(), kind="stable")].tolist()
+    chosen = {by_rho[0]: "the worst"}
+    for number, row in enumerate(found.representatives):
+        if row in failing.index:
+            chosen.setdefault(row, f"it stands for kind {number + 1} of the failures")
+    if len(chosen) < MOST_FAILURES:
+        chosen.setdefault(by_rho[-1], "the one nearest to the bound")
+    for row in by_rho[:MOST_FAILURES]:
+        chosen.setdefault(row, "among the worst")
+    return list(chosen.items())[:MOST_FAILURES]
+
+
+def _animated(replay: Replay, left_out: list[str]) -> bytes | None:
+    if replay.problem.draw is None and not can_draw(replay.problem.system):
+        return None
+    animation = _attempt(f"{WORST} be animated", lambda: animate(replay), left_out)
+    if animation is not None and len(animation.gif) > LARGEST_ANIMATION:
+        left_out.append(
+            f"The animation of the worst failure has {len(animation.gif):,} bytes, more than a "
+            f"report holds ({LARGEST_ANIMATION:,}); verifai-jax replay writes it to a file."
+        )
+        return None
+    return None if animation is None else animation.gif
+
+
+def _attempt(what: str, work: Callable[[], Result], left_out: list[str]) -> Result | None:
+    """Return what a study finds; where it cannot be made, the report says why and goes on."""
+    try:
+        return work()
+    except Exception as error:  # A drawing or a system of somebody else may raise anything.
+        why = one_line(format_error(error))
+        left_out.append(f"{what}: {why}.")
+        return None
+
+
+def png(figure: Figure) -> bytes:
+    """Return a figure as PNG of 128 colours; the same figure gives the same bytes."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    picture = Image.open(buffer).convert("RGB").quantize(colors=128, dither=Image.Dither.NONE)
+    # Nothing of the library's version or of the day is written beside the picture.
+    small = io.BytesIO()
+    picture.save(small, format="png", optimize=True)
+    return small.getvalue()

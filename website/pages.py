@@ -1,0 +1,179 @@
+"""A hook of mkdocs: pages that are made of other files, and links as the site has them.
+
+The README is the first page. Notebooks become pages with the outputs that are stored in them, so
+that nothing runs. The reference has a page for each room, with the names that a user imports.
+"""
+
+import ast
+import base64
+import json
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "benchmarks/RESULTS.md": "benchmarks.md",
+}
+"""Files of the checkout that are pages of the site."""
+LINK = re.compile(r"(!?)\[([^\]\n]*(?:\n[^\]\n]*)?)\]\(([\w./-]+)(#[\w-]+)?\)")
+"""A link or a picture whose place is a path."""
+IMAGE = re.compile(r'(<img src=")([\w./-]+)(")')
+BLOCK = re.compile(r"(^```.*?^```)", re.DOTALL | re.MULTILINE)
+ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
+LONGEST_OUTPUT = 6000
+"""Characters of an output of a notebook that are shown."""
+
+
+def on_config(config: Any) -> Any:
+    """Fill those parts of the navigation that are lists of files."""
+    named = json.dumps(config["nav"])
+    pages = sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+    lists = {
+        "pages-of-docs": [page for page in pages if f'"{page}"' not in named],
+        "pages-of-notebooks": [_page_of(path) for path in _notebooks()],
+        "pages-of-reference": [f"reference/{room}.md" for room in _rooms()],
+    }
+    config["nav"] = [
+        {title: lists.get(entry, entry) if isinstance(entry, str) else entry}
+        for each in config["nav"]
+        for title, entry in each.items()
+    ]
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages that are made of other files."""
+    made = {page: (ROOT / source).read_text() for source, page in PAGES.items()}
+    for path in _notebooks():
+        made[_page_of(path)] = _notebook(path, made)
+    for room, names in _rooms().items():
+        made[f"reference/{room}.md"] = _reference(room, names)
+    for page, content in made.items():
+        files.append(File.generated(config, page, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Lead links to pages of the site; what is no page of it is named only."""
+    source = {page: source for source, page in PAGES.items()}.get(page.file.src_uri)
+    if source is None:
+        if page.file.src_uri.startswith(("reference/", "notebooks/")):
+            folder = posixpath.dirname(page.file.src_uri)
+        else:
+            folder = "docs"
+    else:
+        folder = posixpath.dirname(source)
+    parts = BLOCK.split(markdown)
+    parts[::2] = [_links(part, folder, page.file.src_uri) for part in parts[::2]]
+    return "".join(parts)
+
+
+def _links(text: str, folder: str, page: str) -> str:
+    def link(found: re.Match[str]) -> str:
+        mark, words, path, anchor = found.groups()
+        place = _place(posixpath.normpath(posixpath.join(folder, path)))
+        if place is None:
+            return words if words.startswith("`") else f"{words} (`{path.replace('../', '')}`)"
+        relative = posixpath.relpath(place, posixpath.dirname(page) or ".")
+        return f"{mark}[{words}]({relative}{anchor or ''})"
+
+    def image(found: re.Match[str]) -> str:
+        place = _place(posixpath.normpath(posixpath.join(folder, found[2])))
+        return f"{found[1]}{place or found[2]}{found[3]}"
+
+    return IMAGE.sub(image, LINK.sub(link, text))
+
+
+def _place(path: str) -> str | None:
+    """Return the page or picture of the site that a file of the checkout is; None without one."""
+    if path in PAGES:
+        return PAGES[path]
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    if path.startswith("notebooks/") and path.endswith(".ipynb"):
+        return _page_of(ROOT / path)
+    return path if path.startswith(("notebooks/", "reference/")) and path.endswith(".png") else None
+
+
+def _notebooks() -> list[Path]:
+    return sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def _page_of(notebook: Path) -> str:
+    return f"notebooks/{notebook.stem}.md"
+
+
+def _notebook(path: Path, made: dict[str, Any]) -> str:
+    """Write a notebook as a page; its pictures become files beside it."""
+    lines = []
+    for number, cell in enumerate(json.loads(path.read_text())["cells"]):
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            lines += [source, ""]
+            continue
+        lines += ["```python", source, "```", ""]
+        for place, output in enumerate(cell.get("outputs", [])):
+            lines += _output(output, f"{path.stem}-{number}-{place}", made)
+    return "\n".join(lines)
+
+
+def _output(output: dict[str, Any], name: str, made: dict[str, Any]) -> list[str]:
+    data = output.get("data", {})
+    for kind, ending in (("image/png", "png"), ("image/gif", "gif")):
+        if kind in data:
+            made[f"notebooks/{name}.{ending}"] = base64.b64decode("".join(data[kind]))
+            return [f'<img src="{name}.{ending}" alt="output of the cell above">', ""]
+    text = "".join(output.get("text", data.get("text/plain", [])))
+    text = ANSI.sub("", text).rstrip()[:LONGEST_OUTPUT]
+    return ["```text", text, "```", ""] if text else []
+
+
+def _rooms() -> dict[str, list[str]]:
+    """Return the names that a user imports, by room, as `verifai_jax/__init__.py` lists them."""
+    tree = ast.parse((ROOT / "verifai_jax" / "__init__.py").read_text())
+    rooms: dict[str, list[str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("verifai_jax."):
+            room = (node.module or "").split(".")[1]
+            if not (ROOT / "verifai_jax" / room).is_dir():
+                continue
+            names = [alias.name for alias in node.names if alias.asname == alias.name]
+            if names:
+                rooms.setdefault(room, []).extend(names)
+    packages = [
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module == "verifai_jax"
+        for alias in node.names
+        if alias.asname == alias.name
+    ]
+    for package in packages:
+        names = _exported(ROOT / "verifai_jax" / package / "__init__.py")
+        rooms.setdefault(package, [])
+        rooms[package] += [f"{package}.{name}" for name in names if name not in rooms[package]]
+    return dict(sorted(rooms.items()))
+
+
+def _exported(file: Path) -> list[str]:
+    return sorted(
+        alias.asname
+        for node in ast.parse(file.read_text()).body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.asname == alias.name
+    )
+
+
+def _reference(room: str, names: list[str]) -> str:
+    about = ast.get_docstring(ast.parse((ROOT / "verifai_jax" / room / "__init__.py").read_text()))
+    lines = [f"# {room}", "", (about or "").partition("\n")[0], ""]
+    for name in names:
+        lines += [f"::: verifai_jax.{name}", ""]
+    return "\n".join(lines)
