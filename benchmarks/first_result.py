@@ -15,6 +15,7 @@ those of the pairs.
 | `budget` | the same after an edit of the budget, 10 000 to 9000 |
 | `at1` | `verifai-jax falsify` of ARCH AT1 to its first confirmed counterexample, the second time |
 | `falsify` | what `make falsify` runs, with its pictures, the second time |
+| `brax` | ten rows of a Brax hopper, simulated and confirmed by `vj.confirm`, no program on disk |
 | `help`, `import` | `verifai-jax --help`; `import verifai_jax` and `verifai_jax.Box` |
 """
 
@@ -28,7 +29,7 @@ import tempfile
 import time
 from pathlib import Path
 
-CASES = ("cold", "again", "bound", "budget", "at1", "falsify", "help", "import")
+CASES = ("cold", "again", "bound", "budget", "at1", "falsify", "brax", "help", "import")
 AT1 = "specs/arch/automatic_transmission.py:at1"
 COMMAND = "import sys; from verifai_jax.cli.main import main; sys.argv[0] = 'verifai-jax'; main()"
 
@@ -87,6 +88,26 @@ def run_quadrotor(gust, budget):
     print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
 
 
+def run_brax():
+    """Simulate ten rows of a hopper, confirm them and print how many are."""
+    import jax.numpy as jnp
+
+    import verifai_jax as vj
+
+    system = vj.brax(
+        "hopper",
+        lambda observation: 0.5 * jnp.tanh(observation[:3]),
+        backend="generalized",
+        steps=50,
+        signals={"height": 0},
+        initial={"x": "q[0]"},
+        exact_step=False,
+    )
+    problem = vj.Problem("hopper", {"x": vj.Box(0.0, 0.1)}, system, "always height > 5")
+    run = vj.falsify(problem, "uniform", budget=10, confirm=False, progress=False)
+    print(vj.confirm(run).counts)
+
+
 def measure(command, checkout, cache):
     """Return processor seconds and seconds of a process, and what it printed."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "VERIFAI_JAX_CACHE": str(cache)}
@@ -108,6 +129,8 @@ def command_of(case, place):
     if case in ("cold", "again", "bound", "budget"):
         gust, budget = 2.1 if case == "bound" else 2.0, 9000 if case == "budget" else 10_000
         return [python, __file__, "--quadrotor", str(gust), str(budget)]
+    if case == "brax":
+        return [python, __file__, "--brax"]
     if case == "import":
         return [python, "-c", "import verifai_jax; verifai_jax.Box"]
     if case == "help":
@@ -123,7 +146,7 @@ def one(case, checkout, caches):
     """Run a case once and return its processor seconds, its seconds and what it printed."""
     # One place for all: JAX knows a compiled program by the folder of its cache, too.
     cache = caches / checkout.name / "compiled"
-    if case not in ("cold", "help", "import"):
+    if case not in ("cold", "brax", "help", "import"):
         fill(case, checkout, caches, cache)
     else:
         shutil.rmtree(cache, ignore_errors=True)
@@ -160,7 +183,11 @@ def main():
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--quadrotor", nargs=2, type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--brax", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.brax:
+        run_brax()
+        return
     if options.quadrotor:
         run_quadrotor(options.quadrotor[0], int(options.quadrotor[1]))
         return

@@ -42,6 +42,19 @@ def test_what_is_compiled_is_said_while_it_is():
     assert describe_compilation() == ""
 
 
+def test_less_effort_gives_the_same_numbers_and_unknown_options_are_left_out(monkeypatch):
+    x = np.linspace(0, 1, 64, dtype=np.float32)
+    efforts = {}
+    for effort in ("most", "little", "least"):
+        lowered = jax.jit(lambda x: jnp.sort(jnp.sin(x) * 3)).lower(x)
+        efforts[effort] = np.asarray(compile_soon("one", lowered, effort)(x))
+    np.testing.assert_array_equal(efforts["most"], efforts["little"])
+    np.testing.assert_allclose(efforts["most"], efforts["least"], rtol=1e-6)
+    monkeypatch.setattr(jax.config, "read", lambda name: False)
+    monkeypatch.setitem(compilation._OPTIONS, "little", {"no_such_option": True})
+    assert compilation._options.__wrapped__("little") is None
+
+
 def test_what_the_compiler_raises_is_raised_where_the_program_is_called():
     class Broken:
         def compile(self):

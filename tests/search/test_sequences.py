@@ -131,3 +131,14 @@ class TestUniform:
     def test_points_differ(self):
         u = points(Uniform(), 1, 2000)
         assert len(np.unique(u)) > 1990
+
+
+@pytest.mark.parametrize("dim", [0, 1, 5, 40])
+def test_halton_points_are_the_same_in_a_loop_and_written_out(dim, monkeypatch):
+    index = np.arange(64, dtype=np.uint32) * 977_771 + 1
+    for key in (None, jax.random.key(dim)):
+        points = []
+        for most in (2**14, -1):
+            monkeypatch.setattr("verifai_jax.search.halton.MOST_IN_LOOP", most)
+            points.append(np.asarray(jax.jit(lambda i, key=key: halton_points(i, dim, key))(index)))
+        np.testing.assert_array_equal(*points)

@@ -43,6 +43,9 @@ class Array(Domain):
             return VariableArray(domain, *_ends(domain, length))
         return super().__new__(cls)
 
+    def __getnewargs__(self) -> tuple[Domain, int]:
+        return self.domain, self.length
+
     def __post_init__(self) -> None:
         _check_domain(self.domain)
         length = self.length

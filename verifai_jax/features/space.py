@@ -63,6 +63,15 @@ class FeatureSpace:
                 raise ValueError(f"two features give the table column {column!r}; rename one")
             known.add(column)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What follows from the domains is computed where it is wanted, and so are programs.
+        kind = type(self)
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(kind, name, None), cached_property)
+        }
+
     @property
     def domains(self) -> dict[str, Domain]:
         """Domains by name, in the order written."""

@@ -149,6 +149,10 @@ class Problem:
         drawn = program.jaxpr.invars[0]
         return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is compiled for it stays here: another process compiles its own.
+        return {**self.__dict__, "programs": ProgramCache()}
+
     def on_backend(self, backend: str) -> "Problem":
         """Return the same problem on one backend of its system, made once.
 

@@ -10,9 +10,10 @@ the base.
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key, UInt32
+from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.cube import Cube
@@ -23,6 +24,10 @@ BITS = 32
 
 PLAIN_UP_TO = 8
 """Number of bases up to which the sequence is plain: in larger ones lines are visible."""
+
+MOST_IN_LOOP = 2**14
+"""Coordinates of points computed in a loop, which compiles in a third of the time; more run ten
+times as fast where the loop is written out."""
 
 MOST_SKIPPED_POINTS = 2**31
 """Skipped points at most, so that as many indices remain."""
@@ -102,6 +107,8 @@ def halton_points(
     bases = np.array(primes(skip_bases + dim)[skip_bases:], np.uint32)
     digits = np.array([_digits(int(base)) for base in bases], int)
     maps = None if key is None else _digit_maps(key, bases, int(np.max(digits, initial=0)))
+    if len(index) * dim <= MOST_IN_LOOP:
+        return _radical_inverse_in_loop(index, bases, digits, maps)
     blocks = [jnp.zeros((len(index), 0), jnp.float32)]
     # Bases whose indices have equally many digits go together: one loop for many large ones.
     for count in sorted(set(digits.tolist()), reverse=True):
@@ -151,6 +158,38 @@ def _radical_inverse(
     for figure in reversed(figures):
         inverse = (inverse + figure.astype(jnp.float32)) / bases.astype(np.float32)
     return jnp.minimum(inverse, np.float32(1 - 2**-24))
+
+
+def _radical_inverse_in_loop(
+    index: UInt32[Array, " n"],
+    bases: UInt32[np.ndarray, " d"],
+    digits: Int[np.ndarray, " d"],
+    maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
+) -> Float[Array, "n d"]:
+    """Compute what `_radical_inverse` does, to the last bit, in a program a tenth as long."""
+    most = int(np.max(digits, initial=0))
+    shape = (len(index), len(bases))
+
+    def divide(rest: Array, digit_map: tuple[Array, Array] | None) -> tuple[Array, Array]:
+        quotient = rest // bases
+        figure = rest - quotient * bases
+        if digit_map is not None:
+            figure = (digit_map[0] * figure + digit_map[1]) % bases
+        return quotient, figure
+
+    rest = jnp.broadcast_to(index[:, None], shape)
+    _, figures = jax.lax.scan(divide, rest, maps, length=most)
+    # As XLA writes a division by a constant, in which LLVM joins product and sum.
+    share = np.float32(1) / bases.astype(np.float32)
+
+    def add(total: Array, step: tuple[Array, Array]) -> tuple[Array, None]:
+        figure, there = step
+        return jnp.where(there, total * share + figure.astype(jnp.float32), total), None
+
+    there = jnp.asarray(np.arange(most)[:, None] < digits)
+    zero = jnp.zeros(shape, jnp.float32)
+    total, _ = jax.lax.scan(add, zero, (figures, there), reverse=True)
+    return jnp.minimum(total * share, np.float32(1 - 2**-24))
 
 
 def _digit_maps(

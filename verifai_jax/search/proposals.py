@@ -308,7 +308,7 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
     state: Any = begun.out_info
     # What takes longest to compile begins first.
     ask = _compiled(lambda state: search.ask(state, cube, batch), state)
-    init = compile_soon("the search", begun.lower())
+    init = compile_soon("the search", begun.lower(), "little")
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
@@ -333,4 +333,4 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
 
 
 def _compiled(function: Callable[..., Any], *arguments: PyTree) -> Compilation:
-    return compile_soon("the search", jax.jit(function).lower(*arguments))
+    return compile_soon("the search", jax.jit(function).lower(*arguments), "little")

@@ -83,8 +83,15 @@ class Pool:
             raise ValueError(
                 "workers need Linux or macOS; leave them out, or use a remote simulator"
             )
+        self._begin(workers, timeout, retries, _setup(simulation, function))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Elsewhere it is a pool of its own, which finds the function by its name too.
+        return _pool, (self.workers, self.timeout, self.retries, self._setup)
+
+    def _begin(self, workers: int, timeout: float | None, retries: int, setup: bytes) -> None:
         self.workers, self.timeout, self.retries = workers, timeout, retries
-        self._setup = _setup(simulation, function)
+        self._setup = setup
         self._slots = threading.Semaphore(workers)
         self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
         # When the pool is garbage, and at the interpreter's exit.
@@ -204,6 +211,12 @@ class Pool:
             if batch.stopped:
                 break
         raise StartError(f"{end} before it was ready to simulate")
+
+
+def _pool(workers: int, timeout: float | None, retries: int, setup: bytes) -> Pool:
+    pool = Pool.__new__(Pool)
+    pool._begin(workers, timeout, retries, setup)
+    return pool
 
 
 def _end(idle: "list[_Worker]") -> None:

@@ -70,6 +70,9 @@ class Bindings:
     # MJX models and blank data, by their precision: True in float64.
     models: dict[Any, Any] = field(default_factory=dict, repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "models": {}}
+
     @property
     def all(self) -> tuple[Binding, ...]:
         """Every binding."""

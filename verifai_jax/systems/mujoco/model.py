@@ -117,6 +117,10 @@ class Model:
     spec: Any = None
     contact_sensors: tuple[str, ...] = ()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A spec cannot be pickled, and is compiled by now. The compiled model is sent bit by bit.
+        return {**self.__dict__, "spec": None}
+
 
 def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
     """Read and compile a model.

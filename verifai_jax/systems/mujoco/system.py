@@ -51,6 +51,11 @@ class MuJoCo(System):
     # Of the native backend; another loop has its own, but the same at every step of the physics.
     programs: dict[Any, Any] = field(default_factory=dict, repr=False, init=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process makes its own programs, and its own batches of MuJoCo.
+        kept = {name: value for name, value in self.__dict__.items() if name != "_native"}
+        return {**kept, "programs": {}}
+
     @property
     def duration(self) -> float:
         """Simulated seconds."""
