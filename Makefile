@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help falsify test test-slow test-all lint notebooks notebooks-update bench policy wheel clean
+.PHONY: help falsify test test-slow test-all lint notebooks notebooks-update bench policy wheel docs clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
@@ -11,6 +11,7 @@ help:
 	@echo "make lint       ruff and pyright"
 	@echo "make notebooks  execute the notebooks; their text must be what is stored"
 	@echo "make notebooks-update  execute the notebooks and store what they show"
+	@echo "make docs       build the documentation as a site, out/site/index.html"
 	@echo "make bench      measure; see benchmarks/RESULTS.md"
 	@echo "make policy     train the networks again from their seeds (the hopper: 7 minutes)"
 
@@ -34,14 +35,27 @@ help:
 	fi
 	@touch $@
 
-# Scenic brings 700 MB, which the quick tests do without; diffrax is small, and as rarely used.
+# Scenic brings 700 MB and Ray 200, which the quick tests do without; the others are small, and as
+# rarely used.
 .venv/extras: .venv/installed
 	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax]'; \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax,dask,ray]'; \
 	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax]'; \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax,dask,ray]'; \
 	fi
 	@touch $@
+
+.venv/docs: .venv/installed
+	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'; \
+	else \
+	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'; \
+	fi
+	@touch $@
+
+# Nothing is run and nothing is fetched; a broken link is an error.
+docs: .venv/docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file website/mkdocs.yml
 
 falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
@@ -86,6 +100,7 @@ bench: .venv-bench/installed .venv/extras
 	.venv-bench/bin/python benchmarks/monitor.py
 	$(BIN)/python benchmarks/engine.py
 	$(BIN)/python benchmarks/large_runs.py
+	VERIFAI_JAX_CORES=1 $(BIN)/python benchmarks/executors.py
 	$(BIN)/python benchmarks/contact_gradients.py
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/perception.py frames
@@ -99,10 +114,12 @@ policy: .venv/installed
 	$(BIN)/python -m envs.train_hopper
 	$(BIN)/python -m envs.train_cones
 
-# The wheel must work away from the checkout, where there is no envs/ and no specs/.
+# The wheel must work away from the checkout, where there is no envs/ and no specs/. It is built from
+# the source distribution, which is whole, then.
 wheel: .venv/lint
 	rm -rf dist
-	$(BIN)/python -m build --wheel --outdir dist .
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m twine check --strict dist/*
 	sh tests/wheel_smoke.sh dist/*.whl
 
 clean:

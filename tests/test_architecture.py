@@ -13,7 +13,7 @@ PACKAGE = ROOT / "verifai_jax"
 
 LAYERS = (
     {"core", "statistics", "_version"},
-    {"features", "mtl", "systems", "search"},
+    {"features", "mtl", "systems", "search", "clusters"},
     {"rl", "problem", "perception", "events", "scenes", "blocks"},
     {"evaluation"},
     {"falsification"},
@@ -27,8 +27,10 @@ LAYERS = (
         "analysis",
         "compositional",
     },
-    {"sweeps", "augmentation"},
+    {"failure_modes"},
+    {"sweeps", "augmentation", "checking"},
     {"plotting"},
+    {"reports"},
     {"cli"},
 )
 """Rooms from the ground up: each may import itself and the layers below its own."""
@@ -188,3 +190,9 @@ def test_the_drawing_has_every_room():
     drawing = text.split("```")[1]
     for room in set().union(*LAYERS) - {"_version"}:
         assert f"{room}/" in drawing
+
+
+def test_files_of_tests_have_names_of_their_own():
+    """Two of one name in two folders cannot be collected together."""
+    names = [file.name for file in (ROOT / "tests").rglob("*.py") if file.name != "conftest.py"]
+    assert sorted(names) == sorted(set(names))

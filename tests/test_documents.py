@@ -5,32 +5,26 @@ installed, `<!-- not run: why -->` compiles it only.
 """
 
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+import verifai_jax
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = (
-    "own_equations",
-    "own_environment",
-    "own_mjcf",
-    "feature_spaces",
-    "reading_the_table",
-    "robustness_function",
-    "ode",
-    "building_blocks",
-    "signals",
-    "blackbox",
-    "replays",
-    "road",
-    "fuzzing",
-    "compare",
-)
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+PAGES = [
+    "../README",
+    *(file.stem for file in sorted(DOCS.glob("*.md")) if "```python" in file.read_text()),
+]
+"""Pages with code."""
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
 LINK = re.compile(r"\]\(([\w./-]+)(?:#[\w-]+)?\)")
 """A link to a file; those with a scheme lead elsewhere."""
@@ -86,3 +80,28 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
             # Lines of an error are those of the page.
             code = "\n" * block.line + block.code
             exec(compile(code, str(DOCS / f"{page}.md"), "exec"), names)
+
+
+def test_the_citation_has_the_version():
+    text = (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {verifai_jax.__version__}\n" in text
+
+
+def test_the_navigation_of_the_site_names_pages_that_there_are():
+    text = (ROOT / "website" / "mkdocs.yml").read_text()
+    made = set(re.findall(r'"([a-z]+\.md)"', (ROOT / "website" / "pages.py").read_text()))
+    named = set(re.findall(r"([a-z_]+\.md)", text.partition("nav:")[2]))
+    assert {page for page in named - made if not (DOCS / page).exists()} == set()
+
+
+@pytest.mark.thorough
+def test_the_site_is_built_strictly(tmp_path):
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocstrings")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(tmp_path)]
+    command += ["--config-file", str(ROOT / "website" / "mkdocs.yml")]
+    done = subprocess.run(
+        command, capture_output=True, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    assert "Fuzz" in (tmp_path / "reference" / "fuzzing.html").read_text()

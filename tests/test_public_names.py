@@ -20,7 +20,17 @@ import pytest
 
 TESTS = Path(__file__).parent
 SNAPSHOT = TESTS / "public_names.txt"
-ROOMS = ("analysis", "augmentation", "blocks", "events", "mtl", "perception", "rl", "search")
+ROOMS = (
+    "analysis",
+    "augmentation",
+    "blocks",
+    "clusters",
+    "events",
+    "mtl",
+    "perception",
+    "rl",
+    "search",
+)
 """Packages that are used by their names, as in `vj.mtl.parse`; `vj` comes first in the list."""
 
 

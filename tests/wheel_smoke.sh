@@ -37,4 +37,13 @@ venv/bin/verifai-jax doctor
 venv/bin/verifai-jax falsify pendulum.py:swing --budget 500 --seed 1 | tee out
 grep -q "simulations violate the property" out
 test -s runs/swing-1/table.parquet
+venv/bin/verifai-jax report runs/swing-1 --traces 2 --no-studies
+test -s runs/swing-1/report.html
+venv/bin/verifai-jax new my_project
+(cd my_project && ../venv/bin/python -m unittest)
+venv/bin/python -c "
+from importlib.metadata import entry_points
+assert '_verifai_jax_pytest' in [entry.value for entry in entry_points(group='pytest11')]
+"
+test -s "$(venv/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))")/_verifai_jax_pytest.py"
 if venv/bin/python -c "import envs" 2>/dev/null; then echo "the wheel ships envs" >&2; exit 1; fi

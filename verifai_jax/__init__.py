@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from verifai_jax import analysis as analysis
     from verifai_jax import augmentation as augmentation
     from verifai_jax import blocks as blocks
+    from verifai_jax import clusters as clusters
     from verifai_jax import events as events
     from verifai_jax import mtl as mtl
     from verifai_jax import perception as perception
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
     from verifai_jax.augmentation import augment as augment
     from verifai_jax.certification import Certificates as Certificates
     from verifai_jax.certification import certify as certify
+    from verifai_jax.checking import test as test
     from verifai_jax.comparison import Comparison as Comparison
     from verifai_jax.comparison import compare as compare
+    from verifai_jax.core.loggers import CSVLogger as CSVLogger
+    from verifai_jax.core.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.core.trace import Status as Status
     from verifai_jax.core.trace import Trace as Trace
     from verifai_jax.core.waveform import Waveform as Waveform
@@ -33,6 +37,9 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.estimation import Estimate as Estimate
     from verifai_jax.estimation import estimate as estimate
+    from verifai_jax.failure_modes import Mode as Mode
+    from verifai_jax.failure_modes import Modes as Modes
+    from verifai_jax.failure_modes import modes as modes
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run
@@ -108,7 +115,10 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.systems.remote import remote as remote
 
-_ROOMS = ("analysis", "augmentation", "blocks", "events", "mtl", "perception", "rl", "search")
+_ROOMS = (
+    *("analysis", "augmentation", "blocks", "clusters", "events", "mtl", "perception", "rl"),
+    "search",
+)
 
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 _NAMES = {
@@ -121,9 +131,14 @@ _NAMES = {
         "Certificates",
         "certify",
     ),
+    "checking": ("test",),
     "comparison": (
         "Comparison",
         "compare",
+    ),
+    "core.loggers": (
+        "CSVLogger",
+        "TensorBoardLogger",
     ),
     "core.trace": (
         "Status",
@@ -173,6 +188,11 @@ _NAMES = {
         "FuzzCoverage",
         "FuzzRun",
         "fuzz",
+    ),
+    "failure_modes": (
+        "Mode",
+        "Modes",
+        "modes",
     ),
     "mtl": (
         "Formula",

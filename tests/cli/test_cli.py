@@ -554,3 +554,47 @@ class TestMonitor:
     def test_semicolons_and_decimal_commas(self, call, tmp_path):
         (tmp_path / "semi.csv").write_text("time;dist\n0,0;5,0\n0,5;3,5\n")
         assert call("monitor", "G dist > 1", "semi.csv") == "holds with robustness 2.5\n"
+
+
+def test_new_writes_a_project(call, tmp_path):
+    output = call("new", "my_project")
+    assert "cd my_project && verifai-jax falsify spec.py:upright" in output
+    for name in ("pendulum.py", "spec.py", "test_spec.py"):
+        compile((tmp_path / "my_project" / name).read_text(), name, "exec")
+    assert "# my_project" in (tmp_path / "my_project" / "README.md").read_text()
+    assert "has .gitignore, README.md" in call("new", "my_project", code=2)
+
+
+@pytest.mark.thorough
+def test_a_new_project_passes_its_tests(call, tmp_path):
+    call("new", "my_project")
+    place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-m", "unittest"]
+    done = subprocess.run(command, cwd=tmp_path / "my_project", env=place, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+@pytest.mark.thorough
+def test_parts_of_a_job_array_are_merged_to_the_run_of_one_machine(call, tmp_path):
+    for number in (1, 2):
+        output = call("falsify", "specs/ramp.py:ramp", "--budget", 300, "--shard", f"{number}/2")
+        assert "merge        verifai-jax merge runs/ramp-parts/*" in output
+    parts = sorted((tmp_path / "runs" / "ramp-parts").iterdir())
+    output = call("merge", *parts, "--folder", "merged", "--no-pictures")
+    assert "of 300 simulations violate the property" in output
+    call(
+        "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300,
+        "--folder", "whole", "--no-pictures",
+    )  # fmt: skip
+    merged, whole = load(tmp_path / "merged"), load(tmp_path / "whole")
+    assert merged.table.all.equals(whole.table.all)
+
+
+def test_a_part_alone_neither_stops_nor_learns_nor_uses_a_cluster(call):
+    for option in (["--stop-after", 3], ["--cluster", "dask://a:1"], ["--diverse"]):
+        output = call("falsify", "specs/ramp.py:ramp", "--shard", "1/2", *option, code=2)
+        assert f"{option[0]} needs all rows of a run" in output
+    output = call("falsify", "specs/ramp.py:ramp", "--cluster", "dusk://a:1", code=2)
+    assert "unknown kind of cluster 'dusk'; did you mean 'dask'?" in output
+    output = call("falsify", "specs/ramp.py:ramp", "--shard", "3", code=2)
+    assert "a shard is written as 3/16" in output

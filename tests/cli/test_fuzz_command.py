@@ -1,5 +1,7 @@
 """`verifai-jax fuzz`: a run that says what it covered, and that other commands go on with."""
 
+import json
+
 import pytest
 from click.testing import CliRunner
 
@@ -39,6 +41,10 @@ def test_fuzz_then_shrink(tmp_path, monkeypatch):
     assert "  covered" in output
     assert "2 of 2" in output
     assert "simulations extended coverage" in output
+    told = CliRunner().invoke(main, ["fuzz", "spec.py:ramp", *map(str, options), "--json"])
+    coverage = json.loads(told.stdout)["coverage"]
+    assert {"of", "kind", "covered", "total"} == set(coverage[0])
+    assert coverage[0]["covered"] == coverage[0]["total"] == 2
     assert "3 events: join at" in call("shrink", "runs/ramp-1", "--no-pictures")
 
 

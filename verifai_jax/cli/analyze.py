@@ -5,9 +5,10 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.arguments import FOLDER, PROBLEM, RUN, load_judged_run
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @RUN
 @PROBLEM
 @FOLDER
@@ -15,4 +16,6 @@ def analyze(folder: Path, target: str | None, into: Path | None) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
     analysis = load_judged_run(folder, target).analyze()
     click.echo(str(analysis))
-    click.echo(f"  written      {analysis.save((into or folder) / 'analysis')}")
+    place = analysis.save((into or folder) / "analysis")
+    click.echo(f"  written      {place}")
+    give_result(text=str(analysis), report=place)

@@ -11,6 +11,7 @@ import click
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
+    from verifai_jax.core.executors import Executor
     from verifai_jax.falsification.run import Run
     from verifai_jax.problem import Problem
 
@@ -57,15 +58,6 @@ SEED = click.option("--seed", type=int, default=0, show_default=True, help="Seed
 """Seed of a command that cannot be resumed."""
 
 
-def fail_on(gate: str, explanation: str) -> Callable[[Command], Command]:
-    """Return the option `--fail-on` of a command with one gate."""
-    return click.option(
-        "--fail-on",
-        type=click.Choice([gate]),
-        help=f"Exit with code 1 {explanation}.",
-    )
-
-
 ONLY = click.option(
     "--only",
     metavar="NAMES",
@@ -91,10 +83,25 @@ BACKEND = click.option(
 )
 """Simulator of a system that has several."""
 
+CLUSTER = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
+)
+"""A cluster whose workers do the work."""
+
 PLOT = click.option(
     "--plot", type=click.Path(path_type=Path), metavar="PNG", help="Draw the result into a PNG."
 )
 """File of the one picture of a result."""
+
+REPORT = click.option(
+    "--report",
+    type=click.Path(path_type=Path),
+    metavar="HTML",
+    help="Write the evidence report into an HTML file.",
+)
+"""File of the evidence report on a result."""
 
 SET = click.option(
     "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
@@ -131,6 +138,23 @@ PARAMETER_CHOICE = all_of(
     BACKEND,
 )
 """Options of `synthesize` and `repair`: keywords of both functions."""
+
+
+@contextlib.contextmanager
+def on_cluster(address: str | None) -> "Iterator[Executor | None]":
+    """Connect to the cluster at an address, if one is given."""
+    if address is None:
+        yield None
+        return
+    from verifai_jax.clusters import connect
+
+    try:
+        held = contextlib.ExitStack()
+        executor = held.enter_context(connect(address))
+    except OSError as error:
+        raise CommandError(str(error), BROKEN) from error
+    with held:
+        yield executor
 
 
 def load_problem(target: str, only: str | None = None) -> "Problem":

@@ -4,22 +4,23 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, fail_on, load_judged_run
-from verifai_jax.cli.exit_codes import fail_gate
+from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import as_plain, command, give_result
 
 
-@click.command()
+@command()
 @RUN
 @ROW
 @PROBLEM
 @click.option("--simulator", help="Another backend of the system that has to agree.")
-@fail_on("unconfirmed", "if any is not confirmed")
+@fail_on(unconfirmed="if any is not confirmed", counterexample="if any is confirmed")
 def confirm(
     folder: Path,
     row: int | None,
     target: str | None,
     simulator: str | None,
-    fail_on: str | None,
+    fail_on: Gate | None,
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
     from verifai_jax import counterexamples
@@ -29,8 +30,10 @@ def confirm(
     result = counterexamples.confirm(run, row, simulator=simulator)
     click.echo(printable(str(result)))
     if isinstance(result, counterexamples.Confirmation):
-        all_confirmed = result.confirmed
+        confirmed, examined = int(result.confirmed), 1
     else:
-        all_confirmed = len(result.confirmed) == len(result)
-    if fail_on is not None and not all_confirmed:
-        raise fail_gate()
+        confirmed, examined = len(result.confirmed), len(result)
+    give_result(confirmed=confirmed, examined=examined, **as_plain(result))
+    if isinstance(result, counterexamples.Confirmations):
+        give_result(counts=result.counts, rows=result.table)
+    check_gate(fail_on, {"unconfirmed": confirmed < examined, "counterexample": confirmed > 0})

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import click
 
 from verifai_jax._version import __version__
+from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.core.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
@@ -71,10 +72,17 @@ BAD_PAIRS = (
 """Known bad pairs."""
 
 
-@click.command()
+@command()
 def doctor() -> None:
     """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
-    click.echo(report())
+    text = report()
+    click.echo(text)
+    give_result(
+        packages={package: _version(package) for package in (*PACKAGES, *EXTRAS)},
+        python=platform.python_version(),
+        cores=available_cores(),
+        report=text.splitlines(),
+    )
 
 
 def report() -> str:

@@ -8,22 +8,26 @@ import click
 from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
+    CLUSTER,
     MAX_SECONDS,
     ONLY,
     PLOT,
     PRECISION,
+    REPORT,
     SEED,
     TARGET,
-    fail_on,
     load_problem,
+    on_cluster,
 )
-from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import as_plain, command, give_result
 
 if TYPE_CHECKING:
     from verifai_jax.estimation import Estimate
 
 
-@click.command()
+@command()
 @TARGET
 @click.option("--method", help="monte_carlo, importance or splitting  [default: chosen]")
 @click.option("--budget", type=int, default=50_000, show_default=True, help="Simulations at most.")
@@ -35,8 +39,14 @@ if TYPE_CHECKING:
 @MAX_SECONDS
 @PRECISION
 @BACKEND
+@CLUSTER
 @PLOT
-@fail_on("p0", "unless the probability is shown to be below --p0")
+@REPORT
+@fail_on(
+    p0="unless the probability is shown to be below --p0",
+    rate="unless it is shown to be at most P",
+    counterexample="if any simulation failed",
+)
 def estimate(
     target: str,
     method: str | None,
@@ -49,39 +59,54 @@ def estimate(
     max_seconds: float | None,
     precision: Literal["float32", "float64"] | None,
     backend: str | None,
+    cluster: str | None,
     plot: Path | None,
-    fail_on: str | None,
+    report: Path | None,
+    fail_on: Gate | None,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax.core.text import printable
     from verifai_jax.estimation import estimate as run
 
-    if fail_on is not None and p0 is None:
+    if fail_on is not None and fail_on.name == "p0" and p0 is None:
         raise click.UsageError("--fail-on p0 goes with --p0")
-    found = run(
-        load_problem(target, only),
-        method,
-        budget,
-        batch=batch,
-        seed=seed,
-        confidence=confidence,
-        p0=p0,
-        precision=precision or "float32",
-        backend=backend,
-        max_seconds=max_seconds,
-    )
+    if p0 is None and fail_on is not None:
+        p0 = fail_on.bound
+    problem = load_problem(target, only)
+    with on_cluster(cluster) as executor:
+        found = run(
+            problem,
+            method,
+            budget,
+            batch=batch,
+            seed=seed,
+            confidence=confidence,
+            p0=p0,
+            precision=precision or "float32",
+            backend=backend,
+            max_seconds=max_seconds,
+            executor=executor,
+        )
     click.echo(printable(str(found)))
+    give_result(**as_plain(found))
     if plot is not None:
         found.plot(plot)
         click.echo(f"  picture      {plot}")
+    if report is not None:
+        path = found.report(report, problem=problem, targets=(target,))
+        click.echo(f"  report       {path}")
     if found.prior_no_verdict == found.prior_simulations and not found.failures:
         raise CommandError(
             f"no simulation had a verdict, of {found.prior_simulations:,}: nothing is known of the "
             "probability; verifai-jax falsify says why",
             BROKEN,
         )
-    if fail_on is not None and p0 is not None and not _is_below(found, p0):
-        raise fail_gate()
+    failed = {"counterexample": found.failures > 0}
+    if p0 is not None:
+        failed["p0"] = not _is_below(found, p0)
+    if fail_on is not None and fail_on.bound is not None:
+        failed[RATE] = not _is_below(found, fail_on.bound)
+    check_gate(fail_on, failed)
 
 
 def _is_below(found: "Estimate", p0: float) -> bool:

@@ -5,9 +5,10 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @RUN
 @ROW
 @PROBLEM
@@ -25,6 +26,15 @@ def explain(
     run = load_judged_run(folder, target)
     why = counterexamples.explain(run, row)
     click.echo(textwrap.fill(printable(str(why)), 88, break_on_hyphens=False))
+    influences = {one.name: why.effect(one) for one in why.influences}
+    give_result(
+        row=why.row,
+        formula=why.formula,
+        robustness=why.rho,
+        text=str(why),
+        effects=influences,
+        simulations=why.simulations,
+    )
     if pictures:
         path = (into or folder) / f"why-{why.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

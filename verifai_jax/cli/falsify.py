@@ -2,35 +2,40 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from verifai_jax.cli.arguments import (
     BACKEND,
     BATCH,
+    CLUSTER,
     MAX_SECONDS,
     ONLY,
     PICTURES,
     PRECISION,
     PROGRESS,
     SET,
-    fail_on,
     load_problem,
     next_folder,
+    on_cluster,
     plain_values,
     read_run,
     recorded_target,
     refuse_with_resume,
 )
-from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError, fail_gate
+from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
+from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
+from verifai_jax.cli.json_output import command, describe_run, give_result
 
 if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run
+    from verifai_jax.problem import Problem
+    from verifai_jax.search import Search
     from verifai_jax.statistics.stopping import Decided, Within
 
 
-@click.command()
+@command()
 @click.argument("target", required=False)
 @click.option("--search", help="Name of the search  [default: portfolio]")
 @SET
@@ -46,6 +51,12 @@ if TYPE_CHECKING:
 @click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
 @PRECISION
 @BACKEND
+@CLUSTER
+@click.option(
+    "--shard",
+    metavar="I/N",
+    help="Simulate part I of N alone, as a job of an array; merge makes the run of them.",
+)
 @click.option(
     "--confirm/--no-confirm",
     default=True,
@@ -59,7 +70,10 @@ if TYPE_CHECKING:
 )
 @PICTURES
 @PROGRESS
-@fail_on("counterexample", "if a counterexample was found")
+@fail_on(
+    counterexample="if a counterexample was found",
+    rate="unless the failure rate is shown to be at most P; needs --search uniform",
+)
 def falsify(
     target: str | None,
     search: str | None,
@@ -76,39 +90,67 @@ def falsify(
     resume: Path | None,
     precision: Literal["float32", "float64"] | None,
     backend: str | None,
+    cluster: str | None,
+    shard: str | None,
     confirm: bool,
     diverse: bool,
     folder: Path | None,
     pictures: bool,
     progress: bool | None,
-    fail_on: str | None,
+    fail_on: Gate | None,
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
     from verifai_jax.search import named
 
     stop_when = _stopping_rule(within, decide)
+    if shard is not None:
+        alone = {"--resume": resume, "--cluster": cluster, "--warm-start": warm_start}
+        alone |= {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
+        alone |= {"--decide": decide, "--diverse": diverse or None, "--fail-on": fail_on}
+        for option, value in alone.items():
+            if value is not None:
+                raise click.UsageError(f"{option} needs all rows of a run; --shard has a part")
+        if target is None:
+            raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
+        chosen = named(search or "uniform", **plain_values("--set", options))
+        _simulate_shard(
+            load_problem(target, only), shard, chosen, budget or 10_000, folder,
+            batch=batch, seed=seed or 0, precision=precision or "float32", backend=backend,
+            confirm=confirm, progress=progress, target=target,
+        )  # fmt: skip
+        return
     if resume is not None:
         fixed = {"--search": search, "--batch": batch, "--seed": seed, "--folder": folder}
         fixed |= {"--set": options, "--warm-start": warm_start}
         fixed |= {"--precision": precision, "--backend": backend}
         refuse_with_resume(fixed, "run")
-        run = falsification.resume(
-            resume,
-            load_problem(target or _resumed_target(resume), only),
-            budget=budget,
-            max_seconds=max_seconds,
-            stop_after=stop_after,
-            stop_when=stop_when,
-            progress=progress,
-        )
+        problem = load_problem(target or _resumed_target(resume), only)
+        with on_cluster(cluster) as executor:
+            run = falsification.resume(
+                resume,
+                problem,
+                budget=budget,
+                max_seconds=max_seconds,
+                stop_after=stop_after,
+                stop_when=stop_when,
+                progress=progress,
+                executor=executor,
+            )
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     else:
         chosen = named(search or "portfolio", **plain_values("--set", options))
+        if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
+            raise click.UsageError(
+                f"--fail-on {fail_on} needs independent samples of the space; give --search uniform"
+            )
         problem = load_problem(target, only)
         earlier = None if warm_start is None else read_run(warm_start)
-        with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+        with (
+            next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place,
+            on_cluster(cluster) as executor,
+        ):
             run = falsification.falsify(
                 problem,
                 chosen,
@@ -126,10 +168,36 @@ def falsify(
                 diverse=diverse,
                 progress=progress,
                 target=target,
+                executor=executor,
             )
     print_run(run, pictures)
-    if fail_on is not None and run.table.counts.claimed:
-        raise fail_gate()
+    high = None if run.failure_rate is None else run.failure_rate.high
+    failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(fail_on, high)}
+    check_gate(fail_on, failed)
+
+
+def _simulate_shard(
+    problem: "Problem",
+    shard: str,
+    search: "Search",
+    budget: int,
+    folder: Path | None,
+    **options: Any,
+) -> None:
+    """Simulate one part of a run, and say what makes the run of the parts."""
+    from verifai_jax.core.text import folder_name
+    from verifai_jax.falsification.shards import Shard, simulate_shard
+
+    part = Shard.parse(shard)
+    parts = Path("runs") / f"{folder_name(problem.name)}-parts"
+    place = parts / f"{part.number}-of-{part.of}" if folder is None else folder
+    simulations = simulate_shard(problem, part, search, budget, folder=place, **options)
+    click.echo(f"part {part} of {problem.name}: {simulations:,} of {budget:,} simulations")
+    give_result(
+        problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=place
+    )
+    click.echo(f"  part         {place}")
+    click.echo(f"  merge        verifai-jax merge {place.parent}/*")
 
 
 def _resumed_target(folder: Path) -> str:
@@ -155,6 +223,7 @@ def print_run(run: "Run", pictures: bool) -> None:
     **Raises:** `CommandError` where no simulation has a verdict.
     """
     click.echo(run.summary())
+    give_result(**describe_run(run))
     assert run.folder is not None
     if run.stopped == "interrupted":
         click.echo(f"  resume       verifai-jax falsify --resume {run.folder}")

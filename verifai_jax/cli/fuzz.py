@@ -15,16 +15,16 @@ from verifai_jax.cli.arguments import (
     PROGRESS,
     SEED,
     TARGET,
-    fail_on,
     load_problem,
     next_folder,
     split_pairs,
 )
-from verifai_jax.cli.exit_codes import fail_gate
 from verifai_jax.cli.falsify import print_run
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @TARGET
 @click.option("--budget", type=int, default=10_000, show_default=True, help="Simulations at most.")
 @click.option(
@@ -46,7 +46,7 @@ from verifai_jax.cli.falsify import print_run
 )
 @PICTURES
 @PROGRESS
-@fail_on("counterexample", "if a counterexample was found")
+@fail_on(counterexample="if a counterexample was found")
 def fuzz(
     target: str,
     budget: int,
@@ -60,7 +60,7 @@ def fuzz(
     folder: Path | None,
     pictures: bool,
     progress: bool | None,
-    fail_on: str | None,
+    fail_on: Gate | None,
 ) -> None:
     """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
     from verifai_jax.fuzzing import fuzz as run_fuzz
@@ -83,8 +83,12 @@ def fuzz(
             target=target,
         )
     print_run(run, pictures)
-    if fail_on is not None and run.table.counts.claimed:
-        raise fail_gate()
+    parts = [
+        {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}
+        for part in run.coverage.parts
+    ]
+    give_result(coverage=parts)
+    check_gate(fail_on, {"counterexample": run.table.counts.claimed > 0})
 
 
 def _cells(name: str, text: str) -> tuple[float, float, int]:

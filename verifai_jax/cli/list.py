@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING
 import click
 
 from verifai_jax.cli.exit_codes import WRONG_USAGE
+from verifai_jax.cli.json_output import command, give_result
 
 if TYPE_CHECKING:
     from verifai_jax.problem import Problem
     from verifai_jax.sweeps.study import Study
 
 
-@click.command(name="list")
+@command(name="list")
 @click.argument("place", required=False)
 def list_targets(place: str | None) -> None:
     """List the problems and studies of a file or folder (PLACE, by default specs/).
@@ -31,6 +32,7 @@ def list_targets(place: str | None) -> None:
     files = sorted(path.glob("[!_]*.py")) if path.is_dir() else [path]
     inner = [folder for folder in sorted(path.glob("*/")) if any(folder.glob("[!_]*.py"))]
     broken = shown = 0
+    listed: list[dict[str, object]] = []
     for file in files:
         try:
             targets = definitions(str(file), Problem, Study)
@@ -50,14 +52,27 @@ def list_targets(place: str | None) -> None:
         for name, target in targets.items():
             click.echo(f"{file}:{name}  {target.description}")
             _print_target(target)
+            listed.append(_describe_target(f"{file}:{name}", target))
             shown += 1
     if path.is_dir() and not (shown or broken or inner):
         raise TargetError(f"{path}/ has no Python file with problems")
     for folder in inner:
         click.echo(f"more in {folder}/: verifai-jax list {folder}")
     click.echo(f"searches: {', '.join(names())}")
+    give_result(targets=listed, searches=names(), broken=broken)
     if broken:
         raise click.exceptions.Exit(WRONG_USAGE)
+
+
+def _describe_target(name: str, target: "Problem | Study") -> dict[str, object]:
+    formulas = getattr(target, "formulas", None)
+    return {
+        "target": name,
+        "kind": "study" if formulas is None else "problem",
+        "description": target.description,
+        "features": list(target.space.domains),
+        "formulas": {key: str(formula) for key, formula in (formulas or {}).items()},
+    }
 
 
 def _print_target(target: "Problem | Study") -> None:

@@ -33,9 +33,13 @@ from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
 from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.list import list_targets
+from verifai_jax.cli.merge import merge
+from verifai_jax.cli.modes import modes
 from verifai_jax.cli.monitor import monitor
+from verifai_jax.cli.new import new
 from verifai_jax.cli.repair import repair
 from verifai_jax.cli.replay import replay
+from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
 from verifai_jax.cli.sweep import sweep
 from verifai_jax.cli.synthesize import synthesize
@@ -43,6 +47,7 @@ from verifai_jax.core.errors import unknown_name
 
 COMMANDS = (
     falsify,
+    merge,
     fuzz,
     list_targets,
     replay,
@@ -51,6 +56,7 @@ COMMANDS = (
     doctor,
     confirm,
     estimate,
+    modes,
     explain,
     repair,
     shrink,
@@ -59,6 +65,8 @@ COMMANDS = (
     save_counterexamples,
     replay_counterexamples,
     compare,
+    report,
+    new,
 )
 """The sub-commands. Their files import nothing heavy until a command runs."""
 

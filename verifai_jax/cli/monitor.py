@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from verifai_jax.cli.arguments import PLOT, fail_on, split_pairs
-from verifai_jax.cli.exit_codes import BROKEN, CommandError, fail_gate
+from verifai_jax.cli.arguments import PLOT, split_pairs
+from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_stream import monitor_stream
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
 
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from verifai_jax.mtl import Formula
 
 
-@click.command()
+@command()
 @click.argument("formula")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 @click.option("--define", "definitions", multiple=True, metavar="NAME=FORMULA")
 @click.option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
-@fail_on("violation", "if the formula fails")
+@fail_on(violation="if the formula fails")
 def monitor(
     formula: str,
     recording: Path,
@@ -50,7 +52,7 @@ def monitor(
     definitions: tuple[str, ...],
     explain: bool,
     plot: Path | None,
-    fail_on: str | None,
+    fail_on: Gate | None,
 ) -> None:
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
 
@@ -72,8 +74,8 @@ def monitor(
                 "need the whole recording"
             )
         holds = monitor_stream(parsed, sys.stdin, time, dt)
-        if fail_on is not None and not holds:
-            raise fail_gate()
+        give_result(formula=str(parsed), holds=holds)
+        check_gate(fail_on, {"violation": not holds})
         return
     trace = _read(recording, time, dt, period, method)
     _check_signals(parsed, trace, recording)
@@ -100,8 +102,8 @@ def monitor(
             if plot is not None:
                 mtl.draw(why, plot)
                 click.echo(f"picture {plot}")
-    if fail_on is not None and not holds:
-        raise fail_gate()
+    give_result(formula=str(parsed), holds=holds, robustness=rho)
+    check_gate(fail_on, {"violation": not holds})
 
 
 def _read(

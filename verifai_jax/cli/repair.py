@@ -13,9 +13,11 @@ from verifai_jax.cli.arguments import (
     plain_values,
     read_run,
 )
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @TARGET
 @click.option(
     "--parameters", required=True, metavar="NAMES", help="Features to change, comma-separated."
@@ -36,6 +38,7 @@ from verifai_jax.cli.arguments import (
 )
 @PARAMETER_CHOICE
 @PLOT
+@fail_on(unsafe="unless the repair held in the check")
 def repair(
     target: str,
     parameters: str,
@@ -44,6 +47,7 @@ def repair(
     budget: int,
     estimate: int | None,
     plot: Path | None,
+    fail_on: Gate | None,
     **keywords: Any,
 ) -> None:
     """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
@@ -59,8 +63,23 @@ def repair(
         **keywords,
     )
     click.echo(printable(str(result)))
+    give_result(
+        before=result.before,
+        parameters=result.parameters,
+        robustness=result.robustness,
+        repaired=result.repaired,
+        change=result.change,
+        held_out_before=result.held_out_before,
+        held_out_after=result.held_out_after,
+        simulations=result.simulations,
+        stopped=result.stopped,
+        seed=result.seed,
+    )
     if estimate is not None:
-        click.echo(printable(str(result.estimate(estimate, seed=result.seed))))
+        estimates = result.estimate(estimate, seed=result.seed)
+        click.echo(printable(str(estimates)))
+        give_result(estimate_before=estimates.before, estimate_after=estimates.after)
     if plot is not None:
         result.plot(plot)
         click.echo(f"  picture      {plot}")
+    check_gate(fail_on, {"unsafe": not result.repaired})

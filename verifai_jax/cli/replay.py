@@ -5,9 +5,11 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run, load_run
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @RUN
 @ROW
 @PROBLEM
@@ -18,6 +20,7 @@ from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_
 )
 @FOLDER
 @PICTURES
+@fail_on(counterexample="if it violates the property, or has no verdict")
 def replay(
     folder: Path,
     row: int | None,
@@ -25,6 +28,7 @@ def replay(
     precision: str | None,
     into: Path | None,
     pictures: bool,
+    fail_on: Gate | None,
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
     from verifai_jax.core.text import one_line, printable
@@ -48,6 +52,16 @@ def replay(
         click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")
     verdict = "violated" if again.violated else "satisfied"
     click.echo(f"  status {again.status.name.lower()}; {verdict}")
+    give_result(
+        row=number,
+        precision=precision,
+        features={name: stored[name] for name in run.table.features},
+        robustness=again.rho,
+        stored_robustness=stored["rho"],
+        status=again.status.name.lower(),
+        violated=again.violated,
+    )
     if pictures:
         for path in write_replay_pictures(again, into or folder):
             click.echo(f"  picture      {path}")
+    check_gate(fail_on, {"counterexample": again.violated or again.status.name != "OK"})

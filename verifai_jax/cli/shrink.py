@@ -6,9 +6,10 @@ from typing import Literal
 import click
 
 from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, SEED, load_judged_run
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @RUN
 @ROW
 @PROBLEM
@@ -47,6 +48,15 @@ def shrink(
     run = load_judged_run(folder, target)
     small = counterexamples.shrink(run, row, by=by, budget=budget, seed=seed, others=others)
     click.echo(printable(str(small)))
+    give_result(
+        row=small.row,
+        features=small.features,
+        robustness=small.rho,
+        changed=small.changed,
+        count=small.count,
+        distance=small.distance,
+        simulations=small.simulations,
+    )
     if pictures:
         path = (into or folder) / f"shrunk-{small.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -9,16 +9,20 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from verifai_jax.cli.arguments import (
+    CLUSTER,
     MAX_SECONDS,
     PICTURES,
     SET,
     is_sweep,
     next_folder,
+    on_cluster,
     plain_values,
     refuse_with_resume,
     split_names,
 )
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 if TYPE_CHECKING:
     from verifai_jax.sweeps.result import Sweep
@@ -42,7 +46,7 @@ _MOST_ROWS = 12
 """Rows of the table that are printed."""
 
 
-@click.command()
+@command()
 @click.argument("target", required=False)
 @click.option("--configurations", type=int, help="Configurations at most  [default: 32]")
 @click.option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
@@ -76,7 +80,9 @@ _MOST_ROWS = 12
     type=click.Path(path_type=Path),
     help="Folder to write  [default: sweeps/NAME-1, -2, ...]",
 )
+@CLUSTER
 @PICTURES
+@fail_on(unsafe="unless a policy is shown to be safe")
 def sweep(
     target: str | None,
     configurations: int | None,
@@ -86,7 +92,9 @@ def sweep(
     cache: Path | None,
     resume: Path | None,
     folder: Path | None,
+    cluster: str | None,
     pictures: bool,
+    fail_on: Gate | None,
     **given: Any,
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
@@ -126,7 +134,10 @@ def sweep(
         "nominal": list(nominal),
     }
     keywords = _keywords(given, options)
-    with next_folder("sweeps", study.name) if folder is None else nullcontext(folder) as place:
+    with (
+        next_folder("sweeps", study.name) if folder is None else nullcontext(folder) as place,
+        on_cluster(cluster) as executor,
+    ):
         folder = place
         result = run_sweep(
             study,
@@ -134,6 +145,7 @@ def sweep(
             folder=folder if cache is None else cache,
             max_seconds=max_seconds,
             note=note,
+            executor=executor,
             **keywords,
         )
         record = replace(result.record, options={**result.record.options, "target": target})
@@ -143,6 +155,15 @@ def sweep(
             click.echo(_format_table(result))
         result.save(folder)
     click.echo(f"  table        {folder / 'table.parquet'}")
+    give_result(
+        study=study.name,
+        target=target,
+        policies=result.table,
+        safe=[int(row) for row in result.safe.index],
+        complete=record.complete,
+        seconds=record.seconds,
+        folder=folder,
+    )
     if pictures and record.certified:
         picture = folder / "sweep.png"
         result.plot(picture)
@@ -151,6 +172,7 @@ def sweep(
         click.echo(f"  resume       verifai-jax sweep --resume {folder}")
     elif all(status not in ("trained", "stopped") for status in result.table["status"]):
         raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
+    check_gate(fail_on, {"unsafe": not len(result.safe)})
 
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:

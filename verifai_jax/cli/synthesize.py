@@ -6,9 +6,11 @@ from typing import Any
 import click
 
 from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result
 
 
-@click.command()
+@command()
 @TARGET
 @click.option(
     "--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]"
@@ -21,11 +23,13 @@ from verifai_jax.cli.arguments import PARAMETER_CHOICE, TARGET, load_problem
     metavar="CSV",
     help="Write the candidates into a CSV file.",
 )
+@fail_on(unsafe="unless the formula holds with the parameters, in the check too")
 def synthesize(
     target: str,
     parameters: str | None,
     budget: int,
     table: Path | None,
+    fail_on: Gate | None,
     **keywords: Any,
 ) -> None:
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
@@ -39,6 +43,19 @@ def synthesize(
         **keywords,
     )
     click.echo(printable(str(result)))
+    give_result(
+        parameters=result.parameters,
+        robustness=result.robustness,
+        holds=result.holds,
+        margin=result.margin,
+        converged=result.converged,
+        simulations=result.simulations,
+        without_verdict=result.without_verdict,
+        held_out=result.held_out,
+        stopped=result.stopped,
+        seed=result.seed,
+    )
     if table is not None:
         result.candidates.to_csv(table, index=False)
         click.echo(f"  candidates   {table}")
+    check_gate(fail_on, {"unsafe": not result.holds})

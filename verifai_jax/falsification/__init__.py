@@ -9,4 +9,7 @@ from verifai_jax.falsification._repeat import Trials as Trials
 from verifai_jax.falsification._repeat import repeat as repeat
 from verifai_jax.falsification.run import Run as Run
 from verifai_jax.falsification.run import load as load
+from verifai_jax.falsification.shards import Shard as Shard
+from verifai_jax.falsification.shards import merge as merge
+from verifai_jax.falsification.shards import simulate_shard as simulate_shard
 from verifai_jax.falsification.table import ErrorTable as ErrorTable

@@ -6,17 +6,19 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
+from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.compilation import tracing
-from verifai_jax.core.errors import check_names, suggests_options
+from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
@@ -38,6 +40,7 @@ from verifai_jax.falsification.silent_mistakes import (
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     adapt_search,
+    check_first,
     check_gradient,
     check_options,
     check_rule,
@@ -47,6 +50,7 @@ from verifai_jax.falsification.validation import (
     locked,
     needs_gradient,
     new_folder,
+    points_of,
     recorded_search,
     space_as_data,
     usual_batch,
@@ -58,6 +62,8 @@ from verifai_jax.statistics.stopping import StoppingRule
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from verifai_jax.falsification.validation import Rows
 
 
 class RunError(RuntimeError):
@@ -86,8 +92,11 @@ def falsify(
     backend: str | None = None,
     confirm: bool = True,
     diverse: bool = False,
+    first: "Rows | None" = None,
+    callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
     target: str | None = None,
+    executor: Executor | None = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -117,8 +126,15 @@ def falsify(
       simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
     - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
       failures that are far from each other (`search.Diverse`).
+    - `first`: features that are simulated before the search proposes any, and told to it where it
+      learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
+    - `callbacks`: functions called after each round with the number of simulations and a dictionary
+      of plain numbers; `vj.CSVLogger` and `vj.TensorBoardLogger` are ready ones.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
     - `target`: how the command line names the problem, for the record.
+    - `executor`: whose workers simulate: Dask's `client.get_executor()`, `clusters.RayExecutor()`,
+      a process pool, or anything else with `concurrent.futures`' `submit`. The table is the one of
+      this machine alone, bit for bit, on workers with its kind of processor.
 
     Ctrl-C ends the run and returns what is finished. What is likely a mistake of the problem is in
     the run's `notes`, and above the progress bar.
@@ -134,6 +150,8 @@ def falsify(
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     search = check_search(problem, search)
     check_rule(search, stop_when)
+    given = check_first(problem, first, stop_when)
+    callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
     # Far from what is found already takes rounds, more than many at once.
@@ -157,20 +175,24 @@ def falsify(
     warm = earlier is not None
     with new_folder(folder) as place:
         table = ErrorTable(tuple(problem.space.columns), place)
-        rounds = Rounds(problem, search, batch, seed, table, precision, place, confirm)
+        rounds = Rounds(
+            problem, search, batch, seed, table, precision, place, confirm, executor, target, given
+        )
 
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
 
-        return _run_rounds(rounds, ends, seed, choice, progress, target, prepare, notes, warm=warm)
+        return _run_rounds(
+            rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm
+        )
 
 
 @suggests_options
 @reproducible_settings()
 def simulate(
     problem: Problem,
-    rows: "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]",
+    rows: "Rows",
     *,
     batch: int = 1024,
     seed: int = 0,
@@ -178,6 +200,8 @@ def simulate(
     precision: str = "float32",
     backend: str | None = None,
     progress: bool | None = None,
+    target: str | None = None,
+    executor: Executor | None = None,
 ) -> Run:
     """Simulate given features, in their order: no search, a row of the table for each.
 
@@ -193,16 +217,11 @@ def simulate(
 
     **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
     """
-    if hasattr(rows, "columns"):
-        check_names("column", problem.space.columns, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
-        points = problem.space.points(rows)  # pyright: ignore[reportArgumentType]
-    else:
-        listed = [rows] if isinstance(rows, Mapping) else list(rows)
-        points = np.stack([problem.space.flatten(problem.space.coerce(row)) for row in listed])
+    points = points_of(problem, rows)
     return falsify(
         problem, searches.PointList(points), len(points),
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
-        confirm=False, progress=progress,
+        confirm=False, progress=progress, target=target, executor=executor,
     )  # fmt: skip
 
 
@@ -217,7 +236,9 @@ def resume(
     max_seconds: float | None = None,
     stop_after: int | None = None,
     stop_when: StoppingRule | None = None,
+    callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
+    executor: Executor | None = None,
 ) -> Run:
     """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
 
@@ -247,7 +268,8 @@ def resume(
             run = load(run, problem)
         elif run.folder is not None:
             check_not_continued(run, run.folder)
-        return _resume(run, problem, search, budget, ends, progress)
+        called = check_callbacks(callbacks)
+        return _resume(run, problem, search, budget, ends, progress, called, executor)
 
 
 def _resume(
@@ -257,6 +279,8 @@ def _resume(
     budget: int | None,
     ends: "_Ending",
     progress: bool | None,
+    callbacks: Sequence[Callback],
+    executor: Executor | None = None,
 ) -> Run:
     """Go on with a run whose folder is locked; `ends` is completed from the run."""
     problem = problem or run.problem
@@ -291,8 +315,9 @@ def _resume(
     with writing(run.folder):
         table = run.table.resumed(rows, run.folder)
     rounds = Rounds(
-        problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm
-    )
+        problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
+        executor, run.target, np.asarray(run.first, np.float32).reshape(-1, problem.space.dim),
+    )  # fmt: skip
 
     rounds.confirm_seconds, rounds.checked = run.confirm_seconds, run.checked
 
@@ -304,7 +329,16 @@ def _resume(
     notes = [note for note in run.notes if note.startswith(("portfolio ", NOMINAL_FAILS))]
     notes += notes_before(problem, search)
     return _run_rounds(
-        rounds, ends, run.seed, choice, progress, run.target, prepare, notes, resumed=True
+        rounds,
+        ends,
+        run.seed,
+        choice,
+        progress,
+        run.target,
+        prepare,
+        notes,
+        callbacks,
+        resumed=True,
     )
 
 
@@ -348,6 +382,7 @@ def _run_rounds(
     target: str | None,
     prepare: Callable[[], None],
     notes: Sequence[str] = (),
+    callbacks: Sequence[Callback] = (),
     *,
     warm: bool = False,
     resumed: bool = False,
@@ -374,7 +409,8 @@ def _run_rounds(
             confirm_seconds=rounds.confirm_seconds,
             checked=rounds.checked,
             version=__version__,
-            prior=search.samples_prior,
+            prior=search.samples_prior and not len(rounds.first),
+            first=rounds.first.tolist(),
             folder=place,
             target=target,
             problem=problem,
@@ -406,8 +442,9 @@ def _run_rounds(
             rounds.compile_seconds = ends.seconds
             stopped = "exhausted" if rounds.exhausted else None
             while stopped is None:
-                rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)))
+                rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)), ends.budget)
                 bar.update(len(rounds.table), rounds.found, rounds.best)
+                notify(callbacks, len(rounds.table), rounds.numbers)
                 stopped = ends.reached(rounds)
                 if stopped is None:
                     rounds.save(seldom=True)
@@ -415,6 +452,7 @@ def _run_rounds(
         stopped = "interrupted"
     except Exception as error:
         stopped, cause = format_user_error(error), error
+    rounds.close()
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
     result = replace(result, notes=(*result.notes, *after))

@@ -75,6 +75,7 @@ class Run:
     - `notes`: decisions that were made without the user.
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
+    - `first`: points of the unit cube that were simulated before the search began.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
@@ -103,6 +104,7 @@ class Run:
     confirm: bool = False
     confirm_seconds: float = 0.0
     checked: str = ""
+    first: Sequence[Sequence[float]] = ()
     damage: str = ""
 
     @property
@@ -244,6 +246,27 @@ class Run:
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
         return late("verifai_jax.plotting.scatter", "plot_features")(self, path)
+
+    def report(self, path: str | Path, **options: Any) -> Path:
+        """Write the evidence report on the run: one HTML file, and its claims as JSON beside it.
+
+        **Arguments:**
+
+        - `path`: of the HTML file.
+        - `options`: of `reports.write_report`: `units` and `reasons` of features, `traces`,
+          `studies`, `modes`.
+
+        **Returns:** the path.
+        """
+        return late("verifai_jax.reports", "write_report")(self, path, **options)
+
+    def explore(self) -> Any:
+        """Return a view of the table for a notebook: scatter, parallel coordinates, traces.
+
+        A row under the pointer shows its values; a clicked one is simulated again. It needs
+        anywidget (extra `widget`); without it this is the picture of `plot`.
+        """
+        return late("verifai_jax.reports", "explore")(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.

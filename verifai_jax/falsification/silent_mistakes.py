@@ -13,6 +13,7 @@ from collections.abc import Mapping
 import jax
 import numpy as np
 
+from verifai_jax.core.compilation import compile_soon
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -74,16 +75,22 @@ NOMINAL: Slot[str, tuple[str, ...]] = Slot("nominal")
 
 def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     engine = evaluate.engine
-    if isinstance(engine, HostEngine):
+    if problem.black_box:
         # One of its own: the journal of the run keeps rows of its table only.
-        engine = HostEngine(problem, engine.precision, monitor=engine.monitor)
-    elif not is_quick(problem) or _samples(problem, engine.padded) > MOST_SAMPLES:
-        return ()
+        monitor = engine.monitor if isinstance(engine, HostEngine) else None
+        engine = HostEngine(problem, engine.precision, monitor=monitor)
+    else:
+        assert not isinstance(engine, HostEngine)
+        if not is_quick(problem) or _samples(problem, engine.padded) > MOST_SAMPLES:
+            return ()
     space = problem.space
     nominal = problem.nominal or {}
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
     # One program for it, where each step on its own would compile another.
-    u = np.asarray(jax.jit(lambda: space.flatten(varied))(), np.float32)
+    flatten = compile_soon(
+        "the nominal point", jax.jit(lambda: space.flatten(varied)).lower(), "least"
+    )
+    u = np.asarray(flatten(), np.float32)
     verdict = engine.evaluate(u[None], evaluate.key, 0)
     if not verdict.violated[0]:
         return ()

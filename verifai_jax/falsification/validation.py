@@ -1,11 +1,12 @@
 """Checks of the options of `falsify` and `resume`, before anything compiles."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
+from jaxtyping import Float
 
 from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
@@ -167,6 +168,45 @@ def check_rule(search: Search, rule: StoppingRule | None) -> None:
             f"stop_when needs independent samples of the space, which search {search!r} does not "
             "give; use search='uniform'"
         )
+
+
+Rows: TypeAlias = "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]"
+"""Features: the feature columns of a table, or as a person writes them, one or several."""
+
+
+def points_of(problem: Problem, rows: Rows) -> Float[np.ndarray, "n d"]:
+    """Return given features as points of the unit cube.
+
+    **Raises:** `ValueError` for features that are missing or outside the space.
+    """
+    if hasattr(rows, "columns"):
+        check_names("column", problem.space.columns, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
+        return np.asarray(problem.space.points(rows), np.float32)  # pyright: ignore[reportArgumentType]
+    listed: list[Any] = [rows] if isinstance(rows, Mapping) else list(rows)
+    points = [problem.space.flatten(problem.space.coerce(row)) for row in listed]
+    return np.asarray(points, np.float32).reshape(-1, problem.space.dim)
+
+
+def check_first(
+    problem: Problem, first: "Rows | None", rule: StoppingRule | None
+) -> Float[np.ndarray, "n d"]:
+    """Return the points that are simulated before the search begins; none where none are given.
+
+    **Raises:** `ValueError` for features that are missing, outside the space, or that its
+    constraint refuses, and together with a rule that needs independent samples.
+    """
+    if first is None:
+        return np.zeros((0, problem.space.dim), np.float32)
+    points = points_of(problem, first)
+    if rule is not None and len(points):
+        raise ValueError(
+            "stop_when needs independent samples of the space, which those of first= are not"
+        )
+    if problem.space.constraint is not None and len(points):
+        refused = np.flatnonzero(~np.asarray(problem.space.constraint(points)))
+        if len(refused):
+            raise ValueError(f"the constraint of the space refuses entry {refused[0]} of first=")
+    return points
 
 
 def space_as_data(problem: Problem) -> dict[str, Any] | None:

@@ -70,7 +70,7 @@ def plot_replay(
         axes.plot(clock, values, color=color, linewidth=width)
         axes.set_ylabel(f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
-        bounds = dict(pair for f in formulas.values() for pair in _bounds(f, signal))
+        bounds = dict(pair for f in formulas.values() for pair in signal_bounds(f, signal))
         for predicate, limits in bounds.items():
             _draw_bounds(axes, clock, values, limits, _margin(replay, predicate))
         _name_bounds(axes, {str(b): float(_margin(replay, b).min()) for b in bounds})
@@ -128,7 +128,7 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
-def _bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
+def signal_bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
     """Return predicates that compare this signal, or its absolute value, with a number."""
     bounds = []
     for part in dict.fromkeys(formula.subformulas()):

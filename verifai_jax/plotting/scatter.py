@@ -123,13 +123,14 @@ def distinguishing_features(run: Run) -> list[str]:
     ranks with the robustness.
     """
     table = run.table.all
-    varying = [name for name in run.table.features if len(np.unique(table[name].to_numpy())) > 1]
+    # Items that there are not have no value, which is told apart from all others.
+    varying = [name for name in run.table.features if len(table[[name]].drop_duplicates()) > 1]
     numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe
     if len(failing) and len(safe):
 
         def score(name: str) -> float:
-            return _distance(failing[name].to_numpy(), safe[name].to_numpy())
+            return _distance(failing[name].dropna().to_numpy(), safe[name].dropna().to_numpy())
     else:
         proper = table.loc[table["status"] == "ok"]
         if len(np.unique(proper["rho"].to_numpy())) < 2:
@@ -149,6 +150,8 @@ def _visible_size(size: float, count: int) -> float:
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    if not len(a) or not len(b):
+        return 0.0
     points = np.concatenate([a, b])
     below_a = np.searchsorted(np.sort(a), points, side="right") / len(a)
     below_b = np.searchsorted(np.sort(b), points, side="right") / len(b)
