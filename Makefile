@@ -15,42 +15,31 @@ help:
 	@echo "make bench      measure; see benchmarks/RESULTS.md"
 	@echo "make policy     train the networks again from their seeds (the hopper: 7 minutes)"
 
-# The stamp is renewed when the dependencies change. Debian splits venv's pip into a package of
-# its own; where it is missing, the pip of the system fills the environment.
+# Debian splits venv's pip into a package of its own; where it is missing, the pip of the system
+# fills the environment.
+PIP = if $(BIN)/python -m pip --version >/dev/null 2>&1; \
+  then pip="$(BIN)/python -m pip"; else pip="$(PYTHON) -m pip --python $(BIN)/python"; fi
+INSTALL = $(PIP); $$pip install -q --disable-pip-version-check -c constraints.txt
+
+# The stamp is renewed when the dependencies change.
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("verifai_jax needs Python >= 3.11, this is " + sys.version.split()[0] + "; try make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv .venv 2>/dev/null || $(PYTHON) -m venv --without-pip --clear .venv
-	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[test]'; \
-	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[test]'; \
-	fi
+	@$(INSTALL) -e '.[test]'
 	@touch $@
 
 .venv/lint: .venv/installed
-	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[lint]'; \
-	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[lint]'; \
-	fi
+	@$(INSTALL) -e '.[lint]'
 	@touch $@
 
 # Scenic brings 700 MB and Ray 200, which the quick tests do without; the others are small, and as
 # rarely used.
 .venv/extras: .venv/installed
-	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax,dask,ray]'; \
-	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[scenic,diffrax,dask,ray]'; \
-	fi
+	@$(INSTALL) -e '.[scenic,diffrax,dask,ray]'
 	@touch $@
 
 .venv/docs: .venv/installed
-	@if $(BIN)/python -m pip --version >/dev/null 2>&1; then \
-	  $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'; \
-	else \
-	  $(PYTHON) -m pip --python $(BIN)/python install -q --disable-pip-version-check -c constraints.txt -e '.[docs]'; \
-	fi
+	@$(INSTALL) -e '.[docs]'
 	@touch $@
 
 # Nothing is run and nothing is fetched; a broken link is an error.

@@ -44,9 +44,9 @@ def decaying():
     return problem, vj.falsify(problem, "uniform", 2000).table.all
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def dask():
-    """Three worker processes of one thread each."""
+    """Three worker processes of one thread each, anew for each test, for one may kill a worker."""
     distributed = pytest.importorskip("distributed", reason="needs the extra dask")
     with (
         distributed.LocalCluster(
@@ -115,7 +115,6 @@ def test_dask_gives_the_table_of_one_machine_also_when_a_worker_is_killed(dask, 
     watching.join()
     assert watching.killed
     pd.testing.assert_frame_equal(run.table.all, expected, check_exact=True)
-    dask.wait_for_workers(3, timeout=60)
 
 
 @quiet

@@ -126,7 +126,7 @@ def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
 
 
 def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypatch):
-    monkeypatch.setattr("verifai_jax.evaluation.executor_engine.SECONDS", 0.0)
+    monkeypatch.setattr("verifai_jax.core.executors.SECONDS", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 20, "confirm": False}
     whole = vj.falsify(DECAY, **options)
     with pytest.raises(vj.RunError, match="a process pool does not replace it") as broken:
@@ -137,7 +137,7 @@ def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypat
 
 
 def test_finished_rows_of_a_slow_black_box_are_not_simulated_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("verifai_jax.evaluation.executor_engine.SECONDS", 0.0)
+    monkeypatch.setattr("verifai_jax.core.executors.SECONDS", 0.0)
     monkeypatch.setattr("verifai_jax.evaluation.executor_engine.WORTH_KEEPING", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 70, "confirm": False}
     with pytest.raises(vj.RunError):

@@ -22,7 +22,15 @@ from verifai_jax.certification.simulators import (
     problem_with,
     shared_simulator,
 )
-from verifai_jax.core.executors import Executor, Shipment, check_executor, count_workers, gather
+from verifai_jax.core.executors import (
+    SECONDS,
+    Executor,
+    Shipment,
+    check_executor,
+    count_workers,
+    gather,
+    seconds_per_block,
+)
 from verifai_jax.core.keys import as_key
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -31,11 +39,9 @@ from verifai_jax.problem.problem import Problem
 AT_FIRST = 4
 """Blocks that a worker gets at a time, before it is known how long one takes."""
 MOST = 64
-"""Blocks that a worker gets at a time at most."""
+"""Blocks that a worker gets at a time at most, for a second of work."""
 MOST_KEPT = 64
 """Groups of policies by themselves whose problems a worker keeps."""
-SECONDS = 1.0
-"""Seconds of work that a worker gets at a time, about."""
 
 
 class ExecutorSimulator:
@@ -105,7 +111,9 @@ class ExecutorSimulator:
             for number, message in result["messages"].items():
                 self.messages.setdefault(number, message)
             each = result["seconds"] / max(len(found[place]), 1)
-            self._each = max(1, min(MOST, int(SECONDS / max(each, 1e-9))))
+            wanted = seconds_per_block(self._executor)
+            most = MOST * max(1, int(wanted / SECONDS))
+            self._each = max(1, min(most, int(wanted / max(each, 1e-9))))
 
         gather(futures, ended)
         return [verdicts for place in range(len(parts)) for verdicts in found[place]]

@@ -42,6 +42,13 @@ FOLDER = click.option(
 )
 """Where a command that reads a run writes."""
 
+RUN_FOLDER = click.option(
+    "--folder",
+    type=click.Path(path_type=Path),
+    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
+)
+"""Where a command that makes a run writes it."""
+
 PICTURES = click.option(
     "--pictures/--no-pictures", default=True, show_default=True, help="Draw pictures."
 )
@@ -271,6 +278,13 @@ def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
     for option, value in options.items():
         if value is not None and value != ():
             raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
+
+
+def given_or_next(
+    folder: Path | None, parent: str, name: str
+) -> contextlib.AbstractContextManager[Path]:
+    """Return the folder that was given, or else the next one, as `next_folder` makes it."""
+    return next_folder(parent, name) if folder is None else contextlib.nullcontext(folder)
 
 
 @contextlib.contextmanager

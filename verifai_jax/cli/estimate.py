@@ -21,7 +21,7 @@ from verifai_jax.cli.arguments import (
 )
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import as_plain, command, give_result
+from verifai_jax.cli.json_output import command, show_result
 
 if TYPE_CHECKING:
     from verifai_jax.estimation import Estimate
@@ -65,7 +65,6 @@ def estimate(
     fail_on: Gate | None,
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
-    from verifai_jax.core.text import printable
     from verifai_jax.estimation import estimate as run
 
     if fail_on is not None and fail_on.name == "p0" and p0 is None:
@@ -87,11 +86,7 @@ def estimate(
             max_seconds=max_seconds,
             executor=executor,
         )
-    click.echo(printable(str(found)))
-    give_result(**as_plain(found))
-    if plot is not None:
-        found.plot(plot)
-        click.echo(f"  picture      {plot}")
+    show_result(found, plot)
     if report is not None:
         path = found.report(report, problem=problem, targets=(target,))
         click.echo(f"  report       {path}")

@@ -1,6 +1,5 @@
 """`verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000`."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,9 +14,10 @@ from verifai_jax.cli.arguments import (
     PICTURES,
     PRECISION,
     PROGRESS,
+    RUN_FOLDER,
     SET,
+    given_or_next,
     load_problem,
-    next_folder,
     on_cluster,
     plain_values,
     read_run,
@@ -63,11 +63,7 @@ if TYPE_CHECKING:
     help="Claim only what closer replays confirm  [default: confirm]",
 )
 @click.option("--diverse", is_flag=True, help="Look for failures of different kinds.")
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
-)
+@RUN_FOLDER
 @PICTURES
 @PROGRESS
 @fail_on(
@@ -148,7 +144,7 @@ def falsify(
         problem = load_problem(target, only)
         earlier = None if warm_start is None else read_run(warm_start)
         with (
-            next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place,
+            given_or_next(folder, "runs", problem.name) as place,
             on_cluster(cluster) as executor,
         ):
             run = falsification.falsify(
@@ -171,9 +167,7 @@ def falsify(
                 executor=executor,
             )
     print_run(run, pictures)
-    high = None if run.failure_rate is None else run.failure_rate.high
-    failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(fail_on, high)}
-    check_gate(fail_on, failed)
+    check_run(run, fail_on)
 
 
 def _simulate_shard(
@@ -215,6 +209,13 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
         return Within(within)
     assert decide is not None
     return Decided(decide)
+
+
+def check_run(run: "Run", asked: Gate | None) -> None:
+    """End the command with code 1 where a run does not keep the gate that was asked for."""
+    high = None if run.failure_rate is None else run.failure_rate.high
+    failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(asked, high)}
+    check_gate(asked, failed)
 
 
 def print_run(run: "Run", pictures: bool) -> None:

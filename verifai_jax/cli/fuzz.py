@@ -1,6 +1,5 @@
 """`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: follow what was covered."""
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -13,10 +12,11 @@ from verifai_jax.cli.arguments import (
     PICTURES,
     PRECISION,
     PROGRESS,
+    RUN_FOLDER,
     SEED,
     TARGET,
+    given_or_next,
     load_problem,
-    next_folder,
     split_pairs,
 )
 from verifai_jax.cli.falsify import print_run
@@ -39,11 +39,7 @@ from verifai_jax.cli.json_output import command, give_result
 @click.option("--stop-after", type=int, help="Stop at that many counterexamples.")
 @PRECISION
 @BACKEND
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
-)
+@RUN_FOLDER
 @PICTURES
 @PROGRESS
 @fail_on(counterexample="if a counterexample was found")
@@ -67,7 +63,7 @@ def fuzz(
 
     chosen = {name: _cells(name, text) for name, text in split_pairs("--cells", cells)}
     problem = load_problem(target)
-    with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+    with given_or_next(folder, "runs", problem.name) as place:
         run = run_fuzz(
             problem,
             budget,

@@ -69,6 +69,17 @@ def give_result(**values: object) -> None:
         context.meta.setdefault(_RESULT, {}).update({n: as_plain(v) for n, v in values.items()})
 
 
+def show_result(found: Any, plot: Path | None) -> None:
+    """Print a result, give it as plain data, and draw it into a file where one is named."""
+    from verifai_jax.core.text import printable
+
+    click.echo(printable(str(found)))
+    give_result(**as_plain(found))
+    if plot is not None:
+        found.plot(plot)
+        click.echo(f"  picture      {plot}")
+
+
 def as_plain(value: object) -> Any:
     """Return a value as JSON has it: tables as lists of rows, dataclasses as objects.
 

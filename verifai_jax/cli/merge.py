@@ -1,13 +1,12 @@
 """`verifai-jax merge runs/balance-parts/*`: one run of the parts of a job array."""
 
-from contextlib import nullcontext
 from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PICTURES, PROGRESS, load_problem, next_folder
-from verifai_jax.cli.falsify import print_run
-from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
+from verifai_jax.cli.arguments import PICTURES, PROGRESS, RUN_FOLDER, given_or_next, load_problem
+from verifai_jax.cli.falsify import check_run, print_run
+from verifai_jax.cli.gates import Gate, fail_on
 from verifai_jax.cli.json_output import command
 
 
@@ -22,11 +21,7 @@ from verifai_jax.cli.json_output import command
     help="Problem of the parts  [default: the one they record]",
 )
 @click.option("--only", metavar="NAMES", help="Features that vary, as in the parts.")
-@click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Run folder to write  [default: runs/NAME-1, -2, ...]",
-)
+@RUN_FOLDER
 @PICTURES
 @PROGRESS
 @fail_on(
@@ -55,9 +50,7 @@ def merge(
             remedy="--problem specs/FILE.py:NAME",
         )
     problem = load_problem(target, only)
-    with next_folder("runs", problem.name) if folder is None else nullcontext(folder) as place:
+    with given_or_next(folder, "runs", problem.name) as place:
         run = merge_parts(folders, problem, folder=place, progress=progress)
     print_run(run, pictures)
-    high = None if run.failure_rate is None else run.failure_rate.high
-    failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(fail_on, high)}
-    check_gate(fail_on, failed)
+    check_run(run, fail_on)

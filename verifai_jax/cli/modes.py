@@ -16,7 +16,7 @@ from verifai_jax.cli.arguments import (
     TARGET,
     load_problem,
 )
-from verifai_jax.cli.json_output import as_plain, command, give_result
+from verifai_jax.cli.json_output import command, show_result
 
 
 @command()
@@ -51,7 +51,6 @@ def modes(
     plot: Path | None,
 ) -> None:
     """List the modes of failure of TARGET (FILE.py:NAME), each with its probability."""
-    from verifai_jax.core.text import printable
     from verifai_jax.failure_modes import modes as run
 
     found = run(
@@ -65,8 +64,4 @@ def modes(
         backend=backend,
         max_seconds=max_seconds,
     )
-    click.echo(printable(str(found)))
-    give_result(**as_plain(found))
-    if plot is not None:
-        found.plot(plot)
-        click.echo(f"  picture      {plot}")
+    show_result(found, plot)

@@ -1,7 +1,6 @@
 """`verifai-jax sweep specs/mountain_car.py:safe_training --configurations 32`."""
 
 from collections.abc import Mapping
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +12,8 @@ from verifai_jax.cli.arguments import (
     MAX_SECONDS,
     PICTURES,
     SET,
+    given_or_next,
     is_sweep,
-    next_folder,
     on_cluster,
     plain_values,
     refuse_with_resume,
@@ -135,7 +134,7 @@ def sweep(
     }
     keywords = _keywords(given, options)
     with (
-        next_folder("sweeps", study.name) if folder is None else nullcontext(folder) as place,
+        given_or_next(folder, "sweeps", study.name) as place,
         on_cluster(cluster) as executor,
     ):
         folder = place

@@ -30,6 +30,8 @@ USUAL_WORKERS = 8
 """Workers of an executor that does not say how many it has."""
 KEPT = 8
 """Objects that a worker keeps, with what is compiled for them; the one unused for longest goes."""
+SECONDS = 1.0
+"""Seconds of work that a call takes, about, unless the executor says `seconds_per_block`."""
 LOOK = 0.02
 """Seconds between two looks at futures that nothing can wait for together."""
 SENDS_CODE = ("dask", "distributed", "ray", "submitit", "loky", "joblib", "verifai_jax")
@@ -94,6 +96,11 @@ def count_workers(executor: Executor) -> int:
         return max(1, sum(client.nthreads().values()))
     workers = getattr(executor, "_max_workers", None)
     return workers if isinstance(workers, int) and workers > 0 else USUAL_WORKERS
+
+
+def seconds_per_block(executor: Executor) -> float:
+    """Return the seconds of work that a call is to take, about: more where a call is a job."""
+    return float(getattr(executor, "seconds_per_block", SECONDS))
 
 
 def gather(

@@ -19,7 +19,15 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.devices import describe_processor
-from verifai_jax.core.executors import Executor, Future, check_executor, count_workers, gather, ship
+from verifai_jax.core.executors import (
+    Executor,
+    Future,
+    check_executor,
+    count_workers,
+    gather,
+    seconds_per_block,
+    ship,
+)
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -28,8 +36,6 @@ from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block
 from verifai_jax.problem.problem import Problem
 
-SECONDS = 1.0
-"""Seconds that a block takes, about, unless the executor says `seconds_per_block`."""
 AT_FIRST = 8
 """Units of a compiled block, before it is known how long one takes."""
 TOGETHER = 128
@@ -103,10 +109,10 @@ class ExecutorEngine:
 
     @property
     def block(self) -> int:
-        """Rows of a block that takes about `SECONDS`."""
+        """Rows of a block that takes about `seconds_per_block`."""
         if self._seconds is None:
             return self.unit * (1 if self.problem.black_box else AT_FIRST)
-        wanted = getattr(self.executor, "seconds_per_block", SECONDS)
+        wanted = seconds_per_block(self.executor)
         rows = int(min(wanted / max(self._seconds, 1e-9), MOST_AHEAD // 8))
         return max(self.unit, rows - rows % self.unit)
 
