@@ -1,17 +1,17 @@
 """Sequences of timed events that an automaton allows (`Automaton`)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from verifai_jax.core.checks import check_count, check_positive
-from verifai_jax.core.errors import nearest_names, unknown_name
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.events import ABSENT, Events
 from verifai_jax.features.domain import (
     Domain,
@@ -23,12 +23,8 @@ from verifai_jax.features.domain import (
     dotted,
     indexed,
 )
-from verifai_jax.features.transitions import Graph, Past, Transition, unfold
-
-OPTIONS = ("to", "wait", "weight", "after", "at_most", "guard")
-"""Entries of an event that are no parameters."""
-TAKEN = ("kind", "kinds", "wait", "waits", "time", "times", "length")
-"""Names that a parameter cannot have, because a table or a value uses them."""
+from verifai_jax.features.event_descriptions import describe_event, read_event
+from verifai_jax.features.transitions import Graph, Transition, unfold
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -85,7 +81,7 @@ class Automaton(Domain):
                 'events must be a dictionary {("state", "name"): dict(to=..., wait=...), ...}; '
                 f"got {events!r}"
             )
-        transitions = tuple(_transition(place, event) for place, event in events.items())
+        transitions = tuple(read_event(place, event) for place, event in events.items())
         sources = {each.source for each in transitions}
         if start not in sources:
             raise unknown_name("state to start in", start, sources)
@@ -572,56 +568,9 @@ class Automaton(Domain):
         return taken
 
     def __repr__(self) -> str:
-        events = ", ".join(_shown(each) for each in self.transitions)
+        events = ", ".join(describe_event(each) for each in self.transitions)
         least = f", least={self.least}" if self.least else ""
         return f"Automaton({self.start!r}, {{{events}}}, most={self.most}{least})"
-
-
-def _transition(place: object, event: object) -> Transition:
-    if not (
-        isinstance(place, tuple) and len(place) == 2 and all(isinstance(x, str) for x in place)
-    ):
-        raise ValueError(
-            f'events are named by (state, name), as ("cruise", "brake"); got {place!r}'
-        )
-    if not isinstance(event, Mapping):
-        raise ValueError(
-            f"event {place!r} must be a dictionary, dict(to=..., wait=...); got {event!r}"
-        )
-    source, name = place
-    wait = event.get("wait")
-    if not isinstance(wait, Domain) or wait.lengths or wait.signals:
-        raise ValueError(
-            f"event {place!r} needs wait=, the domain of the seconds since the event before, such "
-            f"as Box(0.5, 4); got {wait!r}"
-        )
-    parameters = {key: value for key, value in event.items() if key not in OPTIONS}
-    for key, value in parameters.items():
-        if not isinstance(value, Domain):
-            raise TypeError(
-                f"{key!r} of event {place!r} must be a domain, such as Box(0, 1); got {value!r}"
-                f"{nearest_names(key, OPTIONS)}"
-            )
-        if key in TAKEN or not key.strip():
-            raise ValueError(f"a parameter of event {place!r} cannot be called {key!r}")
-    guard: Any = event.get("guard")
-    if guard is not None and not callable(guard):
-        raise ValueError(f"guard of event {place!r} must be a function of the past; got {guard!r}")
-    after = event.get("after", ())
-    at_most = event.get("at_most")
-    return Transition(
-        source=source,
-        name=name,
-        to=event.get("to", source),
-        wait=wait,
-        parameters=tuple(parameters.items()),
-        weight=float(
-            check_positive(f"weight of event {place!r}", event.get("weight", 1.0), finite=True)
-        ),
-        after=(after,) if isinstance(after, str) else tuple(after),
-        at_most=None if at_most is None else check_count(f"at_most of event {place!r}", at_most),
-        guard=cast("Guard | None", guard),
-    )
 
 
 def _among(taken: jax.Array, numbers: tuple[int, ...]) -> jax.Array:
@@ -657,23 +606,5 @@ def _own_entries(
     return found
 
 
-def _shown(each: Transition) -> str:
-    parts = [f"'to': {each.to!r}", f"'wait': {each.wait!r}"]
-    if each.weight != 1:
-        parts.append(f"'weight': {each.weight:g}")
-    if each.after:
-        parts.append(f"'after': {list(each.after)!r}")
-    if each.at_most is not None:
-        parts.append(f"'at_most': {each.at_most}")
-    if each.guard is not None:
-        parts.append(f"'guard': {getattr(each.guard, '__qualname__', repr(each.guard))}")
-    parts += [f"{name!r}: {domain!r}" for name, domain in each.parameters]
-    return f"({each.source!r}, {each.name!r}): {{{', '.join(parts)}}}"
-
-
 def _listed(enabled: Sequence[str]) -> str:
     return f"it can be {', '.join(enabled)}" if enabled else "no event is possible"
-
-
-Guard = Callable[[Past], bool]
-"""A function that says whether an event may happen after a past."""
