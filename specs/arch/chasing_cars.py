@@ -1,4 +1,4 @@
-"""CC1 to CC5: how far apart five cars that chase one another stay.
+"""CC1 to CC5 and CCx: how far apart five cars that chase one another stay.
 
     verifai-jax falsify specs/arch/chasing_cars.py:cc3 --search cross_entropy
     verifai-jax falsify specs/arch/chasing_cars.py:cc1_instance1 --search gradient
@@ -7,7 +7,8 @@ Instance 2 (`cc1`, ...): throttle and brake of the first car constant for 5 s, 2
 Instance 1 (`cc1_instance1`, ...): lines between 11 control points of each, 10 s apart; the
 competition leaves their number to the tools.
 
-CC4 is the competition's formula with G[0,5]; some tools' code has G[0,20].
+CC4 is the competition's formula with G[0,5]; some tools' code has G[0,20]. CCx (from 2022 on) is
+the conjunction of four requirements on the gaps, of very different difficulty.
 """
 
 import verifai_jax as vj
@@ -35,6 +36,10 @@ FORMULAS = {
         "always[0, 72] (eventually[0, 8] "
         "((always[0, 5] (y2 - y1 >= 9)) -> (always[5, 20] (y5 - y4 >= 9))))",
         "soon a wide first gap is followed by a wide last one",
+    ),
+    "ccx": (
+        " & ".join(f"(always[0, 50] (y{i + 1} - y{i} >= 7.5))" for i in range(1, 5)),
+        "no gap is less than 7.5 for 50 s",
     ),
 }
 _system = chasing_cars()
@@ -66,3 +71,4 @@ cc2, cc2_instance1 = _instance2("cc2"), _instance1("cc2")
 cc3, cc3_instance1 = _instance2("cc3"), _instance1("cc3")
 cc4, cc4_instance1 = _instance2("cc4"), _instance1("cc4")
 cc5, cc5_instance1 = _instance2("cc5"), _instance1("cc5")
+ccx, ccx_instance1 = _instance2("ccx"), _instance1("ccx")

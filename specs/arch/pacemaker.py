@@ -6,6 +6,9 @@ A negative control. Two paces are 667 to 1200 ms apart, so that there are 8 to 1
 be falsified, and a search should claim nothing. Instance 2 (`pm`): the lower rate limit is constant
 for 2 s. Instance 1 (`pm_instance1`): lines between 11 control points, 1 s apart; the competition
 leaves their number to the tools.
+
+The competition's PM since 2022, on the model `Model1_Scenario1_Correct`. What FalCAuN reported as
+broken in 2023 is another one, PM1, whose formula is on samples.
 """
 
 import verifai_jax as vj

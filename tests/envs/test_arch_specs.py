@@ -31,7 +31,7 @@ PROBLEMS = {
     if isinstance(problem, vj.Problem)
 }
 BOTH = ["at1", "at2", "at51", "at52", "at53", "at54", "at6a", "at6b", "at6c", "at6abc"]
-BOTH += ["cc1", "cc2", "cc3", "cc4", "cc5", "nn", "nn_wide", "pm", "sc"]
+BOTH += ["cc1", "cc2", "cc3", "cc4", "cc5", "ccx", "nn", "nn_wide", "nnx", "pm", "sc"]
 
 
 def test_requirements_are_complete():
