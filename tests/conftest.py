@@ -66,6 +66,7 @@ LONG_FILES = (
     "test_shrink.py",
     "test_brax.py",
     "test_bayes.py",
+    "test_turbo.py",
     "test_quality.py",
     "test_against_oracle.py",
     "test_conformance.py",

@@ -14,7 +14,10 @@ from verifai_jax.search import CrossEntropy, Gradient, Halton, Mutation, Uniform
 from verifai_jax.testing import check_batch_independence, check_search
 
 # A small model says the same of the contract and compiles sooner.
-SMALL = {"bayes": {"capacity": 48, "candidates": 32}}
+SMALL = {
+    "bayes": {"capacity": 48, "candidates": 32},
+    "turbo": {"capacity": 48, "candidates": 32},
+}
 SEARCHES = [named(name, **SMALL.get(name, {})) for name in names()]
 CUBES = {
     "empty": Cube(()),
@@ -33,7 +36,7 @@ REFUSED = {
 
 
 # These take seconds to compile for each cube; what is continuous alone is so in the wide one.
-LARGE = ("Bayes", "Portfolio", "CMAES")
+LARGE = ("Bayes", "Portfolio", "CMAES", "TuRBO")
 EACH = [
     pytest.param(
         search,

@@ -15,6 +15,8 @@ from verifai_jax.testing import check_search
 
 DOMAINS = {"x": vj.Box(0, 1), "y": vj.Box(0, 1), "kind": vj.Categorical("a", "b", "c")}
 
+LARGE = ("bayes", "cmaes", "turbo")
+
 
 def below(features):
     """Below the diagonal, and not of the first kind: a third of the space."""
@@ -42,14 +44,14 @@ def play(proposals, rounds, gradient):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.thorough if name in ("bayes", "cmaes") else ())
+        pytest.param(name, marks=pytest.mark.thorough if name in LARGE else ())
         for name in names()
         if name != "grid"
     ],
 )
 def test_every_search(name):
     # A small model meets the constraint as a large one does.
-    small = {"capacity": 64, "candidates": 64} if name == "bayes" else {}
+    small = {"capacity": 64, "candidates": 64} if name in ("bayes", "turbo") else {}
     search = named(name, **small)
     proposals = Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint)
     points = play(proposals, 8, search.wants_gradient)

@@ -32,6 +32,7 @@ from verifai_jax.search.mutation import Mutation as Mutation
 from verifai_jax.search.point_list import PointList as PointList
 from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
+from verifai_jax.search.turbo import TuRBO as TuRBO
 from verifai_jax.search.uniform import Uniform as Uniform
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "Search",
     "Sobol",
     "Split",
+    "TuRBO",
     "Uniform",
     "distinct",
     "from_json",
@@ -81,6 +83,7 @@ _SEARCHES: dict[str, type[Search]] = {
     "bandit": Bandit,
     "epsilon_greedy": EpsilonGreedy,
     "bayes": Bayes,
+    "turbo": TuRBO,
     "cmaes": CMAES,
     "mutation": Mutation,
     "coverage": Coverage,

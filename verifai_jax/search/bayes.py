@@ -27,12 +27,17 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 from verifai_jax.search.gaussian_process import (
-    GaussianProcess,
     Hyper,
     Posterior,
-    TrainingData,
 )
 from verifai_jax.search.halton import halton_points
+from verifai_jax.search.process_data import (
+    encode,
+    process_of,
+    rows_to_keep,
+    snap,
+    training_data,
+)
 
 MOST_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
@@ -40,7 +45,6 @@ FIT_POINTS, FIT_STEPS = 192, 8
 PARENTS = 8  # best points around which candidates are drawn
 KNOWN = 1 - 1e-5  # correlation with an observation, above which a point need not be simulated
 LARGEST = 1e30  # robustness
-CAP = 30.0  # quartiles of the robustness, above which the process does not tell values apart
 PATIENCE = 80  # points without progress, after which half of them are those of the prior
 
 
@@ -109,7 +113,7 @@ class Bayes(Search[BayesState]):
             verdicts=jnp.int32(0),
             fitted=jnp.int32(0),
             stale=jnp.int32(0),
-            hyper=_process(cube).first(),
+            hyper=process_of(cube).first(),
         )
 
     def ask(
@@ -166,7 +170,7 @@ class Bayes(Search[BayesState]):
         u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
         score = jnp.concatenate([score, state.score])
         luck = jnp.concatenate([luck, state.luck])
-        rows = _rows_to_keep(score, luck, self.capacity)
+        rows = rows_to_keep(score, luck, self.capacity)
         state = state._replace(
             results=state.results + np.uint32(len(usable)),
             u=u[rows],
@@ -182,9 +186,9 @@ class Bayes(Search[BayesState]):
         return state._replace(hyper=hyper, fitted=jnp.where(due, state.verdicts, state.fitted))
 
     def _fit(self, state: BayesState, cube: Cube) -> Hyper:
-        some = _rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
-        data = _training_data(state, cube)
-        return _process(cube).fit(
+        some = rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
+        data = training_data(state.u, state.score, cube)
+        return process_of(cube).fit(
             state.hyper, jax.tree.map(lambda leaf: leaf[some], data), FIT_STEPS
         )
 
@@ -197,7 +201,9 @@ class Bayes(Search[BayesState]):
         anywhere: Float[Array, "half d"],
     ) -> Float[Array, "batch d"]:
         """Return the points that the acquisition function ranks first."""
-        posterior = _process(cube).condition(state.hyper, _training_data(state, cube))
+        posterior = process_of(cube).condition(
+            state.hyper, training_data(state.u, state.score, cube)
+        )
         drawing, placing = jax.random.split(key)
         half, d = anywhere.shape
         if self.acquisition == "thompson":
@@ -233,17 +239,17 @@ def _minima(
     count: int,
 ) -> Float[Array, "parents d"]:
     """Return minima of `count` functions drawn from the posterior, several of each."""
-    process = _process(cube)
+    process = process_of(cube)
     paths = process.paths(posterior, key, count, WAVES)
     parents, children = random.shape[1:3]
     each = parents // count
 
     def basis(u: Float[Array, "m d"]) -> tuple[Array, Array]:
-        basis = process.basis(posterior, paths, _encode(u, cube))
+        basis = process.basis(posterior, paths, encode(u, cube))
         # Simulated already: to be chosen only if there is nothing else.
         return basis, 100.0 * _already_simulated(posterior, basis[:, WAVES:])
 
-    shared = _snap(shared, cube)
+    shared = snap(shared, cube)
     terms, penalty = basis(shared)
     value, place = jax.lax.top_k(-(terms @ paths.weights + penalty[:, None]).T, each)
 
@@ -254,7 +260,7 @@ def _minima(
         best, least = carry
         parent = jnp.repeat(best, children, axis=0)
         u = _near(parent, step[1].reshape(len(parent), -1), cube, step[0])
-        u = _snap(u, cube)
+        u = snap(u, cube)
         terms, penalty = basis(u)
         value = jnp.einsum("pcf,fp->pc", terms.reshape(count, each * children, -1), paths.weights)
         value = (value.reshape(-1) + penalty).reshape(parents, children)
@@ -277,31 +283,31 @@ def _improving(
     batch: int,
 ) -> Float[Array, "batch d"]:
     """Return points with the largest expected improvement, each away from those before it."""
-    process = _process(cube)
+    process = process_of(cube)
     least = jnp.min(posterior.residual, where=posterior.mask, initial=jnp.inf)
 
     def merit(u: Float[Array, "m d"]) -> tuple[Array, Array, Array]:
-        mean, std = process.predict(posterior, _encode(u, cube))
+        mean, std = process.predict(posterior, encode(u, cube))
         z = (least - mean) / std
         density = jnp.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
         gain = std * (z * ndtr(z) + density)
         # Far below zero the difference above is rounding errors; order by the distance instead.
         worth = jnp.where(z > -4, jnp.log(jnp.maximum(gain, 1e-12)), -25 - z**2 / 2)
-        known = _already_simulated(posterior, process.cross(posterior, _encode(u, cube)))
+        known = _already_simulated(posterior, process.cross(posterior, encode(u, cube)))
         return jnp.where(known, worth - 1e6, worth), mean, std
 
-    shared = _snap(shared, cube)
+    shared = snap(shared, cube)
     worth, mean, std = merit(shared)
     _, best = jax.lax.top_k(worth, random.shape[0])
     parent = jnp.repeat(shared[best], random.shape[1], axis=0)
     near = _near(parent, random.reshape(len(parent), -1), cube, jnp.array(CLOSER[0]))
-    near = _snap(near, cube)
+    near = snap(near, cube)
     u = jnp.concatenate([shared, near])
     worth, mean, std = (
         jnp.concatenate([one, two])
         for one, two in zip((worth, mean, std), merit(near), strict=True)
     )
-    x = _encode(u, cube)
+    x = encode(u, cube)
     gradient = jax.grad(lambda x: jnp.sum(process.predict(posterior, x)[0]))(x)
     steepest = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(gradient**2, axis=1))), 1e-3)
     codes = np.array(process.unordered)
@@ -334,57 +340,9 @@ def _near(
     moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
     moved = jnp.clip(parent + step * standard_normal(noise), 0.0, 1.0)
     # An unordered choice has no neighbours: any other.
-    codes = np.array(_process(cube).unordered)
+    codes = np.array(process_of(cube).unordered)
     return jnp.where(moves, jnp.where(codes, noise, moved), parent)
 
 
 def _already_simulated(posterior: Posterior, cross: Float[Array, "m n"]) -> Bool[Array, " m"]:
     return jnp.max(cross, axis=1) > KNOWN * jnp.exp(posterior.hyper.variance)
-
-
-def _process(cube: Cube) -> GaussianProcess:
-    return GaussianProcess(
-        tuple(
-            level > 0 and not ordered
-            for level, ordered in zip(cube.levels, cube.ordered, strict=True)
-        )
-    )
-
-
-def _snap(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
-    """Move discrete coordinates to the middles of their cells."""
-    if len(cube.discrete) == 0:
-        return u
-    return u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
-
-
-def _encode(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
-    """Encode points for the process: middles of ordered cells, numbers of unordered ones."""
-    if len(cube.discrete) == 0:
-        return u
-    cells = cube.cells(u)
-    codes = ~np.array(cube.ordered)[cube.discrete]
-    return u.at[:, cube.discrete].set(jnp.where(codes, cells, cube.centres(cells)))
-
-
-def _training_data(state: BayesState, cube: Cube) -> TrainingData:
-    """Return the process' data: a logarithm of the robustness, with mean 0 and deviation 1."""
-    mask = jnp.isfinite(state.score)
-    score = jnp.where(mask, state.score, 0.0)
-    positive = jnp.sort(jnp.where(score > 0, score, jnp.inf))
-    quartile = positive[jnp.sum(score > 0) // 4]
-    y = score / jnp.where(jnp.isfinite(quartile), quartile, 1.0)
-    y = jnp.log1p(jnp.minimum(y, CAP))
-    count = jnp.maximum(jnp.sum(mask), 1)
-    y = y - jnp.sum(y, where=mask) / count
-    std = jnp.sqrt(jnp.sum(y**2, where=mask) / count)
-    return TrainingData(_encode(state.u, cube), y / jnp.where(std > 0, std, 1.0), mask)
-
-
-def _rows_to_keep(
-    score: Float[Array, " n"], luck: Float[Array, " n"], count: int
-) -> Int[Array, " count"]:
-    """Choose rows to keep: the best half and the luckiest others; present rows come first."""
-    rank = jnp.argsort(jnp.lexsort((luck, score)))
-    best = (rank < count // 2) & jnp.isfinite(score)
-    return jnp.argsort(jnp.where(best, -1.0, jnp.where(jnp.isfinite(score), luck, 2.0)))[:count]

@@ -1,0 +1,253 @@
+"""Trust-region Bayesian optimization (TuRBO): a Gaussian process that is believed only nearby.
+
+Eriksson, Pearce, Gardner, Turner, Poloczek, Scalable global optimization via local Bayesian
+optimization, NeurIPS 2019, with one region at a time. The process knows the points since the last
+restart. Its guesses are used in a box around the best of them, with sides in proportion to the
+length scales; each new point minimizes a function drawn from the posterior over candidates in the
+box, which differ from the best point in about twenty coordinates. The box doubles after a few
+rounds with progress in a row and halves after many without; when it is very small, all begins anew
+at points of the prior.
+
+All failures are equally good: after one the region closes in on it, and the next one is elsewhere.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+
+from verifai_jax.core.checks import check_count, check_positive
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Observations, Search, draw_uniform
+from verifai_jax.search.gaussian_process import Hyper
+from verifai_jax.search.halton import halton_points
+from verifai_jax.search.process_data import (
+    encode,
+    process_of,
+    rows_to_keep,
+    snap,
+    training_data,
+)
+
+MOST_PATHS = 32
+"""Functions drawn for a batch; larger batches take several points from each."""
+WAVES = 256
+"""Random waves of such a function."""
+FIT_POINTS, FIT_STEPS = 192, 12
+"""Points that hyper-parameters are fitted to, and steps of Adam in a fit."""
+COORDINATES = 20
+"""Coordinates in which a candidate differs from the best point, on average."""
+SIDES = (2.0**-7, 0.8, 1.6)
+"""Least, first and greatest side of the box, in cubes; those of the paper."""
+PROGRESS = 1e-3
+"""Share of the least robustness by which a point must be below it, to be progress."""
+KNOWN = 1 - 1e-5
+"""Correlation with an observation, above which a point need not be simulated."""
+LARGEST = 1e30
+"""Robustness above which nothing is told apart."""
+
+
+class TuRBOState(NamedTuple):
+    key: Key[Array, ""]
+    round: UInt32[Array, ""]
+    explored: UInt32[Array, ""]  # points of the prior so far
+    results: UInt32[Array, ""]  # rows, in all
+    u: Float[Array, "capacity d"]  # since the last restart, as all that follows
+    score: Float[Array, " capacity"]  # robustness, 0 for all failures; infinite where no point is
+    luck: Float[Array, " capacity"]
+    verdicts: Int[Array, ""]  # points with a verdict
+    fitted: Int[Array, ""]  # of which the last fit knew
+    side: Float[Array, ""]  # of the box
+    successes: Int[Array, ""]  # rounds with progress in a row
+    failures: Int[Array, ""]  # points without, in a row
+    hyper: Hyper
+
+
+@dataclass(frozen=True)
+class TuRBO(Search[TuRBOState]):
+    """Bayesian optimization in a trust region; for 20 coordinates and more.
+
+    **Arguments:**
+
+    - `capacity`: points that the process knows at most, since the last restart. When there are more
+      it keeps the best half and a random choice of the others.
+    - `candidates`: points of the box among which each drawn function is minimized.
+    - `initial`: points of the prior at every start.
+    - `successes`: rounds with progress in a row, after which the box doubles.
+    - `patience`: points without progress after which it halves, in dimensions of the space; never
+      less than four points.
+
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    most_at_once: ClassVar[int] = 16
+    capacity: int = 512
+    candidates: int = 1024
+    initial: int = 12
+    successes: int = 3
+    patience: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_count("capacity", self.capacity, 16)
+        check_count("candidates", self.candidates, 32)
+        check_count("initial", self.initial, 2)
+        check_count("successes", self.successes)
+        check_positive("patience", self.patience)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> TuRBOState:
+        return TuRBOState(
+            key=key,
+            round=jnp.uint32(0),
+            explored=jnp.uint32(0),
+            results=jnp.uint32(0),
+            u=jnp.full((self.capacity, cube.dim), 0.5, jnp.float32),
+            score=jnp.full(self.capacity, jnp.inf, jnp.float32),
+            luck=jnp.zeros(self.capacity, jnp.float32),
+            verdicts=jnp.int32(0),
+            fitted=jnp.int32(0),
+            side=jnp.float32(SIDES[1]),
+            successes=jnp.int32(0),
+            failures=jnp.int32(0),
+            hyper=process_of(cube).first(),
+        )
+
+    def ask(
+        self, state: TuRBOState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], TuRBOState]:
+        present = jnp.isfinite(state.score)
+        least = jnp.min(state.score, where=present, initial=jnp.inf)
+        spread = jnp.max(state.score, where=present, initial=0.0) > least
+        # Without a difference between points there is nothing to learn from them.
+        informed = spread & (state.verdicts >= self.initial)
+        # Points of the prior are numbered on, whether or not a round uses them.
+        rows = jnp.arange(1, batch + 1, dtype=jnp.uint32)
+        fresh = halton_points(state.explored + rows, cube.dim, state.key)
+        fresh = jax.lax.optimization_barrier(fresh)
+        after = state._replace(
+            round=state.round + 1, explored=state.explored + np.uint32(batch) * ~informed
+        )
+        if cube.dim == 0:
+            return fresh, after
+        key = jax.random.fold_in(state.key, state.round)
+        chosen = jax.lax.cond(
+            informed, lambda: self._in_region(key, state, cube, batch), lambda: fresh
+        )
+        return chosen, after
+
+    def _in_region(
+        self, key: Key[Array, ""], state: TuRBOState, cube: Cube, batch: int
+    ) -> Float[Array, "batch d"]:
+        """Return minima of functions drawn from the posterior, over candidates of the box."""
+        process, d = process_of(cube), cube.dim
+        drawing, placing = jax.random.split(key)
+        posterior = process.condition(state.hyper, training_data(state.u, state.score, cube))
+        best = state.u[jnp.argmin(state.score)]
+        low, high = _box(state, cube, best)
+        count = max(self.candidates, 2 * batch)
+        random = draw_uniform(placing, (count, 2 * d))
+        pick, place = random[:, :d], random[:, d:]
+        moves = pick < min(COORDINATES / d, 1.0)
+        moves |= pick == jnp.min(pick, axis=1, keepdims=True)
+        candidates = snap(jnp.where(moves, low + (high - low) * place, best), cube)
+        paths = process.paths(posterior, drawing, min(batch, MOST_PATHS), WAVES)
+        terms = process.basis(posterior, paths, encode(candidates, cube))
+        known = jnp.max(terms[:, WAVES:], axis=1) > KNOWN * jnp.exp(state.hyper.variance)
+        values = (terms @ paths.weights).T  # [paths, candidates]
+
+        def choose(
+            taken: Bool[Array, " candidates"], row: Int[Array, ""]
+        ) -> tuple[Bool[Array, " candidates"], Int[Array, ""]]:
+            # Simulated already, or in this batch: only if there is nothing else.
+            value = values[row % len(values)] + 100.0 * taken
+            least = jnp.argmin(value)
+            return taken.at[least].set(True), least
+
+        _, chosen = jax.lax.scan(choose, known, jnp.arange(batch))
+        return candidates[chosen]
+
+    def tell(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
+        usable = observations.valid & (observations.rho < jnp.inf)
+        score = jnp.where(usable, jnp.clip(observations.rho, 0.0, LARGEST), jnp.inf)
+        count = jnp.sum(usable, dtype=jnp.int32)
+        number = state.results + jnp.arange(len(score), dtype=jnp.uint32)
+        # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
+        luck = (number * np.uint32(2654435769) >> 8).astype(jnp.float32) / 2**24
+        started = state.verdicts >= self.initial
+        progress = jnp.min(score) < (1 - PROGRESS) * jnp.min(state.score)
+        successes = jnp.where(progress & started, state.successes + 1, 0)
+        failures = jnp.where(progress | ~started, 0, state.failures + count)
+        # A round without a verdict is neither.
+        successes = jnp.where(count > 0, successes, state.successes)
+        wider = successes >= self.successes
+        narrower = failures >= max(4, math.ceil(self.patience * cube.dim))
+        side = jnp.where(wider, jnp.minimum(2 * state.side, SIDES[2]), state.side)
+        side = jnp.where(narrower, side / 2, side)
+        u = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.u])
+        score = jnp.concatenate([score, state.score])
+        luck = jnp.concatenate([luck, state.luck])
+        rows = rows_to_keep(score, luck, self.capacity)
+        state = state._replace(
+            results=state.results + np.uint32(len(usable)),
+            u=u[rows],
+            score=score[rows],
+            luck=luck[rows],
+            verdicts=state.verdicts + count,
+            side=side,
+            successes=jnp.where(wider, 0, successes),
+            failures=jnp.where(narrower, 0, failures),
+        )
+        state = _restarted(state, cube, side < SIDES[0])
+        due = (state.verdicts >= self.initial) & (
+            4 * (state.verdicts - state.fitted) >= state.fitted
+        )
+        hyper = jax.lax.cond(due, lambda: self._fit(state, cube), lambda: state.hyper)
+        return state._replace(hyper=hyper, fitted=jnp.where(due, state.verdicts, state.fitted))
+
+    def warm_start(self, state: TuRBOState, cube: Cube, observations: Observations) -> TuRBOState:
+        # Points that it did not ask for say nothing of the region.
+        told = self.tell(state, cube, observations)
+        return told._replace(
+            side=jnp.float32(SIDES[1]), successes=jnp.int32(0), failures=jnp.int32(0)
+        )
+
+    def _fit(self, state: TuRBOState, cube: Cube) -> Hyper:
+        some = rows_to_keep(state.score, state.luck, min(FIT_POINTS, self.capacity))
+        data = training_data(state.u, state.score, cube)
+        data = jax.tree.map(lambda leaf: leaf[some], data)
+        return process_of(cube).fit(state.hyper, data, FIT_STEPS)
+
+
+def _box(
+    state: TuRBOState, cube: Cube, best: Float[Array, " d"]
+) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """Return the least and the greatest corner of the trust region.
+
+    Sides are in proportion to the length scales, with the volume of a cube. A discrete coordinate
+    can always reach the cells next to its own, and one without an order all of its cells.
+    """
+    lengths = state.hyper.lengths
+    width = state.side * jnp.exp(lengths - jnp.mean(lengths))
+    levels, ordered = np.array(cube.levels), np.array(cube.ordered)
+    cells = np.where(levels > 0, np.where(ordered, 3 / np.maximum(levels, 1), 2.0), 0.0)
+    width = jnp.maximum(width, cells.astype(np.float32))
+    return jnp.clip(best - width / 2, 0.0, 1.0), jnp.clip(best + width / 2, 0.0, 1.0)
+
+
+def _restarted(state: TuRBOState, cube: Cube, restart: Bool[Array, ""]) -> TuRBOState:
+    """Forget the region and its points where it has become too small."""
+    empty = state._replace(
+        score=jnp.full_like(state.score, jnp.inf),
+        verdicts=jnp.int32(0),
+        fitted=jnp.int32(0),
+        side=jnp.float32(SIDES[1]),
+        successes=jnp.int32(0),
+        failures=jnp.int32(0),
+        hyper=process_of(cube).first(),
+    )
+    return jax.tree.map(
+        lambda new, old: new if new is old else jnp.where(restart, new, old), empty, state
+    )
