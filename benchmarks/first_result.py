@@ -13,10 +13,12 @@ those of the pairs.
 | `again` | the same in a new process |
 | `bound` | the same after an edit of a bound of its wind |
 | `budget` | the same after an edit of the budget, 10 000 to 9000 |
+| `small` | a quadrotor of four states at one height, four numbers as features, nothing compiled |
 | `at1` | `verifai-jax falsify` of ARCH AT1 to its first confirmed counterexample, the second time |
 | `falsify` | what `make falsify` runs, with its pictures, the second time |
 | `brax` | ten rows of a Brax hopper, simulated and confirmed by `vj.confirm`, no program on disk |
 | `help`, `import` | `verifai-jax --help`; `import verifai_jax` and `verifai_jax.Box` |
+| `list` | `verifai-jax list`, the problems of `specs/`, the second time |
 """
 
 import argparse
@@ -29,7 +31,9 @@ import tempfile
 import time
 from pathlib import Path
 
-CASES = ("cold", "again", "bound", "budget", "at1", "falsify", "brax", "help", "import")
+CASES = (
+    "cold", "again", "bound", "budget", "small", "at1", "falsify", "brax", "list", "help", "import",
+)  # fmt: skip
 AT1 = "specs/arch/automatic_transmission.py:at1"
 COMMAND = "import sys; from verifai_jax.cli.main import main; sys.argv[0] = 'verifai-jax'; main()"
 
@@ -79,11 +83,44 @@ def quadrotor(gust):
     return vj.Problem("hover", space, system, spec, nominal=nominal)
 
 
-def run_quadrotor(gust, budget):
+def small_quadrotor():
+    """Return the problem of a quadrotor that is held at one height and is to stay in place."""
+    import jax.numpy as jnp
+
+    import verifai_jax as vj
+
+    def motion(time, state, torque, features):
+        drag = 0.3 * (features["wind"] - state["vx"])
+        return {
+            "x": state["vx"],
+            "vx": drag / features["mass"] - 9.81 * jnp.tan(state["theta"]),
+            "theta": state["omega"],
+            "omega": torque / 0.02,
+        }
+
+    def hover(time, state, features):
+        lean = jnp.clip((state["x"] + 1.6 * state["vx"]) / 9.81, -0.5, 0.5)
+        turn = 0.02 * (40.0 * (lean - state["theta"]) - 9.0 * state["omega"])
+        return jnp.clip(turn, -0.2, 0.2)
+
+    def start(features, key):
+        return {"x": features["x0"], "vx": 0.0, "theta": features["theta0"], "omega": 0.0}
+
+    space = {
+        "x0": vj.Box(-1.0, 1.0),
+        "theta0": vj.Box(-0.6, 0.6),
+        "mass": vj.Box(0.4, 0.8),
+        "wind": vj.Box(-3.0, 3.0),
+    }
+    system = vj.ode(motion, start, controller=hover, dt=0.01, duration=5.0)
+    return vj.Problem("hover", space, system, "always abs(x) < 2.2")
+
+
+def run_quadrotor(problem, budget):
     """Falsify it and print what came of it."""
     import verifai_jax as vj
 
-    run = vj.falsify(quadrotor(gust), budget=budget, progress=False)
+    run = vj.falsify(problem, budget=budget, progress=False)
     least = run.table.all["rho"].min()
     print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
 
@@ -129,8 +166,10 @@ def command_of(case, place):
     if case in ("cold", "again", "bound", "budget"):
         gust, budget = 2.1 if case == "bound" else 2.0, 9000 if case == "budget" else 10_000
         return [python, __file__, "--quadrotor", str(gust), str(budget)]
-    if case == "brax":
-        return [python, __file__, "--brax"]
+    if case in ("brax", "small"):
+        return [python, __file__, f"--{case}"]
+    if case == "list":
+        return [python, "-c", COMMAND, "list"]
     if case == "import":
         return [python, "-c", "import verifai_jax; verifai_jax.Box"]
     if case == "help":
@@ -146,7 +185,7 @@ def one(case, checkout, caches):
     """Run a case once and return its processor seconds, its seconds and what it printed."""
     # One place for all: JAX knows a compiled program by the folder of its cache, too.
     cache = caches / checkout.name / "compiled"
-    if case not in ("cold", "brax", "help", "import"):
+    if case not in ("cold", "small", "brax", "help", "import"):
         fill(case, checkout, caches, cache)
     else:
         shutil.rmtree(cache, ignore_errors=True)
@@ -184,12 +223,16 @@ def main():
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--quadrotor", nargs=2, type=float, help=argparse.SUPPRESS)
     parser.add_argument("--brax", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--small", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.brax:
         run_brax()
         return
+    if options.small:
+        run_quadrotor(small_quadrotor(), 10_000)
+        return
     if options.quadrotor:
-        run_quadrotor(options.quadrotor[0], int(options.quadrotor[1]))
+        run_quadrotor(quadrotor(options.quadrotor[0]), int(options.quadrotor[1]))
         return
     now = Path(__file__).resolve().parents[1]
     checkouts = [now] if options.before is None else [options.before.resolve(), now]
@@ -200,7 +243,7 @@ def main():
             for pair in range(options.pairs):
                 for checkout in checkouts if pair % 2 else checkouts[::-1]:
                     rows[checkout].append(one(case, checkout, Path(caches)))
-            if case in ("cold", "again", "bound", "budget"):
+            if case in ("cold", "again", "bound", "budget", "small"):
                 assert len({said for runs in rows.values() for _, _, said in runs}) == 1, rows
             shown = [
                 f"{statistics.median(r[0] for r in runs):.2f} "

@@ -208,7 +208,7 @@ def _preferring(policy: Policy) -> Layers:
         layers[0] = (weight, bias - mean @ weight)
     weight, bias = layers[-1]
     layers[-1] = (weight[:, 1:] - weight[:, :1], bias[1:] - bias[:1])
-    return tuple((jnp.asarray(weight), jnp.asarray(bias)) for weight, bias in layers)
+    return tuple((jax.device_put(weight), jax.device_put(bias)) for weight, bias in layers)
 
 
 def _sign(preference: Scalar) -> Scalar:

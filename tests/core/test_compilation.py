@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from verifai_jax.core import compilation
-from verifai_jax.core.compilation import compile_soon, describe_compilation, tracing
+from verifai_jax.core.compilation import (
+    compile_soon,
+    describe_compilation,
+    tracing,
+    while_compiling,
+)
 from verifai_jax.core.keys import run_keys
 
 
@@ -40,6 +45,21 @@ def test_what_is_compiled_is_said_while_it_is():
     slow.go.set()
     assert compiling(1) == 2
     assert describe_compilation() == ""
+
+
+def test_work_is_done_once_while_this_process_waits_for_a_program():
+    done = []
+    while_compiling(lambda: done.append(1))
+    quick = compile_soon("one", jax.jit(lambda x: x + 1).lower(jnp.float32(0)))
+    quick._future.result()
+    assert quick(jnp.float32(1)) == 2
+    assert done == []  # There was nothing to wait for.
+    slow = Slow()
+    compiling = compile_soon("other", slow)
+    while_compiling(slow.go.set)
+    assert compiling(1) == 2
+    assert done == [1]
+    assert not compilation._meanwhile
 
 
 def test_less_effort_gives_the_same_numbers_and_unknown_options_are_left_out(monkeypatch):

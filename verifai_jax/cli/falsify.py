@@ -97,7 +97,12 @@ def falsify(
 ) -> None:
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
+    from verifai_jax.core import figure
+    from verifai_jax.core.compilation import while_compiling
     from verifai_jax.search import named
+
+    if pictures:
+        while_compiling(figure.load)
 
     stop_when = _stopping_rule(within, decide)
     if shard is not None:

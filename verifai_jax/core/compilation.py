@@ -3,6 +3,7 @@
     ask = compile_soon("the search", jax.jit(f).lower(state))   # at once, in the background
     ask(state)                                          # waits until it is compiled, and calls it
     describe_compilation()                              # "compiling the search, 3 s"
+    while_compiling(import_matplotlib)                  # at the first wait, or never
 
 What a program computes does not depend on when it was compiled, so neither do results.
 
@@ -13,7 +14,7 @@ with less of that (`Effort`): it is compiled in a half to a fifth of the time.
 import gc
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -39,6 +40,9 @@ _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
 
+_meanwhile: list[Callable[[], object]] = []
+"""What is done at the next wait for a program."""
+
 
 class Compilation:
     """A program that is being compiled, or is already; calling it waits until it is.
@@ -59,6 +63,8 @@ class Compilation:
         **Raises:** what the compiler raised.
         """
         if self._program is None:
+            while _meanwhile and not self._future.done():
+                _meanwhile.pop(0)()
             try:
                 self._program = self._future.result()
             except CancelledError:
@@ -87,6 +93,16 @@ def compile_soon(name: str, lowered: jax.stages.Lowered, effort: Effort = "most"
     """
     enable_compile_cache()
     return Compilation(name, lowered, effort)
+
+
+def while_compiling(work: Callable[[], object]) -> None:
+    """Have work done once where this process first waits for a program; never where it does not.
+
+    **Arguments:**
+
+    - `work`: what will be needed anyway, such as an import; nothing that results depend on.
+    """
+    _meanwhile.append(work)
 
 
 @contextmanager

@@ -24,6 +24,11 @@ def new_figure(**options: Any) -> Figure:
     return _figure_class()(**options)
 
 
+def load() -> None:
+    """Import what figures are drawn with, which takes half a second."""
+    _figure_class()
+
+
 @functools.cache
 def _figure_class() -> Any:
     # Made on demand: importing matplotlib takes longer than importing everything else here.

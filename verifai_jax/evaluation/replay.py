@@ -146,12 +146,13 @@ def replay(
             row=number,
             features=features,
             trace=trace.trim(),
-            rho={name: float(value) for name, value in zip(problem.formulas, rho, strict=True)},
+            rho=dict(zip(problem.formulas, np.asarray(rho).tolist(), strict=True)),
             status=Status(int(status)),
             key=key,
         )
 
 
 def _cast(leaf: ArrayLike, precision: str) -> Array:
-    leaf = jnp.asarray(leaf)
-    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
+    if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact):
+        return jax.device_put(np.asarray(leaf).astype(precision))
+    return jnp.asarray(leaf)

@@ -120,8 +120,11 @@ class Automaton(Domain):
             )
             if getattr(form, "shape", None) != () or not jnp.issubdtype(form.dtype, jnp.number):
                 raise ValueError(f"wait of {each.label} must be of one number; got {each.wait!r}")
-            least = float(each.wait.from_unit(jnp.zeros(each.wait.size)))
-            if least < 0:
+        waits = [each.wait for each in self.transitions]
+        # One program for all, and not one for each operation.
+        shortest = jax.jit(lambda: [wait.from_unit(jnp.zeros(wait.size)) for wait in waits])()
+        for each, least in zip(self.transitions, shortest, strict=True):
+            if float(least) < 0:
                 raise ValueError(
                     f"wait of {each.label} is in seconds and must not be negative; got "
                     f"{each.wait!r}"

@@ -22,6 +22,8 @@ from verifai_jax.features.domain import (
     as_numbers,
     as_real,
     indexed,
+    on_device,
+    real_numbers,
     short,
 )
 from verifai_jax.features.ends import (
@@ -127,7 +129,7 @@ class Box(Domain):
         return jnp.ravel(u)
 
     def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
-        return self.rounded(as_real(value))
+        return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:
         """Return real numbers, those that their precision has rounded over an end at that end."""
@@ -159,7 +161,7 @@ class Box(Domain):
     def from_columns(self, row: Row, name: str) -> Float[Array, "*entries"]:
         entries = [as_numbers(row[column], column).item() for column in self.columns(name)]
         numbers = np.asarray(entries[0] if np.ndim(self.low) == 0 else entries)
-        return jnp.asarray(self.rounded(numbers.astype(jnp.result_type(float))))
+        return on_device(self.rounded(numbers.astype(jnp.result_type(float))))
 
     def _limits(self, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return low, high, middle and width in this precision."""

@@ -24,6 +24,7 @@ from verifai_jax.features.domain import (
     cell,
     centre,
     format_choices,
+    on_device,
     short,
 )
 
@@ -165,7 +166,7 @@ class Categorical(Domain):
             return value
         values = np.asarray(value, dtype=object)
         places = [self._place(choice) for choice in values.ravel()]
-        return jnp.asarray(np.array(places, np.int32).reshape(values.shape))
+        return on_device(np.array(places, np.int32).reshape(values.shape))
 
     def check(self, value: object, name: str) -> None:
         known = f"one of {format_choices(self.choices)}"
@@ -199,7 +200,7 @@ class Categorical(Domain):
         if not self.numeric:
             places = {text: i for i, text in enumerate(self._shown)}
             if str(shown) in places:
-                return jnp.asarray(places[str(shown)], jnp.int32)
+                return on_device(np.asarray(places[str(shown)], np.int32))
         else:
             place = self._nearest(shown) if isinstance(shown, bool | int | float) else None
             if place is not None:

@@ -29,6 +29,8 @@ from verifai_jax.features.domain import (
     as_number,
     as_numbers,
     as_real,
+    on_device,
+    real_numbers,
     short,
 )
 from verifai_jax.features.ends import (
@@ -85,7 +87,7 @@ class Continuous(Domain):
         return u[None]
 
     def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
-        return self.rounded(as_real(value))
+        return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:
         """Return real numbers, those that their precision has rounded over an end at that end."""
@@ -126,7 +128,7 @@ class Continuous(Domain):
 
     def from_columns(self, row: Row, name: str) -> Float[Array, ""]:
         number = as_numbers(row[name], name).astype(jnp.result_type(float))
-        return jnp.asarray(self.rounded(number))
+        return on_device(self.rounded(number))
 
 
 @dataclass(frozen=True, repr=False)

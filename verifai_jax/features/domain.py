@@ -20,6 +20,7 @@ from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 MOST_LEVELS = 2**20
@@ -208,9 +209,30 @@ def centre(index: Numbers, count: int) -> Float[Array, "1"]:
 
 def as_real(value: Numbers) -> Float[Array, "*shape"]:
     """Convert to an array of real numbers; integers and lists get JAX's default precision."""
+    return on_device(real_numbers(value))
+
+
+def real_numbers(value: Numbers) -> Any:
+    """Convert as `as_real`, to an array of NumPy where the value is not of JAX."""
+    plain = float | int | np.ndarray | np.number
+    several = isinstance(value, list | tuple) and all(isinstance(each, plain) for each in value)
+    if several or isinstance(value, plain):
+        # Of an array of JAX each first operation of a kind compiles a program.
+        array = np.asarray(value)
+        if array.dtype.kind in "fiub":
+            real = array.dtype.kind == "f" and not isinstance(value, float)
+            kind = dtypes.canonicalize_dtype(array.dtype) if real else jnp.result_type(float)
+            with np.errstate(over="ignore"):
+                return array.astype(kind)
     array = jnp.asarray(value)
     real = jnp.issubdtype(array.dtype, jnp.floating) and not array.weak_type
     return array if real else array.astype(jnp.result_type(float))
+
+
+def on_device(numbers: Array | np.ndarray) -> Array:
+    """Return numbers as an array of JAX; those of NumPy must not change any more."""
+    # Not `jnp.asarray`, which compiles a program for each shape.
+    return numbers if isinstance(numbers, jax.Array) else jax.device_put(numbers)
 
 
 def as_number(value: object, what: str) -> float:

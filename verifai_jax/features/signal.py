@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
@@ -25,7 +26,7 @@ from verifai_jax.core.waveform import (
 )
 from verifai_jax.features.box import Box
 from verifai_jax.features.distributions import Continuous
-from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, short
+from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, on_device, short
 
 DEFAULT_KNOTS = 16
 
@@ -124,7 +125,11 @@ class Signal(Domain):
             return self.waveform(self.domain.coerce(value.knots))
         knots = self.domain.coerce(value)
         if knots.ndim == np.ndim(getattr(self.domain, "low", 0.0)):
-            knots = jnp.broadcast_to(knots, (self.knots, *knots.shape))
+            shape = (self.knots, *knots.shape)
+            if isinstance(knots, Tracer):
+                knots = jnp.broadcast_to(knots, shape)
+            else:
+                knots = on_device(np.array(np.broadcast_to(np.asarray(knots), shape)))
         return self.waveform(knots)
 
     def check(self, value: object, name: str) -> None:
@@ -179,7 +184,9 @@ class Signal(Domain):
 
     def from_columns(self, row: Row, name: str) -> Waveform:
         knots = [self.domain.from_columns(row, knot) for knot in indexed(name, self.knots)]
-        return self.waveform(jnp.stack(knots))
+        if any(isinstance(knot, Tracer) for knot in knots):
+            return self.waveform(jnp.stack(knots))
+        return self.waveform(on_device(np.stack([np.asarray(knot) for knot in knots])))
 
     def refined(self, factor: int) -> "Signal":
         """Return the signal with more control points, among which are all of the coarse one's.

@@ -83,9 +83,13 @@ def satisfied(
     **Raises:** as `robustness`, and `ValueError` for a NaN, naming signal and time.
     """
     verdict = robustness(formula, trace, boolean, end, compat)
-    if not isinstance(verdict, Tracer) and bool(jnp.any(jnp.isnan(verdict))):
+    if isinstance(verdict, Tracer):
+        return verdict > 0
+    # In NumPy, where nothing compiles.
+    numbers = np.asarray(verdict)
+    if np.any(np.isnan(numbers)):
         raise ValueError(f"no verdict: {_first_nan(as_formula(formula), trace)}")
-    return verdict > 0
+    return jax.device_put(numbers > 0)
 
 
 def _first_nan(formula: Formula, trace: Trace) -> str:

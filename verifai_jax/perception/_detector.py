@@ -202,7 +202,7 @@ def load_detector(path: str | Path) -> Detector:
         about = json.loads(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise DetectorFileError(f"{path} has the format {about['format']!r}, not {FORMAT!r}")
-        centre, scale = jnp.asarray(arrays["values"], jnp.float32)
+        centre, scale = map(jax.device_put, np.asarray(arrays["values"], np.float32))
         return Detector(
             _layers(arrays, "convolution"),
             _layers(arrays, "dense"),
@@ -225,8 +225,8 @@ def _layers(arrays: dict[str, np.ndarray], name: str) -> tuple[Layer, ...]:
     count = sum(key.startswith(name) and key.endswith("_bias") for key in arrays)
     return tuple(
         (
-            jnp.asarray(arrays[f"{name}{number}_weights"], jnp.float32),
-            jnp.asarray(arrays[f"{name}{number}_bias"], jnp.float32),
+            jax.device_put(np.asarray(arrays[f"{name}{number}_weights"], np.float32)),
+            jax.device_put(np.asarray(arrays[f"{name}{number}_bias"], np.float32)),
         )
         for number in range(count)
     )

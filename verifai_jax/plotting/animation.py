@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -79,7 +80,10 @@ def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
     )
     # A sample that is longer than a frame is drawn once, and shown as long.
     samples, repeated = np.unique(samples, return_counts=True)
-    frames = [_frame(replay, draw, int(sample)) for sample in samples]
+    frames, layout = [], None
+    for sample in samples.tolist():
+        frame, layout = _frame(replay, draw, sample, layout)
+        frames.append(frame)
     # The last instant is the one that matters: it stays for a while.
     shown = [1000 / FRAMES_PER_SECOND * int(times) for times in repeated]
     shown[-1] += 1500 - 1000 / FRAMES_PER_SECOND
@@ -89,13 +93,35 @@ def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
     return file.getvalue()
 
 
+class _Layout(NamedTuple):
+    """Where the axes are in a frame, and what decides on it."""
+
+    place: Any
+    reasons: tuple[Any, ...]
+
+
 def _frame(
-    replay: Replay, draw: Callable[..., None], sample: int
-) -> UInt8[np.ndarray, "height width 3"]:
+    replay: Replay, draw: Callable[..., None], sample: int, before: _Layout | None
+) -> tuple[UInt8[np.ndarray, "height width 3"], _Layout | None]:
+    """Return the picture of one sample, and its layout.
+
+    - `before`: the layout of the frame before, which stays where nothing has changed that decides
+      on it: to lay out a frame takes longer than to draw it.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure = new_figure(figsize=(5.2, 3.0))
-    draw(figure.subplots(), replay.trace, sample, replay.features)
+    axes = figure.subplots()
+    draw(axes, replay.trace, sample, replay.features)
+    texts = (axes.get_title(), axes.get_xlabel(), axes.get_ylabel())
+    lines = tuple(text.count("\n") if text else -1 for text in texts)
+    reasons = (axes.get_xlim(), axes.get_ylim(), axes.get_aspect(), lines)
+    # With a colour bar or a second panel beside them, each frame is laid out.
+    alone = figure.axes == [axes] and not figure.texts and axes.get_legend() is None
+    if alone and before is not None and before.reasons == reasons:
+        figure.set_layout_engine("none")
+        axes.set_position(before.place)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    layout = _Layout(axes.get_position(original=True), reasons) if alone else None
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy(), layout

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -17,6 +16,7 @@ from verifai_jax.mtl import Formula, explain, robustness_signal
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Predicate
+from verifai_jax.mtl.setting import seconds
 from verifai_jax.plotting.style import BOUND, FAILING, INPUT, SAFE, new_figure, show_or_save, tidy
 
 MOST_PANELS = 6
@@ -57,7 +57,7 @@ def plot_replay(
             raise ValueError("signals names what is drawn; got none")
     shown = list(signals or ordered[: max(MOST_PANELS, len(monitored))])
     name = replay.worst
-    clock = np.asarray(trace.clock())
+    clock = seconds(trace)
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
 
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
@@ -92,17 +92,20 @@ def plot_replay(
 
 def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     """Return the features that are functions of time, at the samples of the trace."""
-    clock = np.asarray(replay.trace.clock())
-    found = {}
-    for keys, value in jax.tree_util.tree_flatten_with_path(replay.features, is_leaf=is_waveform)[
-        0
-    ]:
+    clock = seconds(replay.trace)
+    waveforms = {}
+    leaves = jax.tree_util.tree_flatten_with_path(replay.features, is_leaf=is_waveform)[0]
+    for keys, value in leaves:
         if is_waveform(value):
-            name = jax.tree_util.keystr(keys, simple=True, separator=".")
             known = value.duration is not None
-            waveform = value if known else value.over(max(float(clock[-1]), 1e-9))
-            found[name] = np.asarray(jax.vmap(waveform)(jnp.asarray(clock)))
-    return found
+            name = jax.tree_util.keystr(keys, simple=True, separator=".")
+            waveforms[name] = value if known else value.over(max(float(clock[-1]), 1e-9))
+    if not waveforms:
+        return {}
+    # In one program: each operation alone would compile one.
+    at_all = jax.jit(lambda waveforms, clock: {n: jax.vmap(w)(clock) for n, w in waveforms.items()})
+    found = at_all(waveforms, clock)
+    return {name: np.asarray(found[name]) for name in waveforms}
 
 
 def _left_out(names: list[str]) -> str:
@@ -124,7 +127,7 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     named = why.predicate.signals()
     if not named:
         return None
-    clock = np.asarray(trace.clock())
+    clock = seconds(trace)
     return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
@@ -201,7 +204,7 @@ def _name_bounds(axes: Axes, margins: dict[str, float]) -> None:
 
 
 def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
-    time = float(np.asarray(trace.clock())[sample])
+    time = float(seconds(trace)[sample])
     value = np.asarray(trace.signals[signal])[sample]
     if np.ndim(value):
         value = value[int(np.argmax(np.abs(value)))]

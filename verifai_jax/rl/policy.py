@@ -204,7 +204,7 @@ def load_policy(path: str | Path) -> Policy:
         kind = _KINDS[action.pop("kind")](**action)
         count = sum(name.startswith("weight") for name in arrays)
         layers = tuple(
-            (jnp.asarray(arrays[f"weight{i}"]), jnp.asarray(arrays[f"bias{i}"]))
+            (jax.device_put(arrays[f"weight{i}"]), jax.device_put(arrays[f"bias{i}"]))
             for i in range(count)
         )
         shapes = [weight.shape for weight, _ in layers]
@@ -212,7 +212,7 @@ def load_policy(path: str | Path) -> Policy:
         if not layers or not chained:
             raise KeyError(f"layers of shapes {shapes}")
         optional = {
-            name: jnp.asarray(arrays[name]) if name in arrays else None
+            name: jax.device_put(arrays[name]) if name in arrays else None
             for name in ("mean", "scale", "log_std")
         }
         # Files of before these two were fields have tanh networks that are not squashed.

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.systems.mujoco.model import MjModel, MjxModel, Model, mjx_module
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
@@ -86,8 +87,10 @@ def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
         )
     names = ("geom_size", "geom_pos", "geom_quat", "body_mass", "body_inertia", "body_ipos")
     with jax.enable_x64():
-        leaves = {n: jnp.asarray(getattr(compiled, n)) for n in (*names, "body_iquat")}
+        enable_compile_cache()
+        leaves = {n: jax.device_put(getattr(compiled, n)) for n in (*names, "body_iquat")}
         again = jax.jit(lambda leaves: recompute_inertia(compiled, (solid,), leaves))(leaves)
+        again = {name: np.asarray(again[name]) for name in ("body_mass", "body_inertia")}
     same = np.allclose(again["body_mass"], compiled.body_mass, rtol=1e-6) and np.allclose(
         np.sort(again["body_inertia"][solid.body]),
         np.sort(compiled.body_inertia[solid.body]),
