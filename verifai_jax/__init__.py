@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from verifai_jax.mtl import signal as signal
     from verifai_jax.mtl import until as until
     from verifai_jax.problem import Behaviour as Behaviour
+    from verifai_jax.problem import Guide as Guide
     from verifai_jax.problem import Problem as Problem
     from verifai_jax.problem import ProblemError as ProblemError
     from verifai_jax.problem import Rulebook as Rulebook
@@ -206,6 +207,7 @@ _NAMES = {
     ),
     "problem": (
         "Behaviour",
+        "Guide",
         "Problem",
         "ProblemError",
         "Rulebook",

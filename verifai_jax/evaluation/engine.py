@@ -27,9 +27,11 @@ from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
+from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.streaming_monitor import streaming_monitor
 from verifai_jax.evaluation.verdicts import (
     Verdicts,
@@ -73,6 +75,7 @@ class Engine:
       takes less time; with `own_keys` only.
     - `lanes`: rows that a device works on together; as the system says when left out.
     - `effort`: how much XLA does to make its programs fast.
+    - `steering`: what it computes for a search beside the robustness.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
     """
@@ -90,7 +93,9 @@ class Engine:
         alone: bool = False,
         lanes: int | None = None,
         effort: Effort = "most",
+        steering: Steering = NOTHING,
     ) -> None:
+        self.steering = steering
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
         self.goals: Goals | None = goals_of(problem.formulas.values()) if clauses else None
@@ -172,10 +177,13 @@ class Engine:
         if self.gradient:
             return self._gradient(simulated, coordinates, key, temperature)
         features, system = simulated(coordinates)
-        if self.problem.behaviour is not None and self.inputs.streaming:
+        traced = self.problem.behaviour is not None and self.inputs.streaming
+        if traced or self.steering.size:
             trace = system(features, key)
             rho, status = trace_verdict(self.problem, trace)
-            more = {"marks": trace_marks(self.problem, trace)}
+            more = self._steering(trace, features)
+            if traced:
+                more |= {"marks": trace_marks(self.problem, trace)}
             return Row(rho.astype(coordinates.dtype), status, features, more)
         monitor = streaming_monitor(self.problem) if self.inputs.streaming else None
         if monitor is not None:
@@ -353,11 +361,26 @@ class Engine:
                 for formula in self.problem.formulas.values()
             ]
             verdict = trace_verdict(self.problem, trace)
-            return jnp.min(jnp.stack(smoothed)), (*verdict, features)
+            least = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
+            return least, (*verdict, features, self._steering(trace, features))
 
-        gradient, (rho, status, features) = self._derivative(objective, coordinates)
+        gradient, (rho, status, features, more) = self._derivative(objective, coordinates)
         dtype = coordinates.dtype
-        return Row(rho.astype(dtype), status, features, {"gradient": gradient.astype(dtype)})
+        more |= {"gradient": gradient.astype(dtype)}
+        return Row(rho.astype(dtype), status, features, more)
+
+    def _steering(self, trace: Trace, features: PyTree) -> dict[str, Array]:
+        if not self.steering.size:
+            return {}
+        return {"steering": self.steering.values(self.problem, trace, features)}
+
+    def _guided(self, values: Array, trace: Trace, features: PyTree) -> Array:
+        """Return robustness, or clauses, with the guide's share, for their derivatives."""
+        guide = self.problem.guide
+        if not self.steering.guide or guide is None:
+            return values
+        share = guide.share(guide.value(trace, features, self.problem.end))
+        return (1 - guide.weight) * values + guide.weight * share.astype(values.dtype)
 
     def _clauses(
         self,
@@ -376,21 +399,27 @@ class Engine:
             values = goals.values(trace, hard, self.problem.end)
             nearest = jnp.argmin(jnp.max(values, axis=1))
             verdict = trace_verdict(self.problem, trace)
-            results = (*verdict, features, values[nearest])
+            # A goal that is broken is a failure, whatever the guide says.
+            broken = jnp.max(values[nearest]) < 0
+            told = self._guided(values[nearest], trace, features)
+            # And clauses that there are not stay absent.
+            told = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], told)
+            results = (*verdict, features, told, self._steering(trace, features))
             if not self.gradient:
                 return values[nearest], results
             semantics = smooth(temperature.astype(dtype))
-            return goals.values(trace, semantics, self.problem.end)[nearest], results
+            smoothed = goals.values(trace, semantics, self.problem.end)[nearest]
+            return self._guided(smoothed, trace, features), results
 
         if self.gradient:
             sweep = self._derivative.of_several(objective, coordinates)
-            derivatives, (rho, status, features, values) = sweep
+            derivatives, (rho, status, features, values, more) = sweep
         else:
-            _, (rho, status, features, values) = objective(coordinates)
+            _, (rho, status, features, values, more) = objective(coordinates)
             derivatives = None
         missing = CLAUSES - len(values)
         padded = jnp.pad(values, (0, missing), constant_values=ABSENT)
-        more = {"clauses": padded.astype(dtype)}
+        more |= {"clauses": padded.astype(dtype)}
         if derivatives is not None:
             more["clause_gradients"] = jnp.pad(derivatives, ((0, missing), (0, 0))).astype(dtype)
         return Row(rho.astype(dtype), status, features, more)
@@ -439,6 +468,7 @@ class EngineMode(NamedTuple):
     gradient: bool
     precision: str
     clauses: bool
+    steering: Steering
 
 
 ENGINES: Slot[EngineMode, Engine] = Slot("engines")
@@ -451,11 +481,14 @@ def engine_for(
     gradient: bool = False,
     precision: str = "float32",
     clauses: bool = False,
+    steering: Steering = NOTHING,
 ) -> Engine:
     """Return the engine of this (problem, batch, mode), made once and kept with the problem."""
-    mode = EngineMode(batch, gradient, precision, clauses)
+    mode = EngineMode(batch, gradient, precision, clauses, steering)
     return problem.programs.get(
         ENGINES,
         mode,
-        lambda: Engine(problem, batch, gradient, precision=precision, clauses=clauses),
+        lambda: Engine(
+            problem, batch, gradient, precision=precision, clauses=clauses, steering=steering
+        ),
     )

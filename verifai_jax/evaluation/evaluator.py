@@ -19,6 +19,7 @@ from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
@@ -37,6 +38,7 @@ class Evaluator:
     - `journal`: of rows in flight, for a problem on the host.
     - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
       left out.
+    - `steering`: what is computed for a search beside the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     """
 
@@ -52,18 +54,19 @@ class Evaluator:
         journal: Journal | None = None,
         executor: Executor | None = None,
         target: str | None = None,
+        steering: Steering = NOTHING,
     ) -> None:
         self.problem, self.batch = problem, batch
         self.engine: Engine | HostEngine | ExecutorEngine
         if executor is not None:
             self.engine = ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
-                precision=precision, journal=journal, target=target,
+                precision=precision, journal=journal, target=target, steering=steering,
             )  # fmt: skip
         elif problem.black_box:
-            self.engine = HostEngine(problem, precision, journal)
+            self.engine = HostEngine(problem, precision, journal, steering=steering)
         else:
-            self.engine = engine_for(problem, batch, gradient, precision, clauses)
+            self.engine = engine_for(problem, batch, gradient, precision, clauses, steering)
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 

@@ -32,6 +32,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block
 from verifai_jax.problem.problem import Problem
@@ -59,7 +60,7 @@ class ExecutorEngine:
     - `problem`: a checked one, on the backend it is to run on.
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
-    - `gradient`, `clauses`, `precision`: as of `engine.Engine`.
+    - `gradient`, `clauses`, `precision`, `steering`: as of `engine.Engine`.
     - `journal`: of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
 
@@ -78,6 +79,7 @@ class ExecutorEngine:
         precision: str = "float32",
         journal: Journal | None = None,
         target: str | None = None,
+        steering: Steering = NOTHING,
     ) -> None:
         check_executor(executor)
         self.problem, self.executor, self.precision = problem, executor, precision
@@ -93,7 +95,7 @@ class ExecutorEngine:
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
         least = 1 << (batch - 1).bit_length()
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend)
+        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering)
         self.unit = lanes
         if problem.black_box:
             self.unit = TOGETHER if problem.system.can_simulate_batch else 1
@@ -181,7 +183,11 @@ class ExecutorEngine:
         """Return the verdicts of rows that the journal knows."""
         if self._recalling is None:
             self._recalling = HostEngine(
-                self.problem, self.precision, self._journal, least=self.mode.least
+                self.problem,
+                self.precision,
+                self._journal,
+                least=self.mode.least,
+                steering=self.mode.steering,
             )
         return self._recalling.evaluate(u, key, first)
 
@@ -207,7 +213,9 @@ class ExecutorEngine:
                 marks = None if verdicts.marks is None else verdicts.marks[i]
                 message = "" if verdicts.messages is None else verdicts.messages[i]
                 holds = np.array(not verdicts.violated[i])
-                row = RowVerdict(verdicts.rho[i], int(verdicts.status[i]), holds, message, marks)
+                steering = None if verdicts.steering is None else verdicts.steering[i]
+                rho, status = verdicts.rho[i], int(verdicts.status[i])
+                row = RowVerdict(rho, status, holds, message, marks, steering)
                 self._journal.add(first + i, u[i], row)
         return verdicts
 

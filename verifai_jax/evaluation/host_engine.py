@@ -11,6 +11,7 @@ compile.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import (
     RowVerdict,
     Verdicts,
@@ -45,30 +47,41 @@ PATIENCE = 0.5
 class HostMonitor:
     """The compiled monitor of a problem for batches of traces that came from the host."""
 
-    def __init__(self, problem: Problem) -> None:
-        def decided(trace: Trace) -> tuple[Array, Array, Array]:
-            return *trace_verdict(problem, trace), trace_marks(problem, trace)
+    def __init__(self, problem: Problem, steering: Steering = NOTHING) -> None:
+        self.steering = steering
+
+        def decided(trace: Trace, features: PyTree) -> tuple[Array, Array, Array, Array]:
+            told = jnp.zeros(0, jnp.float32)
+            if steering.size:
+                told = steering.values(problem, trace, features)
+            return *trace_verdict(problem, trace), trace_marks(problem, trace), told
 
         self._decide = jax.jit(jax.vmap(decided))
         self._holds = jax.jit(jax.vmap(lambda trace: boolean_semantics(problem, trace)))
 
     def __call__(
-        self, traces: Trace, count: int
+        self, traces: Trace, count: int, features: PyTree = None
     ) -> tuple[
         Float[np.ndarray, "n k"],
         Int[np.ndarray, " n"],
         Bool[np.ndarray, "n k"],
         Int[np.ndarray, "n marks"],
+        Float[np.ndarray, "n steering"],
     ]:
-        """Return robustness, status, Boolean semantics and marks, in one shape for many `count`."""
+        """Return robustness, status, Boolean semantics, marks and what steers a search.
+
+        In one shape for many `count`. `features` are needed only where something steers.
+        """
         signals = {name: without_wrapping(signal) for name, signal in traces.signals.items()}
         padded = jax.tree.map(_power_of_two, _with_signals(traces, signals))
-        rho, status, marks = (np.asarray(leaf)[:count] for leaf in self._decide(padded))
+        own = jax.tree.map(_power_of_two, features) if self.steering.size else {}
+        decided = self._decide(padded, own)
+        rho, status, marks, told = (np.asarray(leaf)[:count] for leaf in decided)
         holds = np.ones(rho.shape, bool)
         if np.any(rho == 0):
             # Now, while the traces are here: simulating again may be dear.
             holds = np.asarray(self._holds(padded))[:count]
-        return rho, status, holds, marks
+        return rho, status, holds, marks, told
 
 
 class HostEngine:
@@ -83,6 +96,8 @@ class HostEngine:
     - `monitor`: one that is compiled already for the same formulas.
     - `least`: rows that features are computed of together at least, a power of two, so that few
       rows get theirs from the program that many would.
+    - `steering`: what is computed for a search beside the robustness; that of the monitor where one
+      is given.
     """
 
     def __init__(
@@ -94,11 +109,12 @@ class HostEngine:
         system: System | None = None,
         monitor: HostMonitor | None = None,
         least: int = 1,
+        steering: Steering = NOTHING,
     ) -> None:
         self.problem, self.precision, self.journal = problem, precision, journal
         self.least = least
         self.system = problem.system if system is None else system
-        self.monitor = HostMonitor(problem) if monitor is None else monitor
+        self.monitor = HostMonitor(problem, steering) if monitor is None else monitor
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._prepare = jax.jit(self._prepared)
@@ -151,14 +167,21 @@ class HostEngine:
     ) -> Verdicts:
         behaviour = self.problem.behaviour
         width = None if behaviour is None else behaviour.size
-        rows = _Rows(len(seeds), len(self.problem.formulas), self.precision, width)
+        formulas = len(self.problem.formulas)
+        rows = _Rows(len(seeds), formulas, self.precision, width, self.monitor.steering.size)
         if self.system.can_simulate_batch:
             self._together(features, keys, rows)
         else:
             self._one_by_one(features, seeds, u, first, rows)
         violated = violations(rows.rho, rows.status, lambda: rows.holds)
         return Verdicts(
-            rows.rho, rows.status, violated, features, messages=rows.messages, marks=rows.marks
+            rows.rho,
+            rows.status,
+            violated,
+            features,
+            messages=rows.messages,
+            marks=rows.marks,
+            steering=rows.steering if self.monitor.steering.size else None,
         )
 
     def _prepared(self, u: Array, key: Array, first: Array) -> tuple[PyTree, Array, Array]:
@@ -171,7 +194,9 @@ class HostEngine:
         try:
             trace = _checked(self.system.simulate_batch(features, keys), count)
             if _is_plain(trace):
-                rows.rho[:], rows.status[:], rows.holds[:], marks = self.monitor(trace, count)
+                rows.rho[:], rows.status[:], rows.holds[:], marks, rows.steering[:] = self.monitor(
+                    trace, count, features
+                )
                 if rows.marks is not None:
                     rows.marks[:] = marks
                 return
@@ -179,7 +204,7 @@ class HostEngine:
             rows.messages[:] = [format_user_error(error)] * count
             return
         # Row by row, so that one with a wrong code, or a clock of its own, costs no other.
-        waiting = _Waiting(self._block_verdicts, rows.put)
+        waiting = _Waiting(partial(self._block_verdicts, features), rows.put)
         for i in range(count):
             row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
             waiting.add(i, Outcome(row))
@@ -205,7 +230,7 @@ class HostEngine:
             rows.put(i, row)
         todo = [i for i in range(len(seeds)) if i not in known]
         each = [plain_leaves(jax.tree.map(lambda leaf, i=i: leaf[i], features)) for i in todo]
-        waiting = _Waiting(self._block_verdicts, keep)
+        waiting = _Waiting(partial(self._block_verdicts, features), keep)
         try:
             for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
                 waiting.add(todo[place], outcome)
@@ -224,16 +249,20 @@ class HostEngine:
             except (Exception, SystemExit) as error:  # sys.exit() in a simulator is its failure.
                 yield i, Outcome(None, Status.ERROR, format_user_error(error))
 
-    def _block_verdicts(self, traces: Sequence[Trace]) -> list[RowVerdict]:
+    def _block_verdicts(
+        self, features: PyTree, rows: Sequence[int], traces: Sequence[Trace]
+    ) -> list[RowVerdict]:
         filled = [*traces, *[traces[-1]] * (BLOCK - len(traces))]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *filled)
+        place = np.array([*rows, *[rows[-1]] * (BLOCK - len(rows))])
+        own = jax.tree.map(lambda leaf: np.asarray(leaf)[place], features)
         try:
-            rho, status, holds, marks = self.monitor(stacked, BLOCK)
+            rho, status, holds, marks, told = self.monitor(stacked, BLOCK, own)
         except Exception as error:
             # The monitor refuses traces of this form: their signals, or their clock.
             return [_without_verdict(Status.ERROR, format_user_error(error))] * len(traces)
         each = range(len(traces))
-        return [RowVerdict(rho[i], int(status[i]), holds[i], "", marks[i]) for i in each]
+        return [RowVerdict(rho[i], int(status[i]), holds[i], "", marks[i], told[i]) for i in each]
 
 
 class _Waiting:
@@ -241,7 +270,7 @@ class _Waiting:
 
     def __init__(
         self,
-        decide: Callable[[Sequence[Trace]], list[RowVerdict]],
+        decide: Callable[[Sequence[int], Sequence[Trace]], list[RowVerdict]],
         keep: Callable[[int, RowVerdict], None],
     ) -> None:
         self._decide, self.keep = decide, keep
@@ -267,7 +296,7 @@ class _Waiting:
 
     def _settle(self, form: Any) -> None:
         block = self._blocks.pop(form)
-        verdicts = self._decide([trace for _, trace, _ in block])
+        verdicts = self._decide([row for row, _, _ in block], [trace for _, trace, _ in block])
         for (row, _, message), verdict in zip(block, verdicts, strict=True):
             self.keep(row, verdict._replace(message=verdict.message or message))
 
@@ -275,7 +304,10 @@ class _Waiting:
 class _Rows:
     """The rows of a batch while they are filled, in any order."""
 
-    def __init__(self, count: int, formulas: int, precision: str, marks: int | None) -> None:
+    def __init__(
+        self, count: int, formulas: int, precision: str, marks: int | None, steering: int
+    ) -> None:
+        self.steering = np.full((count, steering), np.nan, np.float32)
         self.rho = np.full((count, formulas), np.nan, precision)
         self.status = np.full(count, Status.ERROR, np.int32)
         self.holds = np.ones((count, formulas), bool)
@@ -283,7 +315,9 @@ class _Rows:
         self.marks = None if marks is None else np.full((count, marks), -1, np.int32)
 
     def put(self, i: int, row: RowVerdict) -> None:
-        self.rho[i], self.status[i], self.holds[i], self.messages[i], marks = row
+        self.rho[i], self.status[i], self.holds[i], self.messages[i], marks, steering = row
+        if steering is not None and len(steering):
+            self.steering[i] = steering
         if self.marks is not None and marks is not None and len(marks):
             self.marks[i] = marks
 

@@ -47,6 +47,7 @@ class Journal:
             "holds": np.asarray(verdict.holds).tolist(),
             "message": verdict.message,
             "marks": None if verdict.marks is None else np.asarray(verdict.marks).tolist(),
+            "steering": None if verdict.steering is None else verdict.steering.tolist(),
         }
         self._last = max(self._last, row)
         if self._file is None:
@@ -97,13 +98,14 @@ def _read(path: Path) -> dict[int, tuple[str, RowVerdict]]:
             continue  # It has changed, or was being written when the process died.
         try:
             entry = json.loads(text)
-            marks = entry.get("marks")
+            marks, steering = entry.get("marks"), entry.get("steering")
             verdict = RowVerdict(
                 np.asarray(entry["rho"], np.float64),
                 int(entry["status"]),
                 np.asarray(entry["holds"], bool),
                 str(entry["message"]),
                 None if marks is None else np.asarray(marks, np.int32),
+                None if steering is None else np.asarray(steering, np.float32),
             )
             known[int(entry["row"])] = (str(entry["point"]), verdict)
         except (ValueError, KeyError, TypeError):

@@ -37,6 +37,7 @@ class Verdicts(NamedTuple):
     - `messages`: what a host system raised, one a row, empty where nothing; None for systems that
       JAX traces.
     - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
+    - `steering`: what a search is told beside (`evaluation.steering`); None unless wanted.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -48,6 +49,7 @@ class Verdicts(NamedTuple):
     clause_gradients: Float[np.ndarray, "n clauses d"] | None = None
     messages: list[str] | None = None
     marks: Int[np.ndarray, "n marks"] | None = None
+    steering: Float[np.ndarray, "n steering"] | None = None
 
     @property
     def proper(self) -> Bool[np.ndarray, " n"]:
@@ -87,6 +89,8 @@ class RowVerdict(NamedTuple):
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
     - `message`: what the system raised; empty where nothing.
     - `marks`: what its trace shows, `[marks]`; None without a trace, or a `problem.behaviour`.
+    - `steering`: what a search is told beside, `[steering]`; None unless there is a trace, and it
+      is wanted.
     """
 
     rho: Float[np.ndarray, " formulas"] | Float[np.ndarray, ""]
@@ -94,6 +98,7 @@ class RowVerdict(NamedTuple):
     holds: Bool[np.ndarray, " formulas"] | Bool[np.ndarray, ""]
     message: str
     marks: Int[np.ndarray, " marks"] | None = None
+    steering: Float[np.ndarray, " steering"] | None = None
 
 
 def violations(

@@ -22,10 +22,20 @@ from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
-ARRAYS = ("rho", "status", "violated", "gradient", "clauses", "clause_gradients", "marks")
+ARRAYS = (
+    "rho",
+    "status",
+    "violated",
+    "gradient",
+    "clauses",
+    "clause_gradients",
+    "marks",
+    "steering",
+)
 """Parts of verdicts that come back as arrays under their names."""
 
 
@@ -36,6 +46,7 @@ class BlockMode(NamedTuple):
     - `gradient`, `clauses`, `precision`: as of `Engine`.
     - `least`: rows that a host system's features are computed of together.
     - `backend`: of a system that has several.
+    - `steering`: what is computed for a search beside the robustness.
     """
 
     lanes: int
@@ -44,6 +55,7 @@ class BlockMode(NamedTuple):
     precision: str
     least: int
     backend: str | None
+    steering: Steering
 
 
 ENGINES: Slot[tuple[BlockMode, int], Engine] = Slot("engines of blocks")
@@ -102,7 +114,9 @@ def _on_host(
     u: Float[np.ndarray, "n d"],
 ) -> tuple[Verdicts, float, tuple[str, ...]]:
     engine = problem.programs.get(
-        HOST_ENGINES, mode, lambda: HostEngine(problem, mode.precision, least=mode.least)
+        HOST_ENGINES,
+        mode,
+        lambda: HostEngine(problem, mode.precision, least=mode.least, steering=mode.steering),
     )
     started = time.perf_counter()
     verdicts = engine.evaluate(u, as_key(key), first)
@@ -124,7 +138,14 @@ def _compiled(
         ENGINES,
         (mode, len(devices)),
         lambda: Engine(
-            problem, step, mode.gradient, devices, mode.precision, mode.clauses, lanes=mode.lanes
+            problem,
+            step,
+            mode.gradient,
+            devices,
+            mode.precision,
+            mode.clauses,
+            lanes=mode.lanes,
+            steering=mode.steering,
         ),
     )
     engine.compile()

@@ -37,13 +37,16 @@ from verifai_jax.falsification.silent_mistakes import (
     notes_after,
     notes_before,
 )
+from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     adapt_search,
     check_first,
     check_gradient,
+    check_guide,
     check_options,
     check_rule,
+    check_same_guide,
     check_same_space,
     check_search,
     earlier_rows,
@@ -54,6 +57,7 @@ from verifai_jax.falsification.validation import (
     recorded_search,
     space_as_data,
     usual_batch,
+    without_suggestions,
     writing,
 )
 from verifai_jax.problem.problem import Problem
@@ -148,8 +152,10 @@ def falsify(
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
+    asking, search = without_suggestions(search)
     search = check_search(problem, search)
     check_rule(search, stop_when)
+    check_guide(problem, search)
     given = check_first(problem, first, stop_when)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
@@ -178,6 +184,8 @@ def falsify(
         rounds = Rounds(
             problem, search, batch, seed, table, precision, place, confirm, executor, target, given
         )
+        if asking is not None:
+            rounds.suggestions = Suggestions(replace(asking, search=search), problem)
 
         def prepare() -> None:
             if earlier is not None:
@@ -292,8 +300,10 @@ def _resume(
                 f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
             )
         search = recorded_search(run)
+    asking, search = without_suggestions(search)
     search = check_search(problem, search)
     check_same_space(run, problem)
+    check_same_guide(run, problem)
     check_rule(search, ends.stop_when)
     budget = run.budget if budget is None else budget
     check_options(budget, run.batch, run.seed, ends.max_seconds, ends.stop_after)
@@ -318,6 +328,11 @@ def _resume(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
         executor, run.target, np.asarray(run.first, np.float32).reshape(-1, problem.space.dim),
     )  # fmt: skip
+
+    if asking is not None:
+        rounds.suggestions = Suggestions(replace(asking, search=search), problem)
+        rounds.suggestions.restore(checkpoint)
+        rounds.suggestions.check_source()
 
     rounds.confirm_seconds, rounds.checked = run.confirm_seconds, run.checked
 
@@ -389,6 +404,8 @@ def _run_rounds(
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
+    asked = rounds.suggestions
+    recorded = search if asked is None else asked.search
     chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
     confirmed_before = rounds.confirm_seconds
 
@@ -400,7 +417,7 @@ def _run_rounds(
             name=problem.name,
             formulas={name: str(formula) for name, formula in problem.formulas.items()},
             table=rounds.table,
-            search=repr(search),
+            search=repr(recorded),
             seed=int(seed),
             batch=rounds.batch,
             stopped=stopped,
@@ -409,19 +426,20 @@ def _run_rounds(
             confirm_seconds=rounds.confirm_seconds,
             checked=rounds.checked,
             version=__version__,
-            prior=search.samples_prior and not len(rounds.first),
+            prior=recorded.samples_prior and not len(rounds.first),
             first=rounds.first.tolist(),
             folder=place,
             target=target,
             problem=problem,
             budget=int(ends.budget),
-            search_data=searches.to_json(search),
+            search_data=searches.to_json(recorded),
             space_data=space_as_data(problem),
             acceptance=rounds.acceptance,
             checkpoint=rounds.checkpoint,
             precision=rounds.precision,
             backend=choice.backend,
             confirm=rounds.confirms,
+            guide=None if problem.guide is None else problem.guide.to_json(),
             notes=(*chosen, *notes, *rounds.notes),
         )
 

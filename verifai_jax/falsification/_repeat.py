@@ -163,8 +163,8 @@ def repeat(
     **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
     of the violations are not claimed.
 
-    **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`) or a priority,
-    which are dealt with between rounds: use `falsify` with one seed after the other.
+    **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`), a priority or
+    a guide, which are dealt with between rounds: use `falsify` with one seed after the other.
     """
     check_options(budget, 1 if batch is None else batch, 0, None, None)
     search = check_search(problem, search)
@@ -179,6 +179,7 @@ def repeat(
     for what, there in (
         ("a constraint (where=)", problem.space.where is not None),
         ("a priority", problem.rulebook is not None),
+        ("a guide", problem.guide is not None),
     ):
         if there:
             raise ValueError(

@@ -18,10 +18,13 @@ from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.ahead import Ahead
 from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.marks import MarkBook
+from verifai_jax.falsification.question import describe_run
+from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
@@ -43,7 +46,8 @@ class Rounds:
 
     `found` counts the counterexamples that are claimed, `violating` the simulations that violate
     the property, and `without_verdict` those that have none; `best` is the least robustness.
-    `first` are points that are simulated before the search proposes any.
+    `first` are points that are simulated before the search proposes any, and `suggestions` those
+    that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
     `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
     which they were.
@@ -65,6 +69,8 @@ class Rounds:
     ) -> None:
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
+        guided = problem.guide is not None and search.learns
+        self.steering = Steering(guide=guided, outcome=search.wants_outcomes)
         self.precision, self.folder = precision, folder
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
         self.evaluate = Evaluator(
@@ -77,6 +83,7 @@ class Rounds:
             journal=self._journal,
             executor=executor,
             target=target,
+            steering=self.steering,
         )
         # Derivatives of clauses are wanted of few points, now and then: compiled when they are.
         self._differentiate = (
@@ -89,6 +96,7 @@ class Rounds:
                 seed=seed,
                 executor=executor,
                 target=target,
+                steering=self.steering,
             )
             if search.wants_clauses
             else None
@@ -101,6 +109,7 @@ class Rounds:
         self.checked = ""
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
+        self.suggestions: Suggestions | None = None
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
@@ -147,7 +156,8 @@ class Rounds:
         """Decisions of the engines that a user may not expect."""
         more = () if self._differentiate is None else self._differentiate.notes
         raised = () if self._confirmer is None else self._confirmer.raised
-        return (*self.evaluate.notes, *more, *raised)
+        suggested = () if self.suggestions is None else self.suggestions.notes
+        return (*self.evaluate.notes, *more, *raised, *suggested)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -181,6 +191,11 @@ class Rounds:
         verdicts: Verdicts | None = None
         # The number of rows alone says how many of them are still to come, so resuming goes on.
         given = self.first[first : first + most]
+        suggested = False
+        if not len(given) and self.suggestions is not None:
+            given = self._suggested(self.suggestions, first)
+            given = given[: most if limit is None else max(limit - first, 0)]
+            suggested = len(given) > 0
         if len(given):
             points = given
         elif self._sends_ahead:
@@ -195,8 +210,10 @@ class Rounds:
             self._keep()
             return
         if verdicts is None:
-            verdicts = self._verdicts(points, first)
+            verdicts = self._verdicts(points, first, given=len(given) > 0)
         columns = self._columns(verdicts)
+        if self.suggestions is not None:
+            columns["suggested"] = np.full(len(points), suggested)
         marks = None
         if self._marks is not None:
             marks = self._marks.of(points, verdicts)
@@ -212,18 +229,46 @@ class Rounds:
             # A search that took them for failures would stay with them.
             objective = np.where(refused, told, objective)
             verdicts = _raised(verdicts, refused)
+        if self.steering.guide and verdicts.steering is not None:
+            objective = self._guided(objective, verdicts.steering[:, 0])
+        outcomes = self._outcomes(verdicts)
         if len(given):
-            self._proposals.warm_start(
-                given[verdicts.proper], objective[verdicts.proper].astype(np.float32)
-            )
+            told = objective[verdicts.proper].astype(np.float32)
+            happened = None if outcomes is None else outcomes[verdicts.proper]
+            if suggested:
+                # The best ones last, so that none of a small batch takes their place.
+                order = np.argsort(-told, kind="stable")
+                happened = None if happened is None else happened[order]
+                self._proposals.start_from(given[verdicts.proper][order], told[order], happened)
+            else:
+                self._proposals.warm_start(given[verdicts.proper], told, happened)
         else:
-            self._tell(objective, verdicts, marks)
+            self._tell(objective, verdicts, marks, outcomes)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
+
+    def _suggested(self, suggestions: Suggestions, rows: int) -> Float[np.ndarray, "n d"]:
+        """Return the suggested points that come next, after a question where it is time for one."""
+        waiting = suggestions.waiting(rows)
+        if len(waiting) or not suggestions.due(rows):
+            return waiting
+        question = describe_run(
+            self.problem,
+            self.table.all,
+            suggestions.search,
+            self.evaluate.key,
+            self.precision,
+            suggestions.last_refused,
+        )
+        suggestions.ask(question, rows)
+        # On disk before anything is simulated: nobody is asked twice for it.
+        self._keep()
+        self.save()
+        return suggestions.waiting(rows)
 
     def close(self) -> None:
         """Cancel what workers have been sent ahead and have not begun."""
@@ -235,6 +280,7 @@ class Rounds:
         objective: Float[np.ndarray, " n"],
         verdicts: Verdicts,
         marks: Int[np.ndarray, "n marks"] | None,
+        outcomes: Float[np.ndarray, "n outcome"] | None,
     ) -> None:
         """Tell the search what came of its points, in float32 whatever the simulations do."""
 
@@ -248,7 +294,20 @@ class Rounds:
             single(verdicts.clauses),
             single(verdicts.clause_gradients),
             marks,
+            outcomes,
         )
+
+    def _guided(
+        self, told: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return what the search is told with the guide's term, where there is one."""
+        guide = self.problem.guide
+        return told if guide is None or not self.steering.guide else guide.steer(told, value)
+
+    def _outcomes(self, verdicts: Verdicts) -> Float[np.ndarray, "n outcome"] | None:
+        if not self.steering.outcome or verdicts.steering is None:
+            return None
+        return verdicts.steering[:, int(self.steering.guide) :]
 
     def _confirmed(
         self, confirmer: Confirmer, columns: dict[str, Any], first: int
@@ -277,12 +336,12 @@ class Rounds:
         refused[rows], told[rows] = checked.refuse(own["rho"])
         return verdict, refused, told
 
-    def _verdicts(self, points: Float[Any, "n d"], first: int) -> Verdicts:
-        temperature = self._proposals.temperature
+    def _verdicts(self, points: Float[Any, "n d"], first: int, given: bool = False) -> Verdicts:
         compiled = self.evaluate.compile_seconds
+        temperature = 1.0 if given else self._proposals.temperature
         if self._differentiate is None:
             verdicts = self.evaluate(points, temperature, first)
-        elif not self._proposals.differentiate:
+        elif given or not self._proposals.differentiate:
             verdicts = self.evaluate(points, first=first)
         else:
             compiled = self._differentiate.compile_seconds
@@ -306,6 +365,8 @@ class Rounds:
         if self._objective is not None and all(name in proper for name in names):
             each = proper[names].to_numpy(np.float64)
             rho = self._objective(each, each < 0).astype(np.float32)
+        # What the guide says of these rows is not known: the least good.
+        rho = self._guided(rho, np.full(len(rho), np.nan, np.float32))
         self._proposals.warm_start(self.problem.space.points(proper), rho)
         self._keep()
 
@@ -343,6 +404,8 @@ class Rounds:
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
         if self._marks is not None:
             self._marks.restore(checkpoint)
+        if self.suggestions is not None:
+            self.suggestions.restore(checkpoint)
         counts = self.table.counts
         self.without_verdict, self.violating = counts.without_verdict, counts.violating
         self.found = counts.claimed
@@ -360,6 +423,8 @@ class Rounds:
         }
         if self._marks is not None:
             self.checkpoint |= self._marks.checkpoint()
+        if self.suggestions is not None:
+            self.checkpoint |= self.suggestions.checkpoint()
         if self._confirmer is not None:
             seen = self._confirmer
             self.checkpoint["confirmer"] = np.array([seen.examined, seen.band], np.float64)

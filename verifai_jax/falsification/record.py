@@ -44,6 +44,7 @@ ADDED = (
     "confirm_seconds",
     "checked",
     "first",
+    "guide",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
@@ -57,6 +58,7 @@ DECIDING = (
     "backend",
     "confirm",
     "prior",
+    "guide",
 )
 """Entries that decide what the rows of a run are; they stay what they are when it is resumed."""
 
@@ -172,5 +174,6 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "confirm": _is_flag,
     "confirm_seconds": _is_number,
     "checked": _is_text,
+    "guide": _is_mapping,
 }
 """What each entry of a record must be."""

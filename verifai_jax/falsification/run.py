@@ -76,6 +76,7 @@ class Run:
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
     - `first`: points of the unit cube that were simulated before the search began.
+    - `guide`: the term that steered the search, as plain data; None without one.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
@@ -105,6 +106,7 @@ class Run:
     confirm_seconds: float = 0.0
     checked: str = ""
     first: Sequence[Sequence[float]] = ()
+    guide: Mapping[str, Any] | None = None
     damage: str = ""
 
     @property

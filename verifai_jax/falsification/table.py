@@ -66,6 +66,7 @@ RESERVED = (
     "differentiated",
     "verdict",
     "new_marks",
+    "suggested",
 )
 """Names of the table's own columns, which no feature may have."""
 _FEW = 256

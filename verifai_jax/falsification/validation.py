@@ -102,6 +102,13 @@ def check_search(problem: object, search: object) -> Search:
     return search
 
 
+def without_suggestions(search: object) -> tuple[searches.Suggested | None, Any]:
+    """Return a search that asks for suggestions, None where there is none, and the one inside."""
+    if isinstance(search, searches.Suggested):
+        return search, search.search
+    return None, search
+
+
 def _why_not_traced(system: System) -> str:
     """Return why a system with several backends has none that JAX can trace; often empty."""
     if not system.backends or "mjx" in system.backends:
@@ -134,6 +141,37 @@ def check_gradient(problem: Problem, search: Search) -> None:
         )
 
 
+def check_guide(problem: Problem, search: Search) -> None:
+    """Refuse a guide that has no effect: of a search that does not learn.
+
+    **Raises:** `ValueError`.
+    """
+    if problem.guide is None or search.learns or isinstance(search, searches.PointList):
+        return
+    raise ValueError(
+        f"problem {problem.name!r} has a guide, which steers searches that learn, and search "
+        f"{search!r} does not: its points are the same whatever they come to. Use one that learns, "
+        "such as 'portfolio', or dataclasses.replace(problem, guide=None)"
+    )
+
+
+def check_same_guide(run: Run, problem: Problem) -> None:
+    """Refuse to go on with a run under another guide than it had.
+
+    **Raises:** `ValueError`.
+    """
+    now = None if problem.guide is None else problem.guide.to_json()
+    if run.guide != now:
+        raise ValueError(
+            f"the run of {run.name!r} was steered by {_guide_text(run.guide)}, and the given "
+            f"problem by {_guide_text(now)}"
+        )
+
+
+def _guide_text(guide: Mapping[str, Any] | None) -> str:
+    return "no guide" if guide is None else f"the guide {dict(guide)}"
+
+
 def adapt_search(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
     """Return the search as it can work on this problem, and notes on what it does without.
 
@@ -147,7 +185,7 @@ def adapt_search(problem: Problem, search: Search) -> tuple[Search, tuple[str, .
         why = "a priority has no gradient"
     elif not len(problem.space.cube.continuous):
         why = "all features are discrete"
-    elif not has_gradient(problem):
+    elif problem.guide is None and not has_gradient(problem):
         why = "the robustness is constant almost everywhere"
     else:
         return search, ()

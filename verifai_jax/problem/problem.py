@@ -24,6 +24,7 @@ from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
+from verifai_jax.problem.guide import Guide, Term
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.systems.base import System, as_system
 
@@ -52,6 +53,8 @@ class Problem:
       counterexamples instead of the least robustness.
     - `behaviour`: what a trace shows, as numbers of cells (`Behaviour`), for a search guided by
       coverage.
+    - `guide`: a term beside the robustness that steers searches and decides nothing: a formula,
+      its text, a function of the trace and the features, or a `Guide` with its weight.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
 
     `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
@@ -71,6 +74,7 @@ class Problem:
     draw: Callable[..., None] | None
     priority: Sequence[str] | Sequence[tuple[str, str]] | None
     behaviour: Behaviour | None
+    guide: Guide | None
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False)
     programs: ProgramCache = field(init=False, repr=False)
@@ -87,6 +91,7 @@ class Problem:
         draw: Callable[..., None] | None = None,
         priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
         behaviour: Behaviour | None = None,
+        guide: Guide | Formula | str | Term | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {name!r}")
@@ -115,6 +120,7 @@ class Problem:
             "draw": draw,
             "priority": priority,
             "behaviour": behaviour,
+            "guide": guide if guide is None or isinstance(guide, Guide) else Guide(guide),
             "formulas": formulas,
             "rulebook": None if priority is None else _rulebook(priority, formulas),
             "programs": ProgramCache(),
@@ -232,6 +238,8 @@ class Problem:
             return
         for formula in self.formulas.values():
             jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
+        if (guide := self.guide) is not None:
+            jax.eval_shape(lambda t, f: guide.value(t.hold(), f, self.end), trace, features)
 
     def form(self) -> Trace | None:
         """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.

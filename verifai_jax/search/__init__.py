@@ -32,6 +32,8 @@ from verifai_jax.search.mutation import Mutation as Mutation
 from verifai_jax.search.point_list import PointList as PointList
 from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
+from verifai_jax.search.suggested import Absent
+from verifai_jax.search.suggested import Suggested as Suggested
 from verifai_jax.search.turbo import TuRBO as TuRBO
 from verifai_jax.search.uniform import Uniform as Uniform
 
@@ -57,6 +59,7 @@ __all__ = [
     "Search",
     "Sobol",
     "Split",
+    "Suggested",
     "TuRBO",
     "Uniform",
     "distinct",
@@ -90,6 +93,9 @@ _SEARCHES: dict[str, type[Search]] = {
     "gradient": Gradient,
     "portfolio": Portfolio,
 }
+
+_ASKING = tuple(f.name for f in fields(Suggested) if f.name not in ("suggest", "search"))
+"""Options of `Suggested` that are plain data."""
 
 
 def names() -> tuple[str, ...]:
@@ -144,6 +150,13 @@ def to_json(search: Search) -> dict[str, Any] | None:
             return None
         own = {f.name: getattr(search, f.name) for f in fields(search) if f.name != "search"}
         return {"diverse": inner, "options": own}
+    if isinstance(search, Suggested):
+        inner = to_json(search.search)
+        if inner is None:
+            return None
+        own = {name: getattr(search, name) for name in _ASKING}
+        own["units"] = dict(search.units)
+        return {"suggested": inner, "source": search.source, "options": own}
     for name, kind in _SEARCHES.items():
         if type(search) is kind:
             options = {field.name: getattr(search, field.name) for field in fields(search)}  # pyright: ignore[reportArgumentType]
@@ -162,6 +175,9 @@ def from_json(data: Mapping[str, Any]) -> Search:
         )
     if "diverse" in data:
         return Diverse(from_json(data["diverse"]), **data.get("options", {}))
+    if "suggested" in data:
+        source = Absent(str(data.get("source", "a function")))
+        return Suggested(source, from_json(data["suggested"]), **data.get("options", {}))
     if not isinstance(data.get("options"), Mapping):
         raise ValueError(f"this describes no search: {data!r}")
     options = {

@@ -37,6 +37,8 @@ class Observations(NamedTuple):
       very low where there are fewer than `CLAUSES`. Only for a search that `wants_clauses`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
+    - `outcomes`: what happened (`core.outcomes`), NaN where it is not known. Only for a search that
+      `wants_outcomes`.
     - `marks`: numbers of what each simulation covered, -1 for nothing; `marks // KIND` is the kind
       of thing. Only for a search that `wants_marks`.
     """
@@ -48,6 +50,7 @@ class Observations(NamedTuple):
     clauses: Float[Array, "n clauses"] | None = None
     clause_gradients: Float[Array, "n clauses d"] | None = None
     marks: Int[Array, "n marks"] | None = None
+    outcomes: Float[Array, "n outcome"] | None = None
 
     @property
     def usable(self) -> Bool[Array, " n"]:
@@ -96,6 +99,9 @@ class Search(abc.ABC, Generic[State]):
     wants_marks: ClassVar[bool] = False
     """Whether `tell` needs `Observations.marks`."""
 
+    wants_outcomes: ClassVar[bool] = False
+    """Whether `tell` needs `Observations.outcomes`."""
+
     samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""
 
@@ -127,6 +133,10 @@ class Search(abc.ABC, Generic[State]):
     def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
         """Learn from a batch of an earlier table's points, before the first `ask`."""
         return self.tell(state, cube, observations)
+
+    def start_from(self, state: State, cube: Cube, observations: Observations) -> State:
+        """Learn from points that somebody suggested between two rounds, and start from them."""
+        return self.warm_start(state, cube, observations)
 
     def plan(self, state: State, cube: Cube, batch: int) -> Plan:
         """Return the simulations wanted of the last proposals; only where `wants_clauses`."""

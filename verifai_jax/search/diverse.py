@@ -13,9 +13,9 @@ begins afresh from the best points that lie elsewhere. When it comes no nearer t
 radius shrinks, so that first the modes are found and then the insides of them filled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,10 @@ class DiverseState(NamedTuple):
     verdicts: Float[Array, ""]  # and how many there were
     points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
     rho: Float[Array, " batch"]  # with their own robustness; infinite where there is none
+
+
+_Verb: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
+"""A way to learn of the search inside: `tell`, `warm_start` or `start_from`."""
 
 
 @dataclass(frozen=True)
@@ -151,15 +155,20 @@ class Diverse(Search[DiverseState]):
         return u, state._replace(inner=inner)
 
     def tell(self, state: DiverseState, cube: Cube, observations: Observations) -> DiverseState:
-        return self._learn(state, cube, observations, warm=False)
+        return self._learn(state, cube, observations, self.search.tell)
 
     def warm_start(
         self, state: DiverseState, cube: Cube, observations: Observations
     ) -> DiverseState:
-        return self._learn(state, cube, observations, warm=True)
+        return self._learn(state, cube, observations, self.search.warm_start)
+
+    def start_from(
+        self, state: DiverseState, cube: Cube, observations: Observations
+    ) -> DiverseState:
+        return self._learn(state, cube, observations, self.search.start_from)
 
     def _learn(
-        self, state: DiverseState, cube: Cube, observations: Observations, warm: bool
+        self, state: DiverseState, cube: Cube, observations: Observations, verb: _Verb
     ) -> DiverseState:
         usable = observations.usable
         u = jnp.where(usable[:, None], observations.u, 0.5)
@@ -188,7 +197,6 @@ class Diverse(Search[DiverseState]):
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
         raised = self._deflate(state, cube, observations)
-        verb = self.search.warm_start if warm else self.search.tell
         inner = verb(state.inner, cube, raised)
         if self.search.learns and self.search.total(cube) is None:
             inner = jax.lax.cond(

@@ -275,6 +275,26 @@ class Gradient(Search[GradientState]):
         _, nearest = jax.lax.top_k(-rho, len(state.near))
         return state._replace(offered=points[nearest], near=rho[nearest])
 
+    def start_from(
+        self, state: GradientState, cube: Cube, observations: Observations
+    ) -> GradientState:
+        """Give up descents for new ones from these points, which are differentiated next.
+
+        More than half of the descents, several from one point where points are fewer, so that
+        rounds of gradients do not go on until the others have found some too.
+        """
+        none = jnp.full_like(state.near, jnp.inf)
+        told = self.warm_start(state._replace(near=none), cube, observations)
+        count, n = jnp.sum(jnp.isfinite(told.near)), len(state.near)
+        place = jnp.arange(n) % jnp.maximum(count, 1)
+        chosen = (jnp.arange(n) < jnp.maximum(count, n // 2 + 1)) & (count > 0)
+        return state._replace(
+            offered=_rows(chosen, told.offered[place], state.offered),
+            near=jnp.where(chosen, told.near[place], none),
+            fresh=state.fresh | chosen,
+            known=state.known & ~chosen,
+        )
+
     def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:

@@ -213,6 +213,21 @@ class Portfolio(Search[PortfolioState]):
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
         )
 
+    def start_from(
+        self, state: PortfolioState, cube: Cube, observations: Observations
+    ) -> PortfolioState:
+        state = self.warm_start(state._replace(gradient=None), cube, observations)._replace(
+            gradient=state.gradient
+        )
+        if state.gradient is None:
+            return state
+        common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
+        gradient = Gradient().start_from(state.gradient, cube, common)
+        # The descents from there have their turn at once, whatever the shares are.
+        least = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
+        credit = state.credit.at[GRADIENT].max(least.astype(jnp.float32))
+        return state._replace(gradient=gradient, credit=credit)
+
     def _shares(self, state: PortfolioState) -> Float[Array, " members"]:
         rate = (state.gains + 0.1 * PRIOR_GAINS) / (state.costs + 0.1 * PRIOR_COSTS)
         rate = rate.astype(jnp.float32)

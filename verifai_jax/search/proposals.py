@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.compilation import Compilation, compile_soon, tracing
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.search import Diverse, Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_own
 
@@ -64,6 +65,7 @@ class Proposals:
         if self._accepts is not None:
             # Compiled now, in the shape that it will be asked in.
             self._accepts(np.zeros((batch, self.cube.dim), np.float32))
+        self._verbs: dict[str, Callable[..., PyTree]] = {}
         self._state = self._program.init(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
@@ -121,6 +123,7 @@ class Proposals:
         clauses: Float[np.ndarray, "m clauses"] | None = None,
         clause_gradients: Float[np.ndarray, "m clauses d"] | None = None,
         marks: Int[np.ndarray, "m marks"] | None = None,
+        outcomes: Float[np.ndarray, "m outcome"] | None = None,
     ) -> None:
         """Let the search learn from the simulations of the points that `next` gave last.
 
@@ -131,6 +134,7 @@ class Proposals:
         - `gradient`: of the smooth robustness, for a search that wants it.
         - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
         - `marks`: for a search that wants them, as many as the constructor was told.
+        - `outcomes`: for a search that wants them.
         """
         if not self.search.learns:
             return
@@ -151,6 +155,10 @@ class Proposals:
         if self.search.wants_marks:
             whole = np.zeros((len(rho), 0), np.int32) if marks is None else marks
             observations = observations._replace(marks=self._spread(whole, -1))
+        if self.search.wants_outcomes:
+            unknown = np.full((len(rho), OUTCOME), np.nan, np.float32)
+            known = unknown if outcomes is None else outcomes
+            observations = observations._replace(outcomes=self._spread(known, np.nan))
         self._state = self._program.tell(self._state, observations)
 
     def tell_refused(self) -> None:
@@ -159,11 +167,36 @@ class Proposals:
         marks = np.zeros((0, self._marks), np.int32)
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), gradient, marks=marks)
 
-    def warm_start(self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
+    def warm_start(
+        self,
+        u: Float[np.ndarray, "n d"],
+        rho: Float[np.ndarray, " n"],
+        outcomes: Float[np.ndarray, "n outcome"] | None = None,
+    ) -> None:
         """Let the search learn from the points of an earlier table, before the first round."""
+        self._learn_from(u, rho, outcomes, "warm_start")
+
+    def start_from(
+        self,
+        u: Float[np.ndarray, "n d"],
+        rho: Float[np.ndarray, " n"],
+        outcomes: Float[np.ndarray, "n outcome"] | None = None,
+    ) -> None:
+        """Let the search start from points that somebody suggested, between two rounds."""
+        self._learn_from(u, rho, outcomes, "start_from")
+
+    def _learn_from(
+        self,
+        u: Float[np.ndarray, "n d"],
+        rho: Float[np.ndarray, " n"],
+        outcomes: Float[np.ndarray, "n outcome"] | None,
+        verb: str,
+    ) -> None:
         if not self.search.learns or not len(u):
             return
-        warm_start = jax.jit(lambda state, rows: self.search.warm_start(state, self.cube, rows))
+        if verb not in self._verbs:
+            learn = getattr(self.search, verb)
+            self._verbs[verb] = jax.jit(lambda state, rows: learn(state, self.cube, rows))
         for start in range(0, len(u), self.batch):
             part, values = u[start : start + self.batch], rho[start : start + self.batch]
             missing = self.batch - len(part)
@@ -172,7 +205,12 @@ class Proposals:
                 rho=np.pad(values.astype(np.float32), (0, missing), constant_values=np.nan),  # pyright: ignore[reportArgumentType]
                 valid=np.arange(self.batch) < len(part),  # pyright: ignore[reportArgumentType]
             )
-            self._state = warm_start(self._state, observations)
+            if self.search.wants_outcomes:
+                whole = np.full((self.batch, OUTCOME), np.nan, np.float32)
+                if outcomes is not None:
+                    whole[: len(part)] = outcomes[start : start + self.batch]
+                observations = observations._replace(outcomes=whole)  # pyright: ignore[reportArgumentType]
+            self._state = self._verbs[verb](self._state, observations)
 
     def checkpoint(self) -> dict[str, np.ndarray | Array]:
         """Return the state that decides the next points; its values are arrays and never change."""
@@ -316,6 +354,9 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
     if search.wants_marks:
         form: Any = jax.ShapeDtypeStruct((batch, marks), jnp.int32)
         observations = observations._replace(marks=form)
+    if search.wants_outcomes:
+        happened: Any = jax.ShapeDtypeStruct((batch, OUTCOME), jnp.float32)
+        observations = observations._replace(outcomes=happened)
     plan: Any = None
     if search.wants_clauses:
         observations = observations._replace(

@@ -1,0 +1,74 @@
+"""The guide's term and the outcome of a simulation: for a search, beside the robustness.
+
+    steering = Steering(guide=True, outcome=True)
+    steering.values(problem, trace, features)           # [size], traced by JAX
+
+Nothing of it decides a verdict. It is computed with the traces of a search that wants it, and
+nowhere else.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
+from verifai_jax.core.trace import Trace, as_array
+from verifai_jax.mtl.deciding import deciding_instant
+from verifai_jax.problem.problem import Problem
+
+
+class Steering(NamedTuple):
+    """The parts of it that are wanted.
+
+    - `guide`: the value of the guide's term.
+    - `outcome`: what happened, of the form that `core.outcomes` says.
+    """
+
+    guide: bool = False
+    outcome: bool = False
+
+    @property
+    def size(self) -> int:
+        """Numbers of a simulation; 0 where nothing is wanted."""
+        return int(self.guide) + OUTCOME * int(self.outcome)
+
+    def values(
+        self, problem: Problem, trace: Trace, features: Mapping[str, PyTree]
+    ) -> Float[Array, " size"]:
+        """Return the numbers of one simulation, the guide's first; traced by JAX."""
+        trace = trace.hold()
+        parts = []
+        if self.guide and problem.guide is not None:
+            parts.append(problem.guide.value(trace, features, problem.end)[None])
+        if self.outcome:
+            parts.append(outcome_of(problem, trace))
+        return jnp.concatenate([part.astype(jnp.float32) for part in parts])
+
+
+NOTHING = Steering()
+"""Nothing beside the robustness."""
+
+
+def outcome_of(problem: Problem, trace: Trace) -> Float[Array, " outcome"]:
+    """Return the outcome of one simulation; see `core.outcomes`. It is not differentiated."""
+    signals = {name: jax.lax.stop_gradient(as_array(trace.signals[name])) for name in trace.signals}
+    formulas = tuple(problem.formulas.values())
+    predicate, sample = deciding_instant(formulas, trace, problem.end)
+    instant = sample / max(trace.length - 1, 1)
+    columns = []
+    for name in problem.monitored:
+        columns += list(signals[name].reshape(trace.length, -1).T)
+    edges = [round(i * trace.length / SEGMENTS) for i in range(SEGMENTS + 1)]
+    shape = [
+        # Of fewer samples than parts the same one stands for several.
+        jnp.mean(column[begin : max(stop, begin + 1)].astype(jnp.float32))
+        for column in columns[:SIGNALS]
+        for begin, stop in zip(
+            [min(edge, trace.length - 1) for edge in edges[:-1]], edges[1:], strict=True
+        )
+    ]
+    own = jnp.stack([predicate, instant, *shape]).astype(jnp.float32)
+    return jnp.pad(own, (0, OUTCOME - len(own)))

@@ -1,0 +1,181 @@
+"""A question to whoever suggests points: the problem and the rows so far, as plain data.
+
+    question = describe_run(problem, frame, search)
+    json.dumps(question)                                # numbers, texts, lists and dictionaries
+
+No instant of the clock is in it, so that a function which depends on the question alone gives the
+same table again.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Key
+
+from verifai_jax.core.text import format_error, one_line
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.replay import Replay, replay
+from verifai_jax.features import Domain
+from verifai_jax.features.plain import to_plain
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Suggested
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SAMPLES = 16
+"""Samples of a signal that are shown, evenly spaced, the first and the last among them."""
+SIGNALS = 8
+"""Signals that are shown at most, those of formulas first."""
+
+
+def describe_run(
+    problem: Problem,
+    frame: "pd.DataFrame",
+    search: Suggested,
+    key: Key[Array, ""],
+    precision: str,
+    refused: tuple[str, ...],
+) -> dict[str, Any]:
+    """Return the question after these rows.
+
+    **Arguments:**
+
+    - `problem`: the one that is falsified.
+    - `frame`: the table so far.
+    - `search`: the one that asks.
+    - `key`: of simulations, for the traces of the worst rows.
+    - `precision`: of simulations.
+    - `refused`: what was wrong with earlier suggestions.
+
+    **Returns:** a dictionary of plain data:
+
+    - `problem`, `description`, `context`: texts.
+    - `formulas`: text by name; all of them are to be kept, and one of them broken is a failure.
+    - `features`: one dictionary each, with `name`, `kind`, `unit` where there is one, and what its
+      domain has (`low`, `high`, `choices`, `knots`, ...); `columns` are its names in the rows.
+    - `constraint`: of the features, its text or name; None without one.
+    - `nominal`: ordinary features; None without any.
+    - `wanted`: how many suggestions.
+    - `simulations`, `counterexamples`, `least_robustness`: the run so far.
+    - `rows`: the last rows of the table, without those that are among the worst: features,
+      robustness (`rho`, and `rho.NAME` of each of several formulas), `status`.
+    - `worst`: the rows with the least robustness, the worst first; besides, `explanation` in words,
+      `critical` (which predicate decides, at how many seconds, with what robustness and share), and
+      `trace`: signals by name, with `times` and `values`, `least` and `greatest`.
+    - `refused`: what was wrong with suggestions that were left out, one text each.
+    """
+    proper = frame.loc[frame["status"] == "ok"]
+    worst = proper.nsmallest(search.worst, "rho") if len(proper) else proper
+    others = frame.drop(index=worst.index).tail(search.rows) if search.rows else frame.head(0)
+    failing = frame["violated"] if "violated" in frame else np.zeros(0, bool)
+    question = {
+        "problem": problem.name,
+        "description": problem.description,
+        "context": search.context,
+        "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
+        "features": [
+            _feature(name, domain, search.units.get(name))
+            for name, domain in problem.space.domains.items()
+        ],
+        "constraint": _constraint(problem),
+        "nominal": None if problem.nominal is None else dict(problem.nominal),
+        "wanted": search.points,
+        "simulations": len(frame),
+        "counterexamples": int(np.sum(failing)),
+        "least_robustness": float(proper["rho"].min()) if len(proper) else None,
+        "rows": [_row(problem, frame, number) for number in others.index],
+        "worst": [
+            _row(problem, frame, number)
+            | _trace(lambda n=number: replay(problem, frame.loc[n], key, int(n), precision))
+            for number in worst.index
+        ],
+        "refused": list(refused),
+    }
+    return plain(question)
+
+
+def _feature(name: str, domain: Domain, unit: str | None) -> dict[str, Any]:
+    try:
+        data = dict(to_plain(domain))
+    except ValueError:
+        data = {"kind": type(domain).__name__}
+    described: dict[str, Any] = {"name": name, **data, "text": repr(domain)}
+    if unit is not None:
+        described["unit"] = unit
+    return described | {"columns": list(domain.columns(name))}
+
+
+def _constraint(problem: Problem) -> str | None:
+    if problem.space.where is None:
+        return None
+    try:
+        return str(problem.space.to_json()["where"])
+    except ValueError:
+        return "there is one"
+
+
+def _row(problem: Problem, frame: "pd.DataFrame", number: Any) -> dict[str, Any]:
+    own = [name for name in frame.columns if name == "rho" or name.startswith("rho.")]
+    names = [*problem.space.columns, *own, "violated", "status"]
+    names += [name for name in ("suggested", "message") if name in frame]
+    return {"row": int(number)} | {name: frame.at[number, name] for name in names}
+
+
+def _trace(simulated: Callable[[], Replay]) -> dict[str, Any]:
+    """Return what a simulation shows; nothing where it cannot be shown."""
+    try:
+        seen = simulated()
+        if seen.status != Status.OK:
+            return {}
+        why = seen.explain()
+    except Exception as error:  # A row is worth more than its picture.
+        return {"explanation": f"its trace cannot be shown: {one_line(format_error(error), 120)}"}
+    critical = [
+        {
+            "predicate": str(instant.predicate),
+            "time": instant.time,
+            "robustness": instant.robustness,
+            "share": instant.share,
+        }
+        for instant in why.critical
+    ]
+    return {
+        "explanation": f"{seen.worst}: {str(why).splitlines()[0]}",
+        "critical": critical,
+        "trace": _signals(seen),
+    }
+
+
+def _signals(seen: Replay) -> dict[str, Any]:
+    names = [*seen.problem.monitored, *seen.trace.signals]
+    clock = np.asarray(seen.trace.clock(), np.float64)
+    shown: dict[str, Any] = {}
+    for name in dict.fromkeys(names):
+        values = np.asarray(seen.trace.signals[name], np.float64)
+        if values.ndim != 1 or len(shown) == SIGNALS:
+            continue
+        places = np.unique(np.linspace(0, len(values) - 1, SAMPLES).round().astype(int))
+        shown[name] = {
+            "times": clock[places],
+            "values": values[places],
+            "least": np.min(values),
+            "greatest": np.max(values),
+        }
+    return shown
+
+
+def plain(value: Any) -> Any:
+    """Convert to what JSON has: no NumPy, no JAX, numbers of six digits, None where not finite."""
+    if isinstance(value, Mapping):
+        return {str(name): plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, np.ndarray | jax.Array | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)

@@ -1,0 +1,167 @@
+"""Questions to whoever suggests points, and the suggestions that were made.
+
+    suggestions = Suggestions(search, problem)          # of a `search.Suggested`
+    suggestions.due(rows)                               # whether it is time for a question
+    suggestions.ask(question(...), rows)                # checks what comes back, and keeps it
+    suggestions.waiting(rows)                           # points to simulate next, [n, d]
+
+What was suggested is in the checkpoint, written before the first of it is simulated: a run that
+goes on asks again for nothing that it was told.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.text import format_error, one_line
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Suggested
+from verifai_jax.search.suggested import Absent
+
+POINTS, ASKED, REFUSED = "suggested.points", "suggested.asked", "suggested.refused"
+"""Entries of a checkpoint: all points that were suggested, `[n, d]`; of each question the row at
+which it was asked and how many points came, `[k, 2]`; and what was wrong with others."""
+
+
+class SuggestionError(ValueError):
+    """A suggestion that cannot be simulated, or no suggestions at all."""
+
+
+class Suggestions:
+    """The suggestions of one run; see the module's docstring.
+
+    - `refused`: what was wrong with suggestions that were left out, one text each.
+    """
+
+    def __init__(self, search: Suggested, problem: Problem) -> None:
+        self.search, self.problem = search, problem
+        self.points = np.zeros((0, problem.space.dim), np.float32)
+        self.asked = np.zeros((0, 2), np.int64)
+        self.refused: tuple[str, ...] = ()
+        self.last_refused: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say how much was suggested, and what was left out."""
+        if not len(self.asked):
+            return ()
+        questions = f"{len(self.asked)} question{'s' * (len(self.asked) != 1)}"
+        lines = [f"suggestions of {self.search.source}: {len(self.points)} from {questions}"]
+        lines += [f"suggestion left out: {why}" for why in self.refused]
+        return tuple(lines)
+
+    def left(self) -> int:
+        """Return the number of questions that may still be asked."""
+        return self.search.times - len(self.asked)
+
+    def check_source(self) -> None:
+        """Refuse to go on without the function where there are questions left.
+
+        **Raises:** `ValueError`.
+        """
+        if self.left() > 0 and isinstance(self.search.suggest, Absent):
+            self.search.suggest({})
+
+    def due(self, rows: int) -> bool:
+        """Return whether the next question is asked when there are so many rows."""
+        if self.left() <= 0:
+            return False
+        return not len(self.asked) or rows >= int(self.asked[-1, 0]) + self.search.every
+
+    def waiting(self, rows: int) -> Float[np.ndarray, "n d"]:
+        """Return the suggested points that are not among the first `rows` rows yet."""
+        if not len(self.asked):
+            return self.points[:0]
+        begin, count = self.asked[-1]
+        done = max(rows - int(begin), 0)
+        return self.points[len(self.points) - int(count) :][done:]
+
+    def ask(self, question: dict[str, Any], rows: int) -> None:
+        """Ask, and keep the suggestions that can be simulated.
+
+        **Raises:** `SuggestionError` for what is no list of suggestions, and with `strict` for one
+        that cannot be simulated; what the function itself raises.
+        """
+        number = len(self.asked) + 1
+        points, wrong = [], []
+        for i, each in enumerate(_listed(self.search.suggest(question), self.search.source)):
+            try:
+                if i >= self.search.points:
+                    raise SuggestionError(f"only {self.search.points} were asked for")
+                points.append(point_of(self.problem, each))
+            except (TypeError, ValueError) as error:
+                why = f"number {i + 1} of question {number}: {one_line(format_error(error), 400)}"
+                if self.search.strict:
+                    raise SuggestionError(f"{self.search.source} suggested {why}") from error
+                wrong.append(why)
+        dim = self.problem.space.dim
+        self.points = np.concatenate([self.points, np.reshape(points, (-1, dim))], dtype=np.float32)
+        self.asked = np.concatenate([self.asked, [[rows, len(points)]]]).astype(np.int64)
+        self.last_refused = tuple(wrong)
+        self.refused = (*self.refused, *wrong)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Return what was suggested, as entries of a checkpoint."""
+        refused = np.array(self.refused, dtype=np.str_)
+        return {POINTS: self.points, ASKED: self.asked, REFUSED: refused}
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on with the suggestions of a checkpoint."""
+        if ASKED in checkpoint:
+            self.points = np.asarray(checkpoint[POINTS], np.float32)
+            self.asked = np.asarray(checkpoint[ASKED], np.int64)
+            self.refused = tuple(str(why) for why in checkpoint[REFUSED])
+            last = f" of question {len(self.asked)}: "
+            self.last_refused = tuple(why for why in self.refused if last in why)
+
+
+def point_of(problem: Problem, suggestion: object) -> Float[np.ndarray, " d"]:
+    """Return the point of the unit cube that a suggestion means.
+
+    **Arguments:**
+
+    - `problem`: the one that is falsified.
+    - `suggestion`: features by name, as a person writes them, or by the columns of the table;
+      columns that are none of features are ignored.
+
+    **Raises:** `TypeError` for what is no mapping; `ValueError` that names the feature for one that
+    is missing, unknown or outside its domain, and for features that break the constraint.
+    """
+    if not isinstance(suggestion, Mapping):
+        raise TypeError(f"a suggestion must be a mapping of names to values; got {suggestion!r}")
+    space = problem.space
+    flat = set(space.columns) - set(space.domains)
+    if flat and flat & set(suggestion):
+        names = [name for name in suggestion if name not in _COLUMNS]
+        check_names("column", names, space.columns)
+        features = space.from_row({name: suggestion[name] for name in names})
+        space.check(features)
+    else:
+        names = [name for name in suggestion if name not in _COLUMNS or name in space.domains]
+        check_names("feature", names, space.domains)
+        features = space.coerce({name: suggestion[name] for name in names})
+    point = np.asarray(space.flatten(features), np.float32)
+    if not np.all(np.isfinite(point)):
+        raise ValueError(f"the suggestion {dict(suggestion)!r} is no point of the space")
+    if space.constraint is not None and not np.asarray(space.constraint(point[None]))[0]:
+        raise ValueError(f"the constraint of the space refuses {dict(suggestion)!r}")
+    return point
+
+
+_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
+"""Columns of a table beside its features, which a suggestion made of a row may hold."""
+
+
+def _listed(given: object, source: str) -> list[Any]:
+    if hasattr(given, "to_dict") and hasattr(given, "columns"):
+        return list(given.to_dict("records"))  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(given, Mapping | str | bytes) or not isinstance(given, Iterable):
+        kind = type(given).__name__
+        raise SuggestionError(
+            f"{source} must return a list of suggestions, mappings of feature names to values; it "
+            f"returned {kind} {one_line(repr(given), 80)}"
+        )
+    return list(given)

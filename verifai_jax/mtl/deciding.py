@@ -1,0 +1,62 @@
+"""The predicate and the instant that decide the robustness of formulas, under `jit` and `vmap`.
+
+    predicate, sample = deciding_instant([formula], trace)
+
+The hard robustness is the value of one predicate at one instant, so that its derivative by that
+value is 1, or -1, and zero by all others: one reverse sweep of the monitor alone finds it.
+`explain` says more of one concrete trace.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.semantics import hard
+from verifai_jax.mtl.setting import prepare
+
+
+def leaves_of(formulas: Sequence[Formula]) -> tuple[Formula, ...]:
+    """Return the different predicates of formulas, in their order."""
+    every = (part for formula in formulas for part in formula.subformulas())
+    return tuple(dict.fromkeys(p for p in every if isinstance(p, ast.Predicate | ast.Atom)))
+
+
+def deciding_instant(
+    formulas: Sequence[Formula], trace: Trace, end: End = "hold"
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Find what decides the least robustness of formulas on one trace.
+
+    **Arguments:**
+
+    - `formulas`, `trace`, `end`: as for `robustness`; batches by `jax.vmap`.
+
+    **Returns:** the number of the predicate among `leaves_of(formulas)`, and of the sample, 0 and 0
+    where there is none or the robustness is not finite. Where several decide equally, one of them.
+    """
+    leaves = leaves_of(formulas)
+    trace = trace.hold()
+    if not leaves:
+        return jnp.int32(0), jnp.int32(0)
+
+    def least(nudges: Float[Array, "leaves time"]) -> Float[Array, ""]:
+        own = {leaf: nudges[i] for i, leaf in enumerate(leaves)}
+        values = []
+        for formula in formulas:
+            setting, signals, _, valid = prepare(formula, trace, hard, end, None)
+            signals = jax.lax.stop_gradient(signals)
+            evaluator = Evaluator(
+                signals, setting.length, setting.dt, end=end, valid=valid, nudges=own
+            )
+            values.append(evaluator.value(setting.formula, 0, 0)[0])
+        return jnp.min(jnp.stack(values))
+
+    dtype = jnp.result_type(float)
+    influence = jnp.abs(jax.grad(least)(jnp.zeros((len(leaves), trace.length), dtype)))
+    place = jnp.argmax(jnp.nan_to_num(influence)).astype(jnp.int32)
+    return place // trace.length, place % trace.length

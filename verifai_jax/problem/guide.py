@@ -1,0 +1,121 @@
+"""A person's term beside the robustness, which steers a search and decides nothing.
+
+    Guide("always distance > 10")                       # its robustness
+    Guide(lambda trace, features: trace["speed"].min(), weight=0.8, scale=5.0)
+
+Where the robustness says little, somebody may know what leads to a failure. A search is told a
+weighted sum of both, as in ATheNA, which joins fitness that is made of the requirement with fitness
+that an engineer defines (Formica, Fan, Menghi, Search-based software testing driven by
+automatically generated and manually defined fitness functions, ACM Transactions on Software
+Engineering and Methodology, arXiv:2207.11016, 2022). Verdicts, the robustness of the table,
+confirmation and estimates know nothing of it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from verifai_jax.core.checks import check_fraction, check_positive
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl import Formula, hard, parse, robustness
+from verifai_jax.mtl.evaluate import End
+
+Term = Callable[[Trace, Mapping[str, PyTree]], Float[Array, ""] | float]
+"""A function of a trace and the features to a number, less where it is nearer to a failure."""
+
+
+@dataclass(frozen=True, init=False)
+class Guide:
+    """A term that steers a search.
+
+    The search is told `(1 - weight) * robustness + weight * t` of a simulation that keeps the
+    property, where `t = (1 + g / (abs(g) + scale)) / 2` lies between 0 and 1 and rises with the
+    term's value `g`; so it never takes a safe simulation for a failure. Of one that breaks the
+    property it is told the robustness.
+
+    **Arguments:**
+
+    - `term`: a formula or its text, of which the robustness serves, or a function of the trace and
+      the features, pure and traceable by JAX, also for a black box; less is nearer to a failure.
+    - `weight`: of the term, above 0; with 1 the robustness of safe simulations says nothing.
+    - `scale`: the size of values of the term that matters, in its unit.
+
+    **Raises:** `TypeError` for a term that is neither; `ValueError` for a formula that does not
+    parse, or numbers out of range.
+    """
+
+    term: Formula | Term
+    weight: float
+    scale: float
+
+    def __init__(
+        self, term: "Formula | str | Term", weight: float = 0.5, scale: float = 1.0
+    ) -> None:
+        if isinstance(term, str):
+            term = parse(term)
+        if not isinstance(term, Formula) and not callable(term):
+            raise TypeError(
+                "a guide must be a formula, its text, or a function of a trace and the features; "
+                f"got {term!r}"
+            )
+        check_fraction("weight of a guide", weight, one=True)
+        check_positive("scale of a guide", scale, finite=True)
+        object.__setattr__(self, "term", term)
+        object.__setattr__(self, "weight", float(weight))
+        object.__setattr__(self, "scale", float(scale))
+
+    def value(
+        self, trace: Trace, features: Mapping[str, PyTree], end: End = "hold"
+    ) -> Float[Array, ""]:
+        """Return the value of the term on one trace; traced by JAX.
+
+        **Raises:** what the formula does for a signal that there is not; `TypeError` for a function
+        that returns no number.
+        """
+        if isinstance(self.term, Formula):
+            return robustness(self.term, trace, hard, end)
+        value = jnp.asarray(self.term(trace, features))
+        if value.shape != ():
+            raise TypeError(
+                f"the guide {self.describe()} must return one number; got shape {list(value.shape)}"
+            )
+        return value.astype(jnp.result_type(float))
+
+    def share(self, value: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Return what a value of the term adds, between 0 and 1; 1 where it is not a number."""
+        part = value / (jnp.abs(value) + self.scale)
+        # An infinite value is the end of what can be added.
+        part = jnp.where(jnp.isinf(value), jnp.sign(value), part)
+        return jnp.where(jnp.isnan(value), 1.0, 0.5 * (1 + part))
+
+    def steer(
+        self, told: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        """Return what a search is told instead; failures, and rows without a verdict, as they are.
+
+        **Arguments:**
+
+        - `told`: the robustness, or whatever a search is told otherwise.
+        - `value`: of the term.
+        """
+        # In NumPy: of an array of JAX each first use of this kind compiles a program.
+        known = np.where(np.isfinite(value), value, 0.0).astype(np.float64)
+        part = np.where(np.isinf(value), np.sign(value), known / (np.abs(known) + self.scale))
+        share = np.where(np.isnan(value), 1.0, 0.5 * (1 + part))
+        steered = (1 - self.weight) * told + self.weight * share
+        return np.where(told >= 0, steered, told).astype(told.dtype)
+
+    def describe(self) -> str:
+        """Return the formula, or the name of the function."""
+        if isinstance(self.term, Formula):
+            return str(self.term)
+        name = getattr(self.term, "__qualname__", type(self.term).__qualname__)
+        return f"{getattr(self.term, '__module__', None) or '__main__'}:{name}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Describe the guide as plain data, for the record."""
+        return {"term": self.describe(), "weight": self.weight, "scale": self.scale}

@@ -1,0 +1,127 @@
+"""Suggestions of a person or of a language model, from which another search works on.
+
+    Suggested(ask_me)
+    Suggested(ask_a_model, CMAES(), times=6, every=500, points=4, units={"mass": "kg"})
+
+    def ask_me(question):
+        print(question["problem"], question["worst"])
+        return [{"mass": 1.2, "wind": "strong"}]
+
+`falsify` asks at the start and between rounds, simulates what is suggested, and tells the search
+inside, whose descents then start from there; see `falsification/suggestions.py` for what a question
+holds.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NoReturn, TypeAlias
+
+from jaxtyping import Array, Float, Key, PyTree
+
+from verifai_jax.core.checks import check_count
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Observations, Search
+from verifai_jax.search.portfolio import Portfolio
+
+Suggest: TypeAlias = Callable[[dict[str, Any]], Iterable[Mapping[str, Any]]]
+"""A function of a question, plain data as of JSON, that returns features by name, several times."""
+
+
+@dataclass(frozen=True)
+class Suggested(Search[PyTree]):
+    """Another search, to which a function gives points on the way.
+
+    **Arguments:**
+
+    - `suggest`: called with a question, returns a list of suggestions: features by name, as a
+      person writes them, or by the columns of the table. An empty list is no suggestion.
+    - `search`: the one that goes on from them; it must learn.
+    - `times`: questions of a run at most, the first of them before any simulation.
+    - `every`: simulations from one question to the next, at least.
+    - `points`: suggestions that are wanted of a question.
+    - `rows`: rows of the table that a question holds at most, the last ones.
+    - `worst`: rows with the least robustness that a question holds with their traces. Each is
+      simulated once more for it.
+    - `units`: of features, by name, such as `{"mass": "kg"}`; for the question alone.
+    - `context`: whatever else the function should know; for the question alone.
+    - `strict`: end the run at a suggestion that cannot be simulated. Otherwise it is left out, the
+      notes of the run say so, and so does the next question.
+
+    **Raises:** `TypeError` for what is no function or no search; `ValueError` for a search that
+    does not learn, or numbers out of range.
+    """
+
+    suggest: Suggest
+    search: Search = field(default_factory=Portfolio)
+    times: int = 4
+    every: int = 128
+    points: int = 4
+    rows: int = 100
+    worst: int = 3
+    units: Mapping[str, str] = field(default_factory=dict)
+    context: str = ""
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        if not callable(self.suggest):
+            raise TypeError(
+                f"suggest must be a function of a question that returns suggestions; got "
+                f"{self.suggest!r}"
+            )
+        if not isinstance(self.search, Search) or isinstance(self.search, Suggested):
+            raise TypeError(f"Suggested needs a search like Portfolio(); got {self.search!r}")
+        if not self.search.learns:
+            raise ValueError(
+                f"search {self.search!r} does not learn, so that suggestions would change nothing "
+                "of it; give one that does, such as Portfolio(), or simulate them alone with "
+                "falsify(first=...)"
+            )
+        check_count("times", self.times)
+        check_count("every", self.every)
+        check_count("points", self.points)
+        check_count("rows", self.rows, 0)
+        check_count("worst", self.worst, 0)
+        if not isinstance(self.units, Mapping):
+            raise TypeError(f"units must be texts by the name of a feature; got {self.units!r}")
+
+    @property
+    def source(self) -> str:
+        """Name of the function that suggests."""
+        if isinstance(self.suggest, Absent):
+            return self.suggest.source
+        name = getattr(self.suggest, "__qualname__", type(self.suggest).__qualname__)
+        return f"{getattr(self.suggest, '__module__', None) or '__main__'}:{name}"
+
+    def check(self, cube: Cube) -> None:
+        """Raise `ValueError`: suggestions are asked for between the rounds of `falsify` alone."""
+        raise ValueError(
+            "suggestions are asked for between the rounds of vj.falsify and vj.resume, so "
+            f"Suggested must be their search itself, and no part of another one; got it with "
+            f"{self.search!r} inside"
+        )
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PyTree:
+        return self.search.init(key, cube, batch)
+
+    def ask(self, state: PyTree, cube: Cube, batch: int) -> tuple[Float[Array, "batch d"], PyTree]:
+        return self.search.ask(state, cube, batch)
+
+    def tell(self, state: PyTree, cube: Cube, observations: Observations) -> PyTree:
+        return self.search.tell(state, cube, observations)
+
+    def __repr__(self) -> str:
+        return f"Suggested({self.source}, {self.search!r})"
+
+
+@dataclass(frozen=True)
+class Absent:
+    """The function of a run that was loaded, of which the record has only the name."""
+
+    source: str
+
+    def __call__(self, question: dict[str, Any]) -> NoReturn:
+        """Raise `ValueError`."""
+        raise ValueError(
+            f"the suggestions of this run came from {self.source}, which a record does not hold; "
+            "give it: resume(..., search=vj.search.Suggested(function, ...))"
+        )
