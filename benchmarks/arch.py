@@ -3,6 +3,7 @@
     python benchmarks/arch.py                           # instance 2, all requirements: 20 minutes
     python benchmarks/arch.py at1 at6b --searches portfolio gradient
     python benchmarks/arch.py --instance 1
+    python benchmarks/arch.py sb1 sb2 sb3 sb4 sb5 --lstm FOLDER --budget 1000 --searches portfolio
 
 For each requirement and search, from 50 seeds, one simulation a round: the falsification rate FR,
 and the mean number of simulations S of the seeds that falsify, where a simulation that was
@@ -11,7 +12,8 @@ failures are confirmed by replays in double precision, at half and at a quarter 
 (`vj.confirm`), which is what `falsify` claims. Next to them a published FR and mean S with its
 tool: the lowest that could be read for these models, which leaves out tools whose numbers for each
 requirement could not (FReaK of 2024 reports fewer simulations than all participants of 2022 on most
-of them). Other solvers, other seeds, partly freer inputs.
+of them). Other solvers, other seeds, partly freer inputs. SB's networks carry no licence: they are
+read from a folder (`specs/arch/lstm.py`).
 """
 
 import argparse
@@ -24,6 +26,7 @@ import numpy as np
 import pandas as pd
 
 import verifai_jax as vj
+from specs.arch.lstm import from_folder
 
 MODELS = (
     "automatic_transmission",
@@ -86,8 +89,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--budget", type=int)
     parser.add_argument("--instance", type=int, choices=[1, 2], default=2)
+    parser.add_argument("--lstm", help="folder with the networks of SB1 to SB5")
     chosen = parser.parse_args()
     problems = requirements()
+    if chosen.lstm:
+        problems |= {problem.name: problem for problem in from_folder(chosen.lstm)}
     names = chosen.names or [
         name if chosen.instance == 2 else f"{name}_instance1"
         for name in INSTANCE_2

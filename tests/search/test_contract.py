@@ -10,7 +10,16 @@ from checked_types import unchecked
 from playing import tell_of
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search import CrossEntropy, Gradient, Halton, Mutation, Uniform, named, names
+from verifai_jax.search import (
+    CrossEntropy,
+    Descent,
+    Gradient,
+    Halton,
+    Mutation,
+    Uniform,
+    named,
+    names,
+)
 from verifai_jax.testing import check_batch_independence, check_search
 
 # A small model says the same of the contract and compiles sooner.
@@ -31,6 +40,7 @@ CUBES = {
 
 REFUSED = {
     ("Gradient", CUBES["discrete"]): "at least one continuous feature; all 2 unit",
+    ("Descent", CUBES["discrete"]): "at least one continuous feature; all 2 unit",
     ("Grid", CUBES["wide"]): "grid",
 }
 
@@ -121,7 +131,13 @@ def test_active_searches_do_learn(search):
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("search", "spoil"),
-    [(CrossEntropy(), "invalid"), (Gradient(), "invalid"), (Gradient(), "nan gradient")],
+    [
+        (CrossEntropy(), "invalid"),
+        (Gradient(), "invalid"),
+        (Gradient(), "nan gradient"),
+        (Descent(), "invalid"),
+        (Descent(), "nan gradient"),
+    ],
     ids=str,
 )
 def test_useless_batches_leave_a_search_alive(search, spoil):
@@ -174,6 +190,8 @@ class TestNames:
             (lambda: Gradient(temperatures=(0.1, float("nan"))), "temperatures must be positive"),
             (lambda: Gradient(temperatures=()), "temperatures must have at least one entry"),
             (lambda: Gradient(descents=0), "descents must be an integer of at least 1; got 0"),
+            (lambda: Descent(kept=0), r"kept must be in \(0, 1\]; got 0"),
+            (lambda: Descent(hottest=0), "hottest must be positive and finite; got 0"),
             (lambda: Mutation(kept=3), "kept must be an integer of at least 6; got 3"),
             (lambda: Cube((0, -1)), r"levels must not be negative; got \(0, -1\)"),
         ],

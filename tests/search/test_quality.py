@@ -17,6 +17,7 @@ from verifai_jax.search import (
     Annealing,
     Bandit,
     CrossEntropy,
+    Descent,
     EpsilonGreedy,
     Gradient,
     Mutation,
@@ -27,6 +28,7 @@ from verifai_jax.search import (
 GAIN = {
     CrossEntropy(): 6,
     Gradient(): 8,
+    Descent(): 6,
     CMAES(): 4,
     Bandit(): 4,
     EpsilonGreedy(): 4,
@@ -35,7 +37,7 @@ GAIN = {
     Portfolio(): 2,
 }
 # Ripples point a descent into the next of many hollows, and choices have no slope.
-POINTLESS = {(Gradient, "ripples"), (Gradient, "mixed"), (Gradient, "needle")}
+POINTLESS = {(Descent, "ripples"), (Gradient, "ripples"), (Gradient, "mixed"), (Gradient, "needle")}
 # A program of all members takes long to compile.
 LARGE = (Portfolio, CMAES)
 EACH = pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from verifai_jax.search.ce_compat import CECompat as CECompat
 from verifai_jax.search.cmaes import CMAES as CMAES
 from verifai_jax.search.coverage import Coverage as Coverage
 from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
+from verifai_jax.search.descent import Descent as Descent
 from verifai_jax.search.diverse import Diverse as Diverse
 from verifai_jax.search.diverse import distinct as distinct
 from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
@@ -46,6 +47,7 @@ __all__ = [
     "Coverage",
     "CrossEntropy",
     "Cube",
+    "Descent",
     "Diverse",
     "EpsilonGreedy",
     "Gradient",
@@ -91,6 +93,7 @@ _SEARCHES: dict[str, type[Search]] = {
     "mutation": Mutation,
     "coverage": Coverage,
     "gradient": Gradient,
+    "descent": Descent,
     "portfolio": Portfolio,
 }
 

@@ -1,0 +1,238 @@
+"""Descent into the interior of the space: Adam on the smooth robustness, from many starts.
+
+    vj.falsify(problem, "descent")
+    vj.falsify(problem, search.Descent(rate=0.03, steps=80))
+
+Failures need not lie at corners: a network that was trained to fail rarely does so in small regions
+anywhere. Each descent follows the gradient of the greatest clause (of several, their gradients
+weighted by a softmax) with Adam's steps (Kingma, Ba, Adam: a method for stochastic optimization,
+ICLR 2015, algorithm 1), projected to the cube, while steps and temperature fall.
+
+Most starts lead to minima that are no failures, and which ones is seen early. So a descent goes on
+only where it is among the best of those that came as far: at 1, 2, 4 ... times `trial` steps the
+better share `kept`, decided one by one as they come (asynchronous successive halving: Li,
+Jamieson, Rostamizadeh et al., A system for massively parallel hyperparameter tuning, MLSys 2020,
+algorithm 2). Each start is a new point of a sequence that fills the space evenly, or a good
+point of another search; the latter are not compared, since they would always be ahead.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
+
+from verifai_jax.core.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.cube import Cube
+from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.gradient import NOTHING
+from verifai_jax.search.halton import halton_points
+
+FIRST_DECAY, SECOND_DECAY = 0.9, 0.99
+"""Decay of Adam's means of the gradient and of its square; the latter for short descents."""
+
+NEARER = 0.5
+"""Factor on the steps of a descent that starts from a good point."""
+
+CLEARLY = 0.995
+"""Share of the least value so far below which a new one is clearly less."""
+
+REMEMBERED = 32
+"""Latest descents at each rung among which one must be good to go on."""
+
+
+class DescentState(NamedTuple):
+    key: Key[Array, ""]
+    starts: UInt32[Array, ""]  # how many starts were made
+    point: Float[Array, "descents d"]
+    mean: Float[Array, "descents d"]  # of the gradients, and of their squares
+    square: Float[Array, "descents d"]
+    step: Int[Array, " descents"]  # gradients taken since the start; 0 for a descent yet to start
+    best: Float[Array, " descents"]  # least greatest clause since the start
+    slow: Int[Array, " descents"]  # gradients since it fell clearly
+    given: Bool[Array, " descents"]  # descents whose start came from elsewhere
+    offered: Float[Array, "descents d"]  # starts from elsewhere
+    near: Float[Array, " descents"]  # their robustness; infinite where there is none
+    rungs: Float[Array, "rungs remembered"]  # the best of the latest descents that came so far
+    useless: Int[Array, ""]  # starts in a row whose gradients were zero or not finite
+
+
+@dataclass(frozen=True)
+class Descent(Search[DescentState]):
+    """Adam from many starts; discrete coordinates keep their start's value.
+
+    **Arguments:**
+
+    - `descents`: at once, at most; the batch if that is less.
+    - `rate`: size of the first steps, in unit coordinates; they fall to a twentieth.
+    - `steps`: gradients of a descent, at most.
+    - `trial`: steps after which a descent is first compared with others.
+    - `kept`: share of the descents that go on, at each comparison.
+    - `hottest`, `coldest`: temperature of the smooth robustness at the start and at the end of a
+      descent, in units of the spread of the predicates.
+    - `patience`: gradients in a row without a clearly lower point after which a descent ends.
+
+    **Raises:** `ValueError` for values out of range; `check` for a space without continuous
+    features.
+    """
+
+    descents: int = 64
+    rate: float = 0.06
+    steps: int = 48
+    trial: int = 4
+    kept: float = 0.5
+    hottest: float = 0.4
+    coldest: float = 0.04
+    patience: int = 10
+    wants_clauses: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_count("descents", self.descents)
+        check_count("steps", self.steps)
+        check_count("trial", self.trial)
+        check_fraction("rate", self.rate, one=True)
+        check_fraction("kept", self.kept, one=True)
+        check_positive("hottest", self.hottest, finite=True)
+        check_positive("coldest", self.coldest, finite=True)
+        check_count("patience", self.patience)
+
+    def check(self, cube: Cube) -> None:
+        """Raise `ValueError` unless there is a continuous coordinate to move in."""
+        if cube.dim and len(cube.continuous) == 0:
+            raise ValueError(
+                f"search descent needs at least one continuous feature; all {cube.dim} unit "
+                "coordinates of this space are discrete. Use 'cross_entropy'"
+            )
+
+    @property
+    def rungs(self) -> tuple[int, ...]:
+        """Steps at which a descent is compared with others."""
+        found = [self.trial]
+        while 2 * found[-1] < self.steps:
+            found.append(2 * found[-1])
+        return tuple(found)
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> DescentState:
+        n, d = min(self.descents, batch), cube.dim
+        return DescentState(
+            key=key,
+            starts=jnp.uint32(0),
+            point=jnp.full((n, d), 0.5, jnp.float32),
+            mean=jnp.zeros((n, d), jnp.float32),
+            square=jnp.zeros((n, d), jnp.float32),
+            step=jnp.zeros(n, jnp.int32),
+            best=jnp.full(n, jnp.inf, jnp.float32),
+            slow=jnp.zeros(n, jnp.int32),
+            given=jnp.zeros(n, bool),
+            offered=jnp.full((n, d), 0.5, jnp.float32),
+            near=jnp.full(n, jnp.inf, jnp.float32),
+            rungs=jnp.full((len(self.rungs), REMEMBERED), jnp.inf, jnp.float32),
+            useless=jnp.int32(0),
+        )
+
+    def ask(
+        self, state: DescentState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], DescentState]:
+        fresh = state.step == 0
+        number = state.starts + jnp.cumsum(fresh).astype(jnp.uint32)
+        points = halton_points(number, cube.dim, state.key)
+        points = jnp.where(jnp.isfinite(state.near)[:, None], state.offered, points)
+        point = jnp.where(fresh[:, None], points, state.point)
+        state = state._replace(
+            point=point,
+            starts=state.starts + jnp.sum(fresh).astype(jnp.uint32),
+            given=jnp.where(fresh, jnp.isfinite(state.near), state.given),
+            near=jnp.where(fresh, jnp.inf, state.near),
+        )
+        return point[jnp.arange(batch) % len(point)], state
+
+    def plan(self, state: DescentState, cube: Cube, batch: int) -> Plan:
+        n = len(state.step)
+        cooled = (self.coldest / self.hottest) ** self._progress(state.step)
+        temperature = (self.hottest * cooled).astype(jnp.float32)
+        return Plan(jnp.int32(n), jnp.array(True), temperature[jnp.arange(batch) % n])
+
+    def tell(self, state: DescentState, cube: Cube, observations: Observations) -> DescentState:
+        assert observations.clauses is not None, "the descent search needs clauses"
+        assert observations.clause_gradients is not None
+        n = len(state.step)
+        told = jax.tree.map(lambda each: each[:n], observations)
+        clauses = _clauses(told)
+        usable = told.usable
+        # The greatest clause counts most: the gradient of a maximum that is smooth.
+        weights = jax.nn.softmax(clauses / self.coldest, axis=1)
+        gradients = jnp.where(usable[:, None, None], told.clause_gradients, 0.0)
+        gradient = jnp.sum(weights[:, :, None] * gradients, axis=1)
+        gradient = jnp.where(np.array(cube.levels) == 0, gradient, 0.0)
+        informative = jnp.all(jnp.isfinite(gradient), axis=1) & jnp.any(gradient != 0, axis=1)
+        informative &= usable
+        gradient = jnp.where(informative[:, None], gradient, 0.0)
+
+        merit = jnp.where(usable, jnp.max(clauses, axis=1), jnp.inf)
+        best = jnp.minimum(state.best, merit)
+        step = state.step + 1
+        slow = jnp.where(merit < CLEARLY * state.best, 0, state.slow + 1)
+        over = ~informative | (told.rho < 0) | (step >= self.steps) | (slow >= self.patience)
+        rungs = state.rungs
+        for i, rung in enumerate(self.rungs):
+            arrives = (step == rung) & ~over & ~state.given
+            rungs = rungs.at[i].set(_latest(rungs[i], jnp.where(arrives, best, jnp.inf)))
+            there = jnp.sum(jnp.isfinite(rungs[i]))
+            place = jnp.ceil(self.kept * there).astype(jnp.int32) - 1
+            limit = jnp.sort(rungs[i])[jnp.maximum(place, 0)]
+            over |= arrives & (best > limit)
+
+        mean = FIRST_DECAY * state.mean + (1 - FIRST_DECAY) * gradient
+        square = SECOND_DECAY * state.square + (1 - SECOND_DECAY) * gradient**2
+        count = step[:, None].astype(jnp.float32)
+        direction = mean / (1 - FIRST_DECAY**count)
+        direction /= jnp.sqrt(square / (1 - SECOND_DECAY**count)) + 1e-12
+        falling = 0.525 + 0.475 * jnp.cos(np.pi * self._progress(state.step))
+        rate = self.rate * jnp.where(state.given, NEARER, 1.0) * falling
+        point = jnp.clip(state.point - rate[:, None] * direction, 0.0, 1.0)
+
+        def kept(new: Array, fresh: float) -> Array:
+            return jnp.where(over.reshape(-1, *(1,) * (new.ndim - 1)), fresh, new)
+
+        useless = state.useless + jnp.sum(usable & ~informative)
+        return state._replace(
+            point=point,
+            mean=kept(mean, 0.0),
+            square=kept(square, 0.0),
+            step=kept(step, 0).astype(jnp.int32),
+            best=kept(best, jnp.inf),
+            slow=kept(slow, 0).astype(jnp.int32),
+            rungs=rungs,
+            useless=jnp.where(jnp.any(informative), 0, useless).astype(jnp.int32),
+        )
+
+    def warm_start(
+        self, state: DescentState, cube: Cube, observations: Observations
+    ) -> DescentState:
+        """Start the first descents from the points nearest to failing, failures left out."""
+        usable = observations.usable & (observations.rho >= 0)
+        rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), state.near])
+        points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.offered])
+        _, nearest = jax.lax.top_k(-rho, len(state.near))
+        return state._replace(offered=points[nearest], near=rho[nearest])
+
+    def _progress(self, step: Int[Array, " n"]) -> Float[Array, " n"]:
+        return jnp.minimum(step / max(self.steps - 1, 1), 1.0).astype(jnp.float32)
+
+
+def _clauses(told: Observations) -> Float[Array, "n clauses"]:
+    """Return the clauses, and of a single one the robustness, whose scale does not change."""
+    assert told.clauses is not None
+    several = told.clauses[:, 1] > NOTHING
+    first = jnp.where(several, told.clauses[:, 0], told.rho)
+    clauses = told.clauses.at[:, 0].set(first)
+    return jnp.where(told.usable[:, None], clauses, 0.0)
+
+
+def _latest(remembered: Float[Array, " m"], new: Float[Array, " n"]) -> Float[Array, " m"]:
+    """Put the finite ones of new numbers before those that are remembered."""
+    both = jnp.concatenate([new, remembered])
+    order = jnp.argsort(~jnp.isfinite(both), stable=True)
+    return both[order][: len(remembered)]
