@@ -109,6 +109,15 @@ def interrupted():
     raise KeyboardInterrupt
 
 
+def test_what_is_traced_is_said_as_well():
+    with tracing("the search"):
+        assert describe_compilation() == "compiling the search, 0 s"
+        with tracing("gradients"), tracing():
+            assert describe_compilation() == "compiling gradients, 0 s"
+        assert describe_compilation() == "compiling the search, 0 s"
+    assert describe_compilation() == ""
+
+
 def test_the_collector_waits_while_programs_are_traced():
     assert gc.isenabled()
     with tracing():

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Literal
 
@@ -106,20 +106,42 @@ def while_compiling(work: Callable[[], object]) -> None:
 
 
 @contextmanager
-def tracing() -> Iterator[None]:
+def tracing(name: str = "") -> Iterator[None]:
     """Return a context, or a decorator, for tracing programs: the garbage collector waits.
 
     What is traced is millions of small objects that live until all is compiled. The collector
     would look at all of them again and again, for a fifth of the time.
+
+    **Arguments:**
+
+    - `name`: of the program, which `describe_compilation` then says already; none by default.
     """
-    if not gc.isenabled():
-        yield
-        return
-    gc.disable()
+    with _said(name) if name else nullcontext():
+        if not gc.isenabled():
+            yield
+            return
+        gc.disable()
+        try:
+            yield
+        finally:
+            gc.enable()
+
+
+@contextmanager
+def _said(name: str) -> Iterator[None]:
+    """Return a context in which this thread is said to compile the program."""
+    place = threading.get_ident()
+    with _lock:
+        before = _running.get(place)
+        _running[place] = (name, time.perf_counter())
     try:
         yield
     finally:
-        gc.enable()
+        with _lock:
+            if before is None:
+                del _running[place]
+            else:
+                _running[place] = before
 
 
 def describe_compilation() -> str:
@@ -145,15 +167,9 @@ def _cancel_waiting() -> None:
 
 
 def _compiled(name: str, lowered: jax.stages.Lowered, effort: Effort) -> jax.stages.Compiled:
-    place = threading.get_ident()
-    with _lock:
-        _running[place] = (name, time.perf_counter())
-    try:
+    with _said(name):
         options = _options(effort)
         return lowered.compile(compiler_options=options) if options else lowered.compile()
-    finally:
-        with _lock:
-            del _running[place]
 
 
 @cache

@@ -197,7 +197,7 @@ class Engine:
 
         Traces the program, and raises what that raises.
         """
-        with tracing(), in_precision(self.precision):
+        with tracing(self.inputs.purpose), in_precision(self.precision):
             program = self._trace("evaluate").jaxpr.jaxpr
         used = program.invars[len(jax.tree.leaves(self.inputs.row_form))]
         return any(used is value for step in program.eqns for value in step.invars)
@@ -267,7 +267,7 @@ class Engine:
         started = time.perf_counter()
         differentiates = self.gradient and mode == "evaluate"
         name = "gradients" if differentiates else self.inputs.purpose
-        with tracing():
+        with tracing(name):
             lowered = self._trace(mode).lower()
             self._compiling[mode] = compile_soon(name, lowered, self.effort)
         self.compile_seconds += time.perf_counter() - started

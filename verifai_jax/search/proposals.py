@@ -338,7 +338,7 @@ class SearchProgram(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-@tracing()
+@tracing("the search")
 def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> SearchProgram:
     """Compile `init / ask / tell` of one search on one cube, in the background, side by side."""
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))

@@ -326,6 +326,27 @@ def test_the_step_belongs_to_the_environment_unless_it_is_said_not_to():
     assert brax(Slide(), lambda observation: 0.0, steps=3, exact_step=False).can_refine
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("options", [{}, {"features": {"g": "gravity[2]"}}])
+def test_one_program_replays_at_every_step(options):
+    pole = brax(
+        "inverted_pendulum", lambda observation: 0.1, steps=8, backend="generalized",
+        exact_step=False, initial={"angle": "q[1]"}, signals={"x": 0, "angle": 1}, **options,
+    )  # fmt: skip
+    assert pole.traced_factor
+    assert not brax(Slide(), push, steps=3, exact_step=False).traced_factor
+    features = {"angle": jnp.float32(0.1)} | ({"g": jnp.float32(-3.0)} if options else {})
+    any_step = jax.jit(lambda factor: pole.refined(factor)(features, KEY).signals)
+    found = []
+    for factor in (1, 4):
+        finer = pole.refined(factor)
+        expected = jax.jit(lambda finer=finer: finer(features, KEY).signals)()
+        found.append(any_step(jnp.int32(factor)))
+        for name in ("x", "angle"):
+            np.testing.assert_allclose(found[-1][name], expected[name], rtol=1e-5, atol=1e-6)
+    assert np.abs(found[0]["x"] - found[1]["x"]).max() > 1e-5
+
+
 def test_an_error_within_brax_names_the_versions():
     class Broken(Slide):
         def step(self, state, action):

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.errors import (
@@ -32,6 +33,7 @@ from verifai_jax.systems.environments.brax_model import (
     check_parts_are_read,
     explain_errors,
     joint_place,
+    steps_plainly,
     system_place,
     with_finer_step,
     with_start,
@@ -97,8 +99,16 @@ class Brax(System):
             "unless the model asks for one iteration; the other backends have fixed loops"
         )
 
-    def refined(self, factor: int) -> "Brax":
+    @property
+    def traced_factor(self) -> bool:
+        """True where JAX may trace the factor of `refined`."""
+        return not self.exact_step and steps_plainly(self.env)
+
+    def refined(self, factor: int | Int[Array, ""]) -> "Brax":
         """Return the same episode, decided and sampled as before, at a `factor` times smaller step.
+
+        The factor may be traced where `traced_factor` says so: one program then replays at every
+        step.
 
         **Raises:** `ValueError` for a factor that is not a positive integer, for an environment
         whose step belongs to it, and for one that is another model at another step (backends spring
@@ -109,7 +119,8 @@ class Brax(System):
                 f"the step belongs to {self.name} (exact_step=True), so a finer one would simulate "
                 "another environment; to take its step for an approximation, give exact_step=False"
             )
-        check_factor(factor)
+        if not isinstance(factor, jax.Array):
+            check_factor(factor)
         return replace(self, env=with_finer_step(self.env, factor, self.name))
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:

@@ -11,13 +11,14 @@ import importlib.metadata
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.core.errors import UnknownNameError, require, unknown_name
 from verifai_jax.systems.environments.episode import used_inputs
@@ -207,8 +208,10 @@ def with_system(env: Env, sys: BraxSystem) -> Any:
     return other
 
 
-def with_finer_step(env: Env, factor: int, name: str) -> Any:
+def with_finer_step(env: Env, factor: int | Int[Array, ""], name: str) -> Any:
     """Return a copy of the environment with a `factor` times smaller step of its physics.
+
+    JAX may trace the factor where the environment `steps_plainly`.
 
     **Raises:** `ValueError` for one whose physics is another at another step.
     """
@@ -227,7 +230,33 @@ def with_finer_step(env: Env, factor: int, name: str) -> Any:
     sys = other.sys
     other.sys = sys.tree_replace({"opt.timestep": sys.opt.timestep / factor})
     other._n_frames = frames * factor
+    if isinstance(factor, jax.Array):
+        other.__class__ = _with_counted_frames(type(other))
     return other
+
+
+def steps_plainly(env: Env) -> bool:
+    """Return whether a step of the environment is Brax's own loop over frames of its physics."""
+    pipeline = require("brax.envs.base", extra="brax").PipelineEnv
+    kind = type(env.unwrapped)
+    plain = getattr(kind, "pipeline_step", None) is getattr(pipeline, "pipeline_step", ...)
+    return plain and "pipeline_step" not in vars(env.unwrapped)
+
+
+@cache
+def _with_counted_frames(kind: type) -> type:
+    """Return the class of an environment whose number of frames JAX traces.
+
+    Brax scans over the frames, of which it has to know the number.
+    """
+
+    def pipeline_step(self: Any, state: Any, action: Array) -> Any:
+        def frame(_: Any, state: Any) -> Any:
+            return self._pipeline.step(self.sys, state, action, self._debug)
+
+        return jax.lax.fori_loop(0, self._n_frames, frame, state)
+
+    return type(kind.__name__, (kind,), {"pipeline_step": pipeline_step})
 
 
 def with_start(env: Env, values: Mapping[Place, ArrayLike]) -> Any:
