@@ -21,6 +21,7 @@ from jaxtyping import Array, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl.clauses import ABSENT
@@ -405,6 +406,12 @@ def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observat
         first = (u[:, :1] * 5).astype(jnp.int32) if cube.dim else jnp.zeros((len(u), 1), jnp.int32)
         marks = jnp.concatenate([first, jnp.where(rho[:, None] < 0, 7, -1)], axis=1)
         observations = observations._replace(marks=marks)
+    if search.wants_outcomes:
+        # One of two predicates decides, and the shape follows the first coordinate.
+        first = u[:, :1] if cube.dim else jnp.zeros((len(u), 1), jnp.float32)
+        shape = jnp.broadcast_to(first, (len(u), OUTCOME - 2))
+        outcomes = jnp.concatenate([jnp.round(first), 0.5 * first, shape], axis=1)
+        observations = observations._replace(outcomes=outcomes)
     if not search.wants_clauses:
         return observations
     plan = search.plan(pending, cube, len(u))

@@ -63,6 +63,11 @@ if TYPE_CHECKING:
     help="Claim only what closer replays confirm  [default: confirm]",
 )
 @click.option("--diverse", is_flag=True, help="Look for failures of different kinds.")
+@click.option(
+    "--diverse-by",
+    type=click.Choice(["inputs", "behaviour"]),
+    help="Of kinds that differ in this  [default: inputs]",
+)
 @RUN_FOLDER
 @PICTURES
 @PROGRESS
@@ -90,6 +95,7 @@ def falsify(
     shard: str | None,
     confirm: bool,
     diverse: bool,
+    diverse_by: Literal["inputs", "behaviour"] | None,
     folder: Path | None,
     pictures: bool,
     progress: bool | None,
@@ -108,7 +114,8 @@ def falsify(
     if shard is not None:
         alone = {"--resume": resume, "--cluster": cluster, "--warm-start": warm_start}
         alone |= {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
-        alone |= {"--decide": decide, "--diverse": diverse or None, "--fail-on": fail_on}
+        alone |= {"--decide": decide, "--diverse": diverse or None, "--diverse-by": diverse_by}
+        alone |= {"--fail-on": fail_on}
         for option, value in alone.items():
             if value is not None:
                 raise click.UsageError(f"{option} needs all rows of a run; --shard has a part")
@@ -166,7 +173,7 @@ def falsify(
                 precision=precision or "float32",
                 backend=backend,
                 confirm=confirm,
-                diverse=diverse,
+                diverse=diverse_by or diverse,
                 progress=progress,
                 target=target,
                 executor=executor,

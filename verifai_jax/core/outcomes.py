@@ -2,8 +2,8 @@
 
 An outcome is `OUTCOME` numbers: the number of the predicate that decides the robustness, the
 instant at which it does as a share of the trace, and the shape of the trace: of each of the first
-`SIGNALS` signals that the formulas speak of, means over `SEGMENTS` equal parts of its time. Zero
-where there are fewer signals.
+`SIGNALS` signals, those that the formulas speak of before the others, means over `SEGMENTS` equal
+parts of its time. Zero where there are fewer signals.
 """
 
 SIGNALS = 4

@@ -59,8 +59,10 @@ def outcome_of(problem: Problem, trace: Trace) -> Float[Array, " outcome"]:
     predicate, sample = deciding_instant(formulas, trace, problem.end)
     instant = sample / max(trace.length - 1, 1)
     columns = []
-    for name in problem.monitored:
-        columns += list(signals[name].reshape(trace.length, -1).T)
+    # What formulas speak of comes first; the others tell of what leads there.
+    for name in dict.fromkeys((*problem.monitored, *sorted(signals))):
+        wide = signals[name].reshape(trace.length, -1)
+        columns += list(jnp.nan_to_num(wide[:, : SIGNALS - len(columns)]).T)
     edges = [round(i * trace.length / SEGMENTS) for i in range(SEGMENTS + 1)]
     shape = [
         # Of fewer samples than parts the same one stands for several.

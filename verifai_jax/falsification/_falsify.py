@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -95,7 +95,7 @@ def falsify(
     precision: str = "float32",
     backend: str | None = None,
     confirm: bool = True,
-    diverse: bool = False,
+    diverse: bool | Literal["inputs", "behaviour"] = False,
     first: "Rows | None" = None,
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
@@ -129,7 +129,9 @@ def falsify(
       stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
       simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
     - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
-      failures that are far from each other (`search.Diverse`).
+      failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
+      inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and
+      the shape of the trace.
     - `first`: features that are simulated before the search proposes any, and told to it where it
       learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
     - `callbacks`: functions called after each round with the number of simulations and a dictionary
@@ -176,7 +178,8 @@ def falsify(
         search, notes = adapt_search(problem, search)
         notes += notes_before(problem, search)
     if diverse:
-        search = searches.Diverse(search, capacity=max(256, stop_after or 0))
+        by = "inputs" if diverse is True else diverse
+        search = searches.Diverse(search, capacity=max(256, stop_after or 0), by=by)
     ends = _Ending(started, budget, max_seconds, stop_after, stop_when)
     warm = earlier is not None
     with new_folder(folder) as place:

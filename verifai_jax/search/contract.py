@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.search.base import Observations, Search
 
@@ -97,6 +98,8 @@ def _rows(search: Search, cube: Cube) -> Observations:
     if search.wants_marks:
         marks: Any = jax.ShapeDtypeStruct((BATCH, 4), jnp.int32)
         rows = rows._replace(marks=marks)
+    if search.wants_outcomes:
+        rows = rows._replace(outcomes=real(BATCH, OUTCOME))
     if not search.wants_clauses:
         return rows
     clauses, gradients = real(BATCH, CLAUSES), real(BATCH, CLAUSES, cube.dim)

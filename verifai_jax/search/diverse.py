@@ -2,6 +2,7 @@
 
     Diverse(CrossEntropy())
     Diverse(Gradient(), radius=0.3, capacity=100)
+    Diverse(Portfolio(), by="behaviour")
     Diverse.count(state), Diverse.archive(state)        # how many distinct failures, and where
 
 An archive holds failures no two of which are within a radius. The search inside is told that what
@@ -11,11 +12,16 @@ distinct solutions of nonlinear partial differential equations, SIAM Journal on 
 37(4), 2015). What it had learned on the way to an archived failure leads back there, so that it
 begins afresh from the best points that lie elsewhere. When it comes no nearer to a new one the
 radius shrinks, so that first the modes are found and then the insides of them filled.
+
+By behaviour, failures are apart in what happens (`search/behaviour.py`), wherever their inputs are.
+Where the robustness of all safe points is the same, it says nothing; then what is told of them
+rises with how well known their behaviour is (novelty search: Lehman, Stanley, Abandoning
+objectives: evolution through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +30,16 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.behaviour import SeenBehaviour, is_known
 
 AT_ONCE = 16
 """Failures archived in a round at most."""
+
+WAYS = ("inputs", "behaviour")
+"""What failures can be far from each other in."""
 
 ABSENT = -1e8
 """Values of clauses below mean that there is no such clause."""
@@ -46,6 +58,7 @@ class DiverseState(NamedTuple):
     verdicts: Float[Array, ""]  # and how many there were
     points: Float[Array, "batch d"]  # the best points away from the archive, to begin afresh from,
     rho: Float[Array, " batch"]  # with their own robustness; infinite where there is none
+    seen: SeenBehaviour | None  # by behaviour alone
 
 
 _Verb: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
@@ -65,6 +78,8 @@ class Diverse(Search[DiverseState]):
     - `shrink`: factor on the radius, and a new beginning for the search inside, after
     - `patience` rounds that brought no new failure and came no nearer to one.
     - `capacity`: of the archive; no more failures than that are told apart.
+    - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
+      which the radius is a share of what can differ (`search.behaviour.unlike`).
 
     **Raises:** `TypeError` for what is no search; `ValueError` for values out of range.
     """
@@ -75,6 +90,7 @@ class Diverse(Search[DiverseState]):
     shrink: float = 0.8
     patience: int = 8
     capacity: int = 256
+    by: Literal["inputs", "behaviour"] = "inputs"
 
     def __post_init__(self) -> None:
         if not isinstance(self.search, Search):
@@ -84,6 +100,8 @@ class Diverse(Search[DiverseState]):
         check_fraction("shrink", self.shrink, one=True)
         check_count("patience", self.patience)
         check_count("capacity", self.capacity)
+        if self.by not in WAYS:
+            raise unknown_name("way of being diverse", self.by, WAYS)
         if self.least_radius > self.radius:
             raise ValueError(
                 f"least_radius must be at most radius, {self.radius}; got {self.least_radius}"
@@ -100,6 +118,10 @@ class Diverse(Search[DiverseState]):
     @property
     def wants_marks(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.search.wants_marks
+
+    @property
+    def wants_outcomes(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.by == "behaviour" or self.search.wants_outcomes
 
     @property
     def samples_prior(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -146,6 +168,7 @@ class Diverse(Search[DiverseState]):
             verdicts=jnp.float32(0),
             points=jnp.full((batch, cube.dim), 0.5, jnp.float32),
             rho=jnp.full(batch, jnp.inf, jnp.float32),
+            seen=SeenBehaviour.nothing(self.capacity, batch) if self.by == "behaviour" else None,
         )
 
     def ask(
@@ -174,14 +197,33 @@ class Diverse(Search[DiverseState]):
         u = jnp.where(usable[:, None], observations.u, 0.5)
         size = jnp.sum(jnp.where(usable, jnp.abs(observations.rho), 0.0))
         before = state.count
+        happened = observations.outcomes
+        seen = state.seen
+        if seen is not None:
+            if happened is None:
+                happened = jnp.full((len(u), OUTCOME), jnp.nan, jnp.float32)
+            happened = jnp.where(usable[:, None], happened, jnp.nan)
+            safe = usable & (observations.rho >= 0)
+            seen = seen.widened(happened, jnp.where(safe, observations.rho, jnp.nan))
+            # How well it is known from the rounds before this one.
+            known = jnp.where(safe, seen.familiarity(happened, state.radius), 0.0)
+            known = jnp.where(seen.level, known, 0.0)
+            state = state._replace(seen=seen.recorded(happened))
+            rho = observations.rho + self._scale(state) * known
+            observations = observations._replace(rho=rho, outcomes=happened)
+            if observations.clauses is not None:
+                # These have no unit.
+                there = observations.clauses > ABSENT
+                clauses = observations.clauses + jnp.where(there, known[:, None], 0.0)
+                observations = observations._replace(clauses=clauses)
         state = state._replace(
             round=state.round + 1,
             size=state.size + size.astype(jnp.float32),
             verdicts=state.verdicts + jnp.sum(usable),
         )
-        state = self._archive(state, cube, u, usable & (observations.rho < 0))
+        state = self._archive(state, cube, u, happened, usable & (observations.rho < 0))
         discovered = state.count > before
-        raised = self._raise(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
+        raised = self._raise(state, cube, u, happened, jnp.where(usable, observations.rho, jnp.inf))
         nearest = jnp.min(raised, initial=jnp.inf).astype(jnp.float32)
         progress = discovered | (nearest < 0.98 * state.level) | ~jnp.isfinite(state.level)
         idle = jnp.where(progress, 0, state.idle + 1).astype(jnp.int32)
@@ -192,7 +234,8 @@ class Diverse(Search[DiverseState]):
             radius=jnp.where(tired, smaller, state.radius).astype(jnp.float32),
             level=jnp.where(discovered | tired, jnp.inf, jnp.minimum(state.level, nearest)),
         )
-        state = self._remember(state, cube, u, jnp.where(usable, observations.rho, jnp.inf))
+        rho = jnp.where(usable, observations.rho, jnp.inf)
+        state = self._remember(state, cube, u, happened, rho)
         # The best points of a fruitless period lead nowhere.
         state = state._replace(rho=jnp.where(tired, jnp.inf, state.rho))
 
@@ -205,36 +248,65 @@ class Diverse(Search[DiverseState]):
         return state._replace(inner=inner)
 
     def _archive(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], failing: Bool[Array, " n"]
+        self,
+        state: DiverseState,
+        cube: Cube,
+        u: Float[Array, "n d"],
+        happened: Float[Array, "n outcome"] | None,
+        failing: Bool[Array, " n"],
     ) -> DiverseState:
         """Archive the failures beyond the radius of all archived ones, the farthest first."""
+        seen = state.seen
+        kept = jnp.zeros((self.capacity, 0)) if seen is None else seen.archive
+        if seen is not None and happened is not None:
+            failing &= is_known(happened)
 
-        def add(_: Int[Array, ""], carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            archive, count, far = carry
+        def add(
+            _: Int[Array, ""], carry: tuple[Array, Array, Array, Array]
+        ) -> tuple[Array, Array, Array, Array]:
+            archive, kept, count, far = carry
             place = jnp.argmax(jnp.where(failing, far, -1.0))
             fresh = failing[place] & (far[place] > state.radius) & (count < self.capacity)
             slot = jnp.minimum(count, self.capacity - 1)
             archive = jnp.where(fresh, archive.at[slot].set(u[place]), archive)
-            closer = jnp.minimum(far, apart(cube, u, u[place][None])[:, 0])
-            return archive, count + fresh.astype(count.dtype), jnp.where(fresh, closer, far)
+            if seen is None or happened is None:
+                between = apart(cube, u, u[place][None])
+            else:
+                kept = jnp.where(fresh, kept.at[slot].set(happened[place]), kept)
+                between = seen.unlike(happened, happened[place][None])
+            closer = jnp.minimum(far, between[:, 0])
+            return archive, kept, count + fresh.astype(count.dtype), jnp.where(fresh, closer, far)
 
-        far = jnp.min(self._distances(state, cube, u), axis=1)
+        far = jnp.min(self._distances(state, cube, u, happened), axis=1)
         most = min(AT_ONCE, len(u))
-        archive, count, _ = jax.lax.fori_loop(0, most, add, (state.archive, state.count, far))
-        return state._replace(archive=archive, count=count)
+        start = (state.archive, kept, state.count, far)
+        archive, kept, count, _ = jax.lax.fori_loop(0, most, add, start)
+        if seen is not None:
+            seen = seen._replace(archive=kept)
+        return state._replace(archive=archive, count=count, seen=seen)
 
     def _distances(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
+        self,
+        state: DiverseState,
+        cube: Cube,
+        u: Float[Array, "n d"],
+        happened: Float[Array, "n outcome"] | None,
     ) -> Float[Array, "n capacity"]:
         """Return distances to all archived failures; infinite for empty places of the archive."""
         known = jnp.arange(self.capacity) < state.count
-        return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
+        if state.seen is None or happened is None:
+            return jnp.where(known, apart(cube, u, state.archive), jnp.inf)
+        return jnp.where(known, state.seen.unlike(happened, state.seen.archive), jnp.inf)
 
     def _nearness(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"]
+        self,
+        state: DiverseState,
+        cube: Cube,
+        u: Float[Array, "n d"],
+        happened: Float[Array, "n outcome"] | None,
     ) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
         """Return 1 at an archived failure, 0 from one and a half radii on; and its index."""
-        far = self._distances(state, cube, u)
+        far = self._distances(state, cube, u, happened)
         nearest = jnp.argmin(far, axis=1)
         least = jnp.min(far, axis=1)
         return jnp.clip(1 - least / (1.5 * state.radius), 0.0, 1.0), nearest
@@ -243,18 +315,25 @@ class Diverse(Search[DiverseState]):
         return 2.0 * state.size / jnp.maximum(state.verdicts, 1.0) + 1e-6
 
     def _raise(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
+        self,
+        state: DiverseState,
+        cube: Cube,
+        u: Float[Array, "n d"],
+        happened: Float[Array, "n outcome"] | None,
+        rho: Float[Array, " n"],
     ) -> Float[Array, " n"]:
         """Raise robustness near archived failures to that of safe points and beyond."""
-        near, _ = self._nearness(state, cube, u)
+        near, _ = self._nearness(state, cube, u, happened)
         return jnp.where(near > 0, jnp.maximum(rho, 0.0) + self._scale(state) * near, rho)
 
     def _deflate(self, state: DiverseState, cube: Cube, observations: Observations) -> Observations:
         usable = observations.usable
         u = jnp.where(usable[:, None], observations.u, 0.5)
-        near, nearest = self._nearness(state, cube, u)
+        happened = observations.outcomes if state.seen is not None else None
+        near, nearest = self._nearness(state, cube, u, happened)
         inside = usable & (near > 0)
-        rho = jnp.where(inside, self._raise(state, cube, u, observations.rho), observations.rho)
+        raised = self._raise(state, cube, u, happened, observations.rho)
+        rho = jnp.where(inside, raised, observations.rho)
         changed = observations._replace(rho=rho)
         if observations.gradient is None and observations.clauses is None:
             return changed
@@ -285,14 +364,24 @@ class Diverse(Search[DiverseState]):
         return changed
 
     def _remember(
-        self, state: DiverseState, cube: Cube, u: Float[Array, "n d"], rho: Float[Array, " n"]
+        self,
+        state: DiverseState,
+        cube: Cube,
+        u: Float[Array, "n d"],
+        happened: Float[Array, "n outcome"] | None,
+        rho: Float[Array, " n"],
     ) -> DiverseState:
         """Update the best points so far that are away from the archive."""
         points = jnp.concatenate([u, state.points])
         values = jnp.concatenate([rho.astype(jnp.float32), state.rho])
-        raised = self._raise(state, cube, points, values)
+        seen = state.seen
+        if seen is not None and happened is not None:
+            happened = jnp.concatenate([happened, seen.best])
+        raised = self._raise(state, cube, points, happened, values)
         score = jnp.where(jnp.isfinite(values), raised, jnp.inf)
         _, best = jax.lax.top_k(-score, len(state.rho))
+        if seen is not None and happened is not None:
+            state = state._replace(seen=seen._replace(best=happened[best]))
         return state._replace(points=points[best], rho=values[best])
 
     def _restart(self, state: DiverseState, cube: Cube) -> PyTree:
@@ -300,8 +389,11 @@ class Diverse(Search[DiverseState]):
         batch = len(state.rho)
         inner = self.search.init(jax.random.fold_in(state.key, state.round), cube, batch)
         known = jnp.isfinite(state.rho)
-        raised = self._raise(state, cube, state.points, jnp.where(known, state.rho, 1.0))
-        return self.search.warm_start(inner, cube, Observations(state.points, raised, known))
+        happened = None if state.seen is None else state.seen.best
+        rho = jnp.where(known, state.rho, 1.0)
+        raised = self._raise(state, cube, state.points, happened, rho)
+        told = Observations(state.points, raised, known, outcomes=happened)
+        return self.search.warm_start(inner, cube, told)
 
 
 def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:

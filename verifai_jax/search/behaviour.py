@@ -1,0 +1,141 @@
+"""Distances between what happens in simulations, and a memory of what has happened.
+
+    seen = SeenBehaviour.nothing(capacity=256, batch=16)
+    seen = seen.widened(outcomes).recorded(outcomes)
+    seen.unlike(outcomes, others)                       # [n, m], from 0 to 1
+
+Outcomes are those of `core.outcomes`: the predicate that decides, the instant, the shape of the
+trace.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from verifai_jax.core.outcomes import OUTCOME, SEGMENTS, SIGNALS
+
+MEMORY = 256
+"""Outcomes that are remembered; the last ones."""
+
+NEIGHBOURS = 15
+"""Remembered outcomes that say how well known one is."""
+
+ALIKE = 1e-4
+"""Spread of the robustness of safe points, over its size, up to which it says nothing."""
+
+
+class SeenBehaviour(NamedTuple):
+    """Outcomes seen so far, and the ranges of signals in them.
+
+    - `archive`: of archived failures.
+    - `best`: of the points to begin afresh from.
+    - `memory`: the last outcomes, whatever the robustness; not finite where there is none.
+    - `place`: where in the memory the next one goes.
+    - `low`, `high`: of each signal.
+    - `least`, `most`: robustness of safe points.
+    """
+
+    archive: Float[Array, "capacity outcome"]
+    best: Float[Array, "batch outcome"]
+    memory: Float[Array, "memory outcome"]
+    place: Int[Array, ""]
+    low: Float[Array, " signals"]
+    high: Float[Array, " signals"]
+    least: Float[Array, ""]
+    most: Float[Array, ""]
+
+    @classmethod
+    def nothing(cls, capacity: int, batch: int) -> "SeenBehaviour":
+        """Return the memory before the first simulation."""
+        unknown = np.float32(np.nan)
+        return cls(
+            archive=jnp.full((capacity, OUTCOME), unknown),
+            best=jnp.full((batch, OUTCOME), unknown),
+            memory=jnp.full((MEMORY, OUTCOME), unknown),
+            place=jnp.int32(0),
+            low=jnp.full(SIGNALS, np.float32(np.inf)),
+            high=jnp.full(SIGNALS, np.float32(-np.inf)),
+            least=jnp.float32(np.inf),
+            most=jnp.float32(-np.inf),
+        )
+
+    @property
+    def level(self) -> Bool[Array, ""]:
+        """True where the robustness of all safe points is the same, so that it says nothing."""
+        return self.most - self.least <= ALIKE * jnp.abs(self.most)
+
+    def widened(
+        self, outcomes: Float[Array, "n outcome"], safe: Float[Array, " n"]
+    ) -> "SeenBehaviour":
+        """Return the memory with ranges that hold these outcomes too.
+
+        **Arguments:**
+
+        - `outcomes`: of a round.
+        - `safe`: the robustness of safe points, NaN of others.
+        """
+        known = is_known(outcomes)[:, None, None]
+        shape = _shape(outcomes)
+        low = jnp.min(jnp.where(known, shape, jnp.inf), axis=(0, 2), initial=jnp.inf)
+        high = jnp.max(jnp.where(known, shape, -jnp.inf), axis=(0, 2), initial=-jnp.inf)
+        least = jnp.min(jnp.where(jnp.isnan(safe), jnp.inf, safe), initial=jnp.inf)
+        most = jnp.max(jnp.where(jnp.isnan(safe), -jnp.inf, safe), initial=-jnp.inf)
+        return self._replace(
+            low=jnp.minimum(self.low, low),
+            high=jnp.maximum(self.high, high),
+            least=jnp.minimum(self.least, least).astype(jnp.float32),
+            most=jnp.maximum(self.most, most).astype(jnp.float32),
+        )
+
+    def recorded(self, outcomes: Float[Array, "n outcome"]) -> "SeenBehaviour":
+        """Return the memory with these outcomes among the last ones; unknown ones are left out."""
+        known = is_known(outcomes)
+        number = self.place + jnp.cumsum(known) - 1
+        slot = jnp.where(known, number % MEMORY, MEMORY)
+        return self._replace(
+            memory=self.memory.at[slot].set(outcomes, mode="drop"),
+            place=((self.place + jnp.sum(known)) % MEMORY).astype(jnp.int32),
+        )
+
+    def familiarity(
+        self, outcomes: Float[Array, "n outcome"], radius: Float[Array, ""]
+    ) -> Float[Array, " n"]:
+        """Return 1 for what has happened often, falling to 0 at a radius from what is remembered.
+
+        The mean over the nearest outcomes, as of novelty search, so that what happened once is
+        not well known.
+        """
+        far = jnp.where(is_known(self.memory), self.unlike(outcomes, self.memory), jnp.inf)
+        _, nearest = jax.lax.top_k(-far, NEIGHBOURS)
+        near = jnp.take_along_axis(far, nearest, axis=1)
+        return jnp.mean(jnp.clip(1 - near / radius, 0.0, 1.0), axis=1)
+
+    def unlike(
+        self, one: Float[Array, "n outcome"], other: Float[Array, "m outcome"]
+    ) -> Float[Array, "n m"]:
+        """Return how unlike outcomes are, from 0 to 1; infinite where one is not known.
+
+        1 where another predicate decides; otherwise the greater of the difference of the instants
+        and that of the shapes: of each signal the root mean square over the parts of its time, as a
+        share of the range in which it was seen, and of these the greatest.
+        """
+        later = jnp.abs(one[:, None, 1] - other[None, :, 1])
+        span = jnp.where(self.high > self.low, self.high - self.low, 1.0)[:, None]
+        gap = (_shape(one)[:, None] - _shape(other)[None]) / span
+        shape = jnp.max(jnp.sqrt(jnp.mean(gap**2, axis=-1)), axis=-1)
+        same = one[:, None, 0] == other[None, :, 0]
+        distance = jnp.where(same, jnp.maximum(later, jnp.minimum(shape, 1.0)), 1.0)
+        known = is_known(one)[:, None] & is_known(other)[None]
+        return jnp.where(known, distance, jnp.inf)
+
+
+def is_known(outcomes: Float[Array, "n outcome"]) -> Bool[Array, " n"]:
+    """Return which outcomes are known."""
+    return jnp.all(jnp.isfinite(outcomes), axis=1)
+
+
+def _shape(outcomes: Float[Array, "n outcome"]) -> Float[Array, "n signals parts"]:
+    return outcomes[:, 2:].reshape(-1, SIGNALS, SEGMENTS)
