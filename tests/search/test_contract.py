@@ -26,6 +26,7 @@ from verifai_jax.testing import check_batch_independence, check_search
 SMALL = {
     "bayes": {"capacity": 48, "candidates": 32},
     "turbo": {"capacity": 48, "candidates": 32},
+    "trace_surrogate": {"capacity": 48},
 }
 SEARCHES = [named(name, **SMALL.get(name, {})) for name in names()]
 CUBES = {
@@ -46,7 +47,7 @@ REFUSED = {
 
 
 # These take seconds to compile for each cube; what is continuous alone is so in the wide one.
-LARGE = ("Bayes", "Portfolio", "CMAES", "TuRBO")
+LARGE = ("Bayes", "Portfolio", "CMAES", "TuRBO", "TraceSurrogate")
 EACH = [
     pytest.param(
         search,

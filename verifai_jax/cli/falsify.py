@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @command()
 @click.argument("target", required=False)
-@click.option("--search", help="Name of the search  [default: portfolio]")
+@click.option("--search", help="Name of the search  [default: auto]")
 @SET
 @click.option("--budget", type=int, help="Simulations at most  [default: 10000]")
 @BATCH
@@ -161,7 +161,7 @@ def falsify(
         ):
             run = falsification.falsify(
                 problem,
-                chosen,
+                chosen if search or options else "auto",
                 10_000 if budget is None else budget,
                 batch=batch,
                 seed=0 if seed is None else seed,

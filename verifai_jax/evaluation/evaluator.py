@@ -40,6 +40,7 @@ class Evaluator:
       left out.
     - `steering`: what is computed for a search beside the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
+    - `keep_traces`: whether verdicts come with traces; of a problem on the host, in this process.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class Evaluator:
         executor: Executor | None = None,
         target: str | None = None,
         steering: Steering = NOTHING,
+        keep_traces: bool = False,
     ) -> None:
         self.problem, self.batch = problem, batch
         self.engine: Engine | HostEngine | ExecutorEngine
@@ -64,7 +66,9 @@ class Evaluator:
                 precision=precision, journal=journal, target=target, steering=steering,
             )  # fmt: skip
         elif problem.black_box:
-            self.engine = HostEngine(problem, precision, journal, steering=steering)
+            self.engine = HostEngine(
+                problem, precision, journal, steering=steering, keep_traces=keep_traces
+            )
         else:
             self.engine = engine_for(problem, batch, gradient, precision, clauses, steering)
         self.key: Key[Array, ""] = run_keys(seed)[1]

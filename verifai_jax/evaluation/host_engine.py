@@ -98,6 +98,9 @@ class HostEngine:
       rows get theirs from the program that many would.
     - `steering`: what is computed for a search beside the robustness; that of the monitor where one
       is given.
+    - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
+
+    `simulation_seconds` is what the last simulations took, with the verdicts between them.
     """
 
     def __init__(
@@ -110,12 +113,14 @@ class HostEngine:
         monitor: HostMonitor | None = None,
         least: int = 1,
         steering: Steering = NOTHING,
+        keep_traces: bool = False,
     ) -> None:
         self.problem, self.precision, self.journal = problem, precision, journal
-        self.least = least
+        self.least, self.keep_traces = least, keep_traces
         self.system = problem.system if system is None else system
         self.monitor = HostMonitor(problem, steering) if monitor is None else monitor
         self.compile_seconds = 0.0
+        self.simulation_seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._prepare = jax.jit(self._prepared)
 
@@ -169,6 +174,8 @@ class HostEngine:
         width = None if behaviour is None else behaviour.size
         formulas = len(self.problem.formulas)
         rows = _Rows(len(seeds), formulas, self.precision, width, self.monitor.steering.size)
+        if self.keep_traces:
+            rows.traces = [None for _ in seeds]
         if self.system.can_simulate_batch:
             self._together(features, keys, rows)
         else:
@@ -182,6 +189,7 @@ class HostEngine:
             messages=rows.messages,
             marks=rows.marks,
             steering=rows.steering if self.monitor.steering.size else None,
+            traces=rows.traces,
         )
 
     def _prepared(self, u: Array, key: Array, first: Array) -> tuple[PyTree, Array, Array]:
@@ -199,12 +207,15 @@ class HostEngine:
                 )
                 if rows.marks is not None:
                     rows.marks[:] = marks
+                for i in range(count if rows.traces is not None else 0):
+                    each = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
+                    rows.show(i, on_host_clock(each))
                 return
         except (Exception, SystemExit) as error:
             rows.messages[:] = [format_user_error(error)] * count
             return
         # Row by row, so that one with a wrong code, or a clock of its own, costs no other.
-        waiting = _Waiting(partial(self._block_verdicts, features), rows.put)
+        waiting = _Waiting(partial(self._block_verdicts, features), rows.put, rows.show)
         for i in range(count):
             row = jax.tree.map(lambda leaf, i=i: np.asarray(leaf)[i], trace)
             waiting.add(i, Outcome(row))
@@ -230,9 +241,11 @@ class HostEngine:
             rows.put(i, row)
         todo = [i for i in range(len(seeds)) if i not in known]
         each = [plain_leaves(jax.tree.map(lambda leaf, i=i: leaf[i], features)) for i in todo]
-        waiting = _Waiting(partial(self._block_verdicts, features), keep)
+        waiting = _Waiting(partial(self._block_verdicts, features), keep, rows.show)
+        started = time.perf_counter()
         try:
             for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
+                self.simulation_seconds = time.perf_counter() - started
                 waiting.add(todo[place], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
@@ -272,8 +285,9 @@ class _Waiting:
         self,
         decide: Callable[[Sequence[int], Sequence[Trace]], list[RowVerdict]],
         keep: Callable[[int, RowVerdict], None],
+        show: Callable[[int, Trace], None],
     ) -> None:
-        self._decide, self.keep = decide, keep
+        self._decide, self.keep, self._show = decide, keep, show
         self._blocks: dict[Any, list[tuple[int, Trace, str]]] = {}
         self._since = time.monotonic()
 
@@ -282,6 +296,7 @@ class _Waiting:
         if trace is None:
             self.keep(row, without)
             return
+        self._show(row, trace)
         form = _form(trace)
         self._blocks.setdefault(form, []).append((row, trace, outcome.message))
         if len(self._blocks[form]) == BLOCK:
@@ -313,6 +328,11 @@ class _Rows:
         self.holds = np.ones((count, formulas), bool)
         self.messages = [""] * count
         self.marks = None if marks is None else np.full((count, marks), -1, np.int32)
+        self.traces: list[Trace | None] | None = None  # Where they are to be kept.
+
+    def show(self, i: int, trace: Trace) -> None:
+        if self.traces is not None:
+            self.traces[i] = trace
 
     def put(self, i: int, row: RowVerdict) -> None:
         self.rho[i], self.status[i], self.holds[i], self.messages[i], marks, steering = row

@@ -38,6 +38,8 @@ class Verdicts(NamedTuple):
       JAX traces.
     - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
     - `steering`: what a search is told beside (`evaluation.steering`); None unless wanted.
+    - `traces`: the traces themselves, None where there is none; only of a host engine that keeps
+      them.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -50,6 +52,7 @@ class Verdicts(NamedTuple):
     messages: list[str] | None = None
     marks: Int[np.ndarray, "n marks"] | None = None
     steering: Float[np.ndarray, "n steering"] | None = None
+    traces: list[Trace | None] | None = None
 
     @property
     def proper(self) -> Bool[np.ndarray, " n"]:
@@ -73,8 +76,11 @@ class Verdicts(NamedTuple):
         """Join the rows of several batches that were evaluated alike."""
         if len(parts) == 1:
             return parts[0]
-        rows = [part._replace(messages=None) for part in parts]
+        rows = [part._replace(messages=None, traces=None) for part in parts]
         whole: Verdicts = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
+        if any(part.traces is not None for part in parts):
+            traces = [t for part in parts for t in part.traces or [None] * len(part.status)]
+            whole = whole._replace(traces=traces)
         if all(part.messages is None for part in parts):
             return whole
         messages = [m for part in parts for m in part.messages or [""] * len(part.status)]

@@ -40,7 +40,9 @@ from verifai_jax.falsification.silent_mistakes import (
 from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
+    AUTO,
     adapt_search,
+    can_be_slow,
     check_first,
     check_gradient,
     check_guide,
@@ -55,6 +57,7 @@ from verifai_jax.falsification.validation import (
     new_folder,
     points_of,
     recorded_search,
+    slow_search,
     space_as_data,
     usual_batch,
     without_suggestions,
@@ -82,7 +85,7 @@ class RunError(RuntimeError):
 @reproducible_settings()
 def falsify(
     problem: Problem,
-    search: str | Search = "portfolio",
+    search: str | Search = "auto",
     budget: int = 10_000,
     *,
     batch: int | None = None,
@@ -107,7 +110,10 @@ def falsify(
     **Arguments:**
 
     - `problem`: what to break.
-    - `search`: a name (`verifai_jax.search.names()`), or a search with its options.
+    - `search`: a name (`verifai_jax.search.names()`), or a search with its options. `"auto"` is
+      `portfolio`, unless the system is a black box whose first two simulations take half a second
+      or longer: then it is one that spends arithmetic to save simulations, `trace_surrogate`. The
+      run's record says which; name it for the same table whatever the machine's speed.
     - `budget`: simulations at most; the last batch is cut to fit.
     - `batch`: simulations a round. Active searches learn once a round: a small batch spends
       fewer simulations, a large one less time. By default 1024, and for a search that learns at
@@ -155,7 +161,8 @@ def falsify(
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
     asking, search = without_suggestions(search)
-    search = check_search(problem, search)
+    default = search == AUTO
+    search = check_search(problem, "portfolio" if default else search)
     check_rule(search, stop_when)
     check_guide(problem, search)
     given = check_first(problem, first, stop_when)
@@ -166,7 +173,7 @@ def falsify(
     whole = stop_after is None and stop_when is None and max_seconds is None
     usual = usual_batch(search, budget, stop_after, whole and not problem.black_box)
     usual = min(16, budget) if diverse else usual
-    batch = min(usual if batch is None else batch, budget)
+    own_batch, batch = batch, min(usual if batch is None else batch, budget)
     choice = resolved(
         problem, gradient=needs_gradient(search), batch=batch, budget=budget, precision=precision,
         wanted=backend,
@@ -175,7 +182,7 @@ def falsify(
     check_gradient(problem, search)
     with tracing():
         problem.check()
-        search, notes = adapt_search(problem, search)
+        search, notes = adapt_search(problem, search, executor)
         notes += notes_before(problem, search)
     if diverse:
         by = "inputs" if diverse is True else diverse
@@ -193,6 +200,14 @@ def falsify(
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
+            if not default or diverse or not can_be_slow(problem, executor):
+                return
+            slow = slow_search(problem, rounds.measure(min(batch, budget)))
+            if slow is not None:
+                usual = usual_batch(slow[0], budget, stop_after)
+                rounds.switch(*slow, min(own_batch or usual, budget))
+                if earlier is not None:
+                    rounds.warm(earlier)
 
         return _run_rounds(
             rounds, ends, seed, choice, progress, target, prepare, notes, callbacks, warm=warm
@@ -344,7 +359,8 @@ def _resume(
             rounds.resume(checkpoint)
 
     ends = ends._replace(budget=budget, earlier=run.run_seconds)
-    notes = [note for note in run.notes if note.startswith(("portfolio ", NOMINAL_FAILS))]
+    kept = ("portfolio ", "search ", NOMINAL_FAILS)
+    notes = [note for note in run.notes if note.startswith(kept)]
     notes += notes_before(problem, search)
     return _run_rounds(
         rounds,
@@ -459,6 +475,14 @@ def _run_rounds(
             for note in notes:
                 bar.note(note)
             prepare()
+            if rounds.search is not search:
+                search = recorded = rounds.search
+                if place is not None:
+                    # Before any row, so that whoever resumes it does not choose again.
+                    with writing(place):
+                        rounds.record_checksum = write_record(run("running"), place)
+                for note in rounds.notes:
+                    bar.note(note)
             # Checking and tracing are part of what a second run of the problem does not repeat.
             rounds.compile_seconds = ends.seconds
             stopped = "exhausted" if rounds.exhausted else None

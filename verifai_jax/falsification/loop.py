@@ -5,7 +5,8 @@ round is enough to go on from there, whatever happened since.
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -25,10 +27,12 @@ from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.question import describe_run
 from verifai_jax.falsification.suggestions import Suggestions
+from verifai_jax.falsification.surrogates import Surrogate
 from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.falsification.validation import SLOW
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
-from verifai_jax.search import Diverse, Search
+from verifai_jax.search import Diverse, Search, TraceSurrogate
 from verifai_jax.search.proposals import Proposals, compiled_search
 
 if TYPE_CHECKING:
@@ -37,6 +41,8 @@ if TYPE_CHECKING:
 STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
 MOST_DIFFERENTIATED = 16
 """Rows whose clauses are differentiated in one call of the engine."""
+MEASURED = 2
+"""First rows of a black box that are timed; in the first one a simulator may prepare itself."""
 MOST_WARM = 2048
 """Rows of an earlier table at most that a search starts with; the worst of a longer one."""
 
@@ -72,7 +78,11 @@ class Rounds:
         guided = problem.guide is not None and search.learns
         self.steering = Steering(guide=guided, outcome=search.wants_outcomes)
         self.precision, self.folder = precision, folder
+        self.search_key = run_keys(seed)[0]
+        self._surrogate: Surrogate | None = None
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
+        if isinstance(search, TraceSurrogate):
+            self._learn_traces(search)
         self.evaluate = Evaluator(
             problem,
             batch,
@@ -84,6 +94,7 @@ class Rounds:
             executor=executor,
             target=target,
             steering=self.steering,
+            keep_traces=self._surrogate is not None,
         )
         # Derivatives of clauses are wanted of few points, now and then: compiled when they are.
         self._differentiate = (
@@ -102,7 +113,6 @@ class Rounds:
             else None
         )
         self._marks = MarkBook(problem) if search.wants_marks else None
-        self.search_key = run_keys(seed)[0]
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
         self.compile_seconds = self.confirm_seconds = 0.0
@@ -113,6 +123,9 @@ class Rounds:
         self._confirmer = Confirmer(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
+        self._measured: Verdicts | None = None  # Of the first points, which are
+        self._pending: Any = None  # these.
+        self._chosen: tuple[str, ...] = ()
         self._sends_ahead = executor is not None and not search.learns
         self._ahead: Ahead | None = None
         self._saved = time.perf_counter()
@@ -129,15 +142,80 @@ class Rounds:
         if self._differentiate is not None and not resumed:
             self._differentiate.begin_compiling()
         self.evaluate.compile()
+        self._propose()
+
+    def _propose(self) -> None:
+        """Begin the proposals of the search."""
+        space = self.problem.space
         self._proposals = Proposals(
             self.search,
             space.cube,
             self.batch,
             self.search_key,
             space.constraint,
-            marks,
+            0 if self._marks is None else self._marks.width,
+            None if self._surrogate is None else self._surrogate.improve,
         )
         self._keep()
+
+    def _learn_traces(self, search: TraceSurrogate) -> None:
+        self._surrogate = Surrogate(self.problem, search, self.search_key)
+        # Rows of a journal have no traces; those of a batch that is cut off are simulated again.
+        if self._journal is not None:
+            self._journal.settle(len(self.table) + MEASURED)
+            self._journal = None
+
+    def measure(self, most: int) -> float:
+        """Simulate the first rows one by one, and return the least seconds that one took.
+
+        They are rows of the run. A first one that is quick is the only one.
+
+        - `most`: of the first round.
+        """
+        if not len(self.first):
+            self._pending = self._proposals.next(most)
+        points = np.asarray(self.first if len(self.first) else self._pending)
+        points = points[: min(MEASURED, most)]
+        engine = self.evaluate.engine
+        assert isinstance(engine, HostEngine)
+        seconds, parts = float("inf") if len(points) else 0.0, []
+        with self._as_in_a_batch(keep_traces=True):
+            for row in range(len(points)):
+                parts.append(self.evaluate(points[row : row + 1], first=row))
+                # Without the compilation of the monitor.
+                seconds = min(seconds, engine.simulation_seconds)
+                if seconds < SLOW:
+                    break
+        self._measured = Verdicts.concatenate(parts) if parts else None
+        return seconds
+
+    def switch(self, search: Search, note: str, batch: int) -> None:
+        """Go on with another search, for which the rows that are measured are given ones."""
+        if not len(self.first) and self._measured is not None:
+            self.first = np.asarray(self._pending)[: len(self._measured.status)]
+        self._pending = None
+        self.search, self.batch, self._chosen = search, batch, (note,)
+        self.evaluate.batch = batch
+        if isinstance(search, TraceSurrogate):
+            self._learn_traces(search)
+            assert isinstance(self.evaluate.engine, HostEngine)
+            self.evaluate.engine.keep_traces, self.evaluate.engine.journal = True, None
+        self._propose()
+
+    @contextmanager
+    def _as_in_a_batch(self, keep_traces: bool) -> Iterator[None]:
+        """Let rows that are simulated on their own be those of a whole batch, bit for bit."""
+        engine = self.evaluate.engine
+        if not isinstance(engine, HostEngine):
+            yield
+            return
+        before = engine.least, engine.keep_traces
+        engine.least = 1 << (self.batch - 1).bit_length()
+        engine.keep_traces = keep_traces
+        try:
+            yield
+        finally:
+            engine.least, engine.keep_traces = before
 
     @property
     def confirms(self) -> bool:
@@ -157,7 +235,7 @@ class Rounds:
         more = () if self._differentiate is None else self._differentiate.notes
         raised = () if self._confirmer is None else self._confirmer.raised
         suggested = () if self.suggestions is None else self.suggestions.notes
-        return (*self.evaluate.notes, *more, *raised, *suggested)
+        return (*self._chosen, *self.evaluate.notes, *more, *raised, *suggested)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -204,7 +282,9 @@ class Rounds:
                 self._ahead = Ahead(self._proposals, self.evaluate, self.batch, limit, first)
             points, verdicts = self._ahead.next()
         else:
-            points = self._proposals.next(most)
+            points, self._pending = self._pending, None
+            if points is None:
+                points = self._proposals.next(most)
         if not len(points):
             self._proposals.tell_refused()
             self._keep()
@@ -244,6 +324,8 @@ class Rounds:
                 self._proposals.warm_start(given[verdicts.proper], told, happened)
         else:
             self._tell(objective, verdicts, marks, outcomes)
+        if self._surrogate is not None:
+            self._surrogate.learn(points, verdicts)
         self.table.append(columns)
         self.found += int(np.sum(claimed))
         self.violating += int(np.sum(verdicts.violated))
@@ -337,6 +419,16 @@ class Rounds:
         return verdict, refused, told
 
     def _verdicts(self, points: Float[Any, "n d"], first: int, given: bool = False) -> Verdicts:
+        if self._measured is not None:
+            known, self._measured = self._measured, None
+            count = len(known.status)
+            if len(points) <= count:
+                return known
+            with self._as_in_a_batch(keep_traces=self._surrogate is not None):
+                rest = self.evaluate(np.asarray(points)[count:], first=first + count)
+            if self._surrogate is None:
+                known = known._replace(traces=None)
+            return Verdicts.concatenate([known, rest])
         compiled = self.evaluate.compile_seconds
         temperature = 1.0 if given else self._proposals.temperature
         if self._differentiate is None:
@@ -402,6 +494,8 @@ class Rounds:
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
+        if self._surrogate is not None:
+            self._surrogate.restore(checkpoint)
         if self._marks is not None:
             self._marks.restore(checkpoint)
         if self.suggestions is not None:
@@ -421,6 +515,8 @@ class Rounds:
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }
+        if self._surrogate is not None:
+            self.checkpoint |= self._surrogate.checkpoint()
         if self._marks is not None:
             self.checkpoint |= self._marks.checkpoint()
         if self.suggestions is not None:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from verifai_jax import search as searches
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
@@ -172,11 +173,18 @@ def _guide_text(guide: Mapping[str, Any] | None) -> str:
     return "no guide" if guide is None else f"the guide {dict(guide)}"
 
 
-def adapt_search(problem: Problem, search: Search) -> tuple[Search, tuple[str, ...]]:
+def adapt_search(
+    problem: Problem, search: Search, executor: Executor | None = None
+) -> tuple[Search, tuple[str, ...]]:
     """Return the search as it can work on this problem, and notes on what it does without.
 
-    A portfolio does without gradients where there are none.
+    A portfolio does without gradients where there are none, a model of traces without traces.
     """
+    if isinstance(search, searches.TraceSurrogate):
+        why = _why_no_traces(problem, executor)
+        if why is None:
+            return search, ()
+        return search.without_traces, (f"search turbo: {why}",)
     if not isinstance(search, searches.Portfolio) or not search.gradients:
         return search, ()
     if problem.black_box:
@@ -190,6 +198,52 @@ def adapt_search(problem: Problem, search: Search) -> tuple[Search, tuple[str, .
     else:
         return search, ()
     return search.without_gradients(), (f"portfolio without gradients: {why}",)
+
+
+def _why_no_traces(problem: Problem, executor: Executor | None) -> str | None:
+    """Return why a search cannot learn from the traces of this problem; None where it can."""
+    if not problem.black_box:
+        return "only black boxes keep the traces that trace_surrogate learns from"
+    if executor is not None:
+        return "workers of an executor send no traces, which trace_surrogate learns from"
+    if problem.rulebook is not None:
+        return "trace_surrogate knows no priority"
+    return None
+
+
+AUTO = "auto"
+"""The search of a run that names none: by the seconds that a simulation takes."""
+SLOW = 0.5
+"""Seconds of a simulation from which on arithmetic is spent to save simulations."""
+FEW_DIMENSIONS = 20
+"""Dimensions up to which a Gaussian process needs no trust region."""
+
+
+def can_be_slow(problem: Problem, executor: Executor | None) -> bool:
+    """Return whether the seconds of a simulation decide on the default search.
+
+    Where JAX traces the system a simulation is quick, one that simulates many rows in a call takes
+    as long for one as for all, and at an executor it is not the simulation alone that takes time.
+    """
+    if problem.system.backends or problem.system.can_simulate_batch:
+        return False
+    return problem.black_box and executor is None and problem.space.dim > 0
+
+
+def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
+    """Return the default search where a simulation takes so long, and a note that says why.
+
+    None where it takes not long enough for another search than the portfolio.
+    """
+    if seconds < SLOW:
+        return None
+    if _why_no_traces(problem, None) is None:
+        search, name = searches.TraceSurrogate(), "trace_surrogate"
+    elif problem.space.dim > FEW_DIMENSIONS:
+        search, name = searches.TuRBO(), "turbo"
+    else:
+        search, name = searches.Bayes(), "bayes"
+    return search, f"search {name}: a simulation takes {seconds:.2g} s; search= sets another"
 
 
 def check_rule(search: Search, rule: StoppingRule | None) -> None:

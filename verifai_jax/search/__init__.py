@@ -35,6 +35,7 @@ from verifai_jax.search.portfolio import Portfolio as Portfolio
 from verifai_jax.search.sobol import Sobol as Sobol
 from verifai_jax.search.suggested import Absent
 from verifai_jax.search.suggested import Suggested as Suggested
+from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
 from verifai_jax.search.turbo import TuRBO as TuRBO
 from verifai_jax.search.uniform import Uniform as Uniform
 
@@ -62,6 +63,7 @@ __all__ = [
     "Sobol",
     "Split",
     "Suggested",
+    "TraceSurrogate",
     "TuRBO",
     "Uniform",
     "distinct",
@@ -89,6 +91,7 @@ _SEARCHES: dict[str, type[Search]] = {
     "epsilon_greedy": EpsilonGreedy,
     "bayes": Bayes,
     "turbo": TuRBO,
+    "trace_surrogate": TraceSurrogate,
     "cmaes": CMAES,
     "mutation": Mutation,
     "coverage": Coverage,

@@ -99,7 +99,7 @@ class GaussianProcess:
         # About the middle, so that the difference below loses few digits.
         left, right = ((x[:, plain] - 0.5) * inverse[plain] for x in (a, b))
         square = jnp.sum(left**2, 1)[:, None] + jnp.sum(right**2, 1)[None] - 2 * left @ right.T
-        value = jnp.exp(hyper.variance) * _matern(jnp.maximum(square, 0.0))
+        value = jnp.exp(hyper.variance) * matern(jnp.maximum(square, 0.0))
         if len(codes) == 0:
             return value
         differ = (a[:, None, codes] != b[None, :, codes]).astype(value.dtype)
@@ -264,13 +264,13 @@ def _bounded(hyper: Hyper) -> Hyper:
 
 
 @jax.custom_jvp
-def _matern(square: Array) -> Array:
+def matern(square: Array) -> Array:
     """Return Matern-5/2 of the squared distance; its derivative is finite at zero."""
     r = jnp.sqrt(5 * square)
     return (1 + r + r**2 / 3) * jnp.exp(-r)
 
 
-@_matern.defjvp
+@matern.defjvp
 def _matern_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     r = jnp.sqrt(5 * primals[0])
     decay = jnp.exp(-r)

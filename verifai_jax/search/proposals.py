@@ -44,6 +44,8 @@ class Proposals:
 
     - `proposed`: number of points that the search proposed.
     - `accepted`: number of these that the constraint accepted.
+
+    `improve` may replace points of a round by others, of which the search is told instead.
     """
 
     def __init__(
@@ -54,11 +56,13 @@ class Proposals:
         key: Key[Array, ""],
         accepts: Callable[[Any], Bool[Array, " n"]] | None = None,
         marks: int = 0,
+        improve: Callable[[Any], Float[Any, "batch d"]] | None = None,
     ) -> None:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
         self._marks = marks if search.wants_marks else 0
+        self._improve = improve
         self._program = compiled_search(search, self.cube, batch, self._marks)
         self._checked = is_own(search)
         self._accepts = accepts
@@ -285,6 +289,8 @@ class Proposals:
     def _next_to_learn_from(self, most: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
         """Return the points of one round of a search that learns."""
         points = self._ask()
+        if self._improve is not None:
+            points = self._improve(points)
         self._plan = None
         planned = len(points)
         if self.search.wants_clauses:

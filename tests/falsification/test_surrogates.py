@@ -1,0 +1,170 @@
+"""A model of the traces in place of a slow black box: proposals, resuming, the default search."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import verifai_jax as vj
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.falsification import loop
+from verifai_jax.falsification.surrogates import TraceForm
+from verifai_jax.search import TraceSurrogate, TuRBO
+
+DIM = 6
+SMALL = TraceSurrogate(initial=6, starts=4, steps=8)
+
+
+def oscillator(features):
+    """A damped oscillator under a force of six pieces, in NumPy."""
+    x, v, xs = 0.0, 0.0, [0.0]
+    for force in np.repeat(features["force"], 20):
+        v += 0.1 * (force - 0.2 * v - x - 0.2 * x**3)
+        x += 0.1 * v
+        xs.append(x)
+    return vj.Trace({"x": np.array(xs), "late": np.arange(len(xs)) > 60}, dt=0.1)
+
+
+def problem(system=oscillator, formula="always x < 2.1", **options):
+    space = {"force": vj.Array(vj.Box(-1, 1), length=DIM)}
+    return vj.Problem("oscillator", space, vj.blackbox(system, **options), formula)
+
+
+def first_failure(run):
+    failing = np.flatnonzero(run.table.all["violated"])
+    return int(failing[0]) + 1 if len(failing) else len(run.table.all) + 1
+
+
+@pytest.mark.slow
+def test_needs_half_of_the_simulations_of_others():
+    rare = problem()
+    needed = {
+        name: np.median(
+            [
+                first_failure(
+                    vj.falsify(rare, name, 200, batch=8, seed=s, stop_after=1, progress=False)
+                )
+                for s in range(5)
+            ]
+        )
+        for name in ("trace_surrogate", "cmaes", "bayes")
+    }
+    assert 2 * needed["trace_surrogate"] <= min(needed["cmaes"], needed["bayes"])
+
+
+@pytest.mark.thorough
+def test_resumed_it_proposes_the_same(tmp_path):
+    options = {"batch": 8, "seed": 3, "progress": False}
+    whole = vj.falsify(problem(), SMALL, 32, **options)
+    vj.falsify(problem(), SMALL, 24, folder=tmp_path / "run", **options)
+    resumed = vj.resume(tmp_path / "run", problem(), budget=32, progress=False)
+    assert whole.table.all.equals(resumed.table.all)
+    # The model did propose: what it learned from is in the checkpoint.
+    assert len(whole.checkpoint["surrogate.rho"]) == 32
+
+
+@pytest.mark.thorough
+def test_rows_without_a_trace_and_of_other_lengths_are_simulated_as_well():
+    def odd(features):
+        trace = oscillator(features)
+        if features["force"][0] > 0.8:
+            raise RuntimeError("no solution")
+        if features["force"][1] > 0.5:  # Ended early.
+            return vj.Trace({n: s[:50] for n, s in trace.signals.items()}, dt=0.1)
+        return trace
+
+    run = vj.falsify(problem(odd, "always (late -> x < 2.1)"), SMALL, 32, batch=8, progress=False)
+    table = run.table.all
+    assert len(table) == 32
+    assert (table["status"] == "error").any()
+    assert len(run.checkpoint["surrogate.rho"]) == (table["status"] == "ok").sum()
+
+
+@pytest.mark.thorough
+def test_where_no_traces_come_it_is_turbo():
+    def fall(features, key):
+        return vj.Trace({"x": features["force"]}, dt=1.0)
+
+    space = {"force": vj.Array(vj.Box(-1, 1), length=DIM)}
+    traced = vj.Problem("fall", space, fall, "always x < 0.99")
+    run = vj.falsify(traced, "trace_surrogate", 8, batch=8, progress=False)
+    assert run.search.startswith("TuRBO(")
+    assert any(note.startswith("search turbo: only black boxes") for note in run.notes)
+    assert isinstance(SMALL.without_traces, TuRBO)
+
+
+class TestDefault:
+    def test_quick_black_boxes_have_the_portfolio(self):
+        calls = []
+
+        def counted(features):
+            calls.append(1)
+            return oscillator(features)
+
+        options = {"budget": 40, "seed": 5, "progress": False}
+        default = vj.falsify(problem(counted), **options)
+        assert len(calls) == 40  # Measured ones are rows.
+        named = vj.falsify(problem(), "portfolio", **options)
+        assert default.search == named.search
+        assert default.table.all.equals(named.table.all)
+        assert default.notes == named.notes
+
+    @pytest.mark.thorough
+    def test_slow_ones_a_model_and_resume_keeps_it(self, tmp_path, monkeypatch):
+        # The clock is not asked: as if each simulation took as long as it takes to be slow.
+        monkeypatch.setattr(loop, "SLOW", 0.0)
+        monkeypatch.setattr("verifai_jax.falsification.validation.SLOW", 0.0)
+        run = vj.falsify(
+            problem(), budget=16, stop_after=100, seed=2, folder=tmp_path / "run", progress=False
+        )
+        assert run.search.startswith("TraceSurrogate(")
+        assert run.batch == 8
+        assert any(note.startswith("search trace_surrogate: a simulation") for note in run.notes)
+        monkeypatch.undo()
+        resumed = vj.resume(tmp_path / "run", problem(), budget=24, progress=False)
+        assert resumed.search == run.search
+        assert any(
+            note.startswith("search trace_surrogate: a simulation") for note in resumed.notes
+        )
+        # The measured rows are those that a portfolio would have begun with.
+        begun = vj.falsify(problem(), "portfolio", 16, seed=2, progress=False).table.all
+        first = [c for c in begun if c.startswith("force")]
+        np.testing.assert_array_equal(resumed.table.all[first][:1], begun[first][:1])
+
+    def test_it_can_be_set(self, monkeypatch):
+        monkeypatch.setattr("verifai_jax.falsification.validation.SLOW", 0.0)
+        run = vj.falsify(problem(), "portfolio", 8, progress=False)
+        assert run.search.startswith("Portfolio(")
+
+
+def test_traces_in_the_form_of_the_model():
+    rng = np.random.default_rng(0)
+    form = TraceForm((("p", 2), ("x", 0)), 0.1, 100)
+    trace = vj.Trace({"x": rng.normal(size=100), "p": rng.normal(size=(100, 2))}, dt=0.1)
+    again = form.trace(jnp.asarray(form.flat(trace)))
+    for name, signal in trace.signals.items():
+        np.testing.assert_allclose(again.signals[name], signal, atol=1e-5)
+    # A longer one keeps every so many samples, those between on straight lines.
+    form = TraceForm((("x", 0),), 0.1, 1001)
+    smooth = np.sin(np.arange(1001) / 60)
+    again = form.trace(jnp.asarray(form.flat(vj.Trace({"x": smooth}, dt=0.1))))
+    assert again.length == 1001
+    np.testing.assert_allclose(again.signals["x"], smooth, atol=1e-3)
+
+
+@pytest.mark.parametrize("vectorised", [False, True])
+def test_an_engine_that_keeps_traces(vectorised):
+    def many(features):
+        rows = [oscillator({"force": row}) for row in features["force"]]
+        signals = {n: np.stack([row.signals[n] for row in rows]) for n in rows[0].signals}
+        return vj.stack_traces(signals, dt=0.1)
+
+    what = problem(many, vectorised=True) if vectorised else problem()
+    u = np.random.default_rng(1).random((3, DIM)).astype(np.float32)
+    engine = HostEngine(what, keep_traces=True)
+    verdicts = engine.evaluate(u, jax.random.key(0))
+    assert verdicts.traces is not None
+    for point, trace in zip(u, verdicts.traces, strict=True):
+        expected = oscillator({"force": 2 * point - 1}).signals["x"]
+        np.testing.assert_allclose(trace.signals["x"][: len(expected)], expected, atol=1e-4)
+    assert HostEngine(what).evaluate(u, jax.random.key(0)).traces is None

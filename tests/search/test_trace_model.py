@@ -1,0 +1,106 @@
+"""The model of traces: its posterior against exact formulas, its components, its fit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from verifai_jax.search import trace_model as models
+
+WIDTH, ROWS, SIZE = 3, 10, 16
+
+
+def covariance(hyper, a, b):
+    """The covariance in double precision, written out once more."""
+    lengths, parts = (np.asarray(leaf, np.float64) for leaf in (hyper.lengths, hyper.parts))
+    a, b = a / np.exp(lengths), b / np.exp(lengths)
+    inner = a @ b.T
+    r = np.sqrt(5) * np.linalg.norm(a[:, None] - b[None], axis=2)
+    constant, linear, quadratic, rough = np.exp(parts)
+    return (
+        constant + linear * inner + quadratic * inner**2 + rough * (1 + r + r**2 / 3) * np.exp(-r)
+    )
+
+
+@pytest.fixture(scope="module")
+def data():
+    rng = np.random.default_rng(0)
+    x = np.zeros((SIZE, WIDTH))
+    x[:ROWS] = rng.random((ROWS, WIDTH)) - 0.5
+    mask = np.arange(SIZE) < ROWS
+    coefficients = np.zeros((SIZE, 2))
+    coefficients[:ROWS] = np.stack([np.sin(4 * x[:ROWS, 0]), 3 * x[:ROWS, 1] * x[:ROWS, 2]], 1)
+    return jnp.asarray(x, jnp.float32), jnp.asarray(coefficients, jnp.float32), jnp.asarray(mask)
+
+
+@pytest.mark.thorough
+def test_draws_have_the_moments_of_the_exact_posterior(data):
+    x, coefficients, mask = data
+    hyper = models.first_hyper(WIDTH)._replace(noise=jnp.float32(-5.0))
+    identity = jnp.eye(2)
+    model = models.condition(hyper, x, mask, coefficients, jnp.zeros(2), identity)
+    there = jnp.asarray(np.random.default_rng(1).random((4, WIDTH)) - 0.5, jnp.float32)
+
+    @jax.jit
+    def drawn(key):
+        waves, weights = models.draw(model, key, 33)
+        return jnp.einsum("mt,jtc->jmc", models.basis(model, waves, there), weights)
+
+    # Each call has other waves, as their number is finite.
+    values = np.concatenate(
+        [np.asarray(drawn(key)) for key in jax.random.split(jax.random.key(0), 60)]
+    )
+    rows, new = np.asarray(x, np.float64)[:ROWS], np.asarray(there, np.float64)
+    y = np.asarray(coefficients, np.float64)[:ROWS]
+    known = covariance(hyper, rows, rows) + np.exp(-5.0) * np.eye(ROWS)
+    cross = covariance(hyper, new, rows)
+    mean = cross @ np.linalg.solve(known, y)
+    scale = np.sqrt(np.sum(y * np.linalg.solve(known, y), axis=0) / ROWS)
+    variance = np.diag(covariance(hyper, new, new) - cross @ np.linalg.solve(known, cross.T))
+    std = np.sqrt(variance)[:, None] * scale
+    # The first of each call is the mean itself.
+    np.testing.assert_allclose(values[0], mean, atol=1e-3)
+    others = np.delete(values, np.arange(0, len(values), 33), axis=0)
+    assert np.all(np.abs(others.mean(axis=0) - mean) < 0.15 * std)
+    np.testing.assert_allclose(others.std(axis=0), std, rtol=0.15)
+
+
+@pytest.mark.thorough
+def test_absent_rows_change_nothing(data):
+    x, coefficients, mask = data
+    hyper = models.first_hyper(WIDTH)
+    padded = models.fit(hyper, x, mask, coefficients)
+    exact = models.fit(hyper, x[:ROWS], mask[:ROWS], coefficients[:ROWS])
+    for one, other in zip(padded, exact, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-2)
+
+
+@pytest.mark.thorough
+def test_what_is_linear_is_learned_from_as_many_rows_as_it_has_inputs():
+    # Forty inputs, fifty rows: a rough process alone would know nothing of a new point.
+    rng = np.random.default_rng(2)
+    weights = rng.normal(size=(40, 3))
+    x = rng.random((64, 40)) - 0.5
+    mask = np.arange(64) < 50
+    y = np.where(mask[:, None], x @ weights, 0.0)
+    x, y, mask = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), jnp.asarray(mask)
+    x = jnp.where(mask[:, None], x, 0.0)
+    hyper = models.fit(models.first_hyper(40), x, mask, y)
+    model = models.condition(hyper, x, mask, y, jnp.zeros(3), jnp.eye(3))
+    new = rng.random((20, 40)) - 0.5
+    waves, drawn = models.draw(model, jax.random.key(0), 1)
+    told = models.basis(model, waves, jnp.asarray(new, jnp.float32)) @ drawn[0]
+    error = np.std(np.asarray(told) - new @ weights)
+    assert error < 0.1 * np.std(new @ weights)
+
+
+def test_components_give_back_the_traces():
+    rng = np.random.default_rng(3)
+    traces = (rng.normal(size=(30, 4)) @ rng.normal(size=(4, 200))).astype(np.float32) + 5
+    mean, components = models.principal_components(traces)
+    assert np.any(components, axis=1).sum() == 4
+    assert len(components) == models.COMPONENTS
+    again = mean + (traces - mean) @ components.T @ components
+    np.testing.assert_allclose(again, traces, atol=1e-4)
+    # Fewer rows than components.
+    assert models.principal_components(traces[:2])[1].shape == (models.COMPONENTS, 200)

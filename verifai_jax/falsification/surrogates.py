@@ -1,0 +1,403 @@
+"""A model of the traces of a run, monitored in place of the system: proposals of `TraceSurrogate`.
+
+    surrogate = Surrogate(problem, search, key)
+    surrogate.learn(u, verdicts)                        # the rows of a round, with their traces
+    points = surrogate.improve(points)                  # some of a round's points replaced
+
+Each proposal comes from a simulator drawn from the model's posterior (`search/trace_model.py`):
+many points are monitored on it, and from the best ones the smooth robustness is descended, all in
+one batch. Where the model is sure of a failure all of them go there; where it is not they differ as
+much as it knows too little (Thompson sampling). The real system decides on each.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from verifai_jax.core.cube import Cube
+from verifai_jax.core.programs import Slot
+from verifai_jax.core.trace import Trace
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.mtl import hard, smooth
+from verifai_jax.mtl.clauses import goals_of
+from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.semantics import Semantics
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import TraceSurrogate
+from verifai_jax.search import trace_model as models
+from verifai_jax.search.base import draw_uniform, standard_normal
+from verifai_jax.search.process_data import snap
+
+SAMPLES = 256
+"""Samples of a signal that are modelled; those between are interpolated."""
+POOL = 512
+"""Points that are monitored on each drawn simulator, before the best ones descend."""
+PARENTS = 8
+"""Best rows around which half of them are."""
+SIZES = (64, 256, 1024)
+"""Numbers of rows that programs are compiled for; fewer rows are padded."""
+RATE = (0.1, 0.01)
+"""First and last step of a descent, in cubes."""
+TEMPERATURES = (0.3, 0.02)
+"""First and last temperature of the smooth robustness, without unit."""
+APART = 1e-3
+"""Distance, greatest over the coordinates, below which two points are the same."""
+
+
+@dataclass(frozen=True)
+class TraceForm:
+    """The form of the modelled traces.
+
+    - `signals`: names and components (0 for a plain signal), in order.
+    - `dt`: sampling period in seconds.
+    - `length`: number of samples.
+    """
+
+    signals: tuple[tuple[str, int], ...]
+    dt: float
+    length: int
+
+    @property
+    def places(self) -> Float[np.ndarray, " samples"]:
+        """Places of the modelled samples among all."""
+        return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
+
+    def fits(self, trace: Trace) -> bool:
+        """Return whether a trace has these signals and this clock, whatever its length is."""
+        names = [name for name, _ in self.signals]
+        same = all(name in trace.signals for name in names)
+        same = same and _signals(trace, names) == self.signals
+        return same and bool(np.isclose(trace.dt or 0.0, self.dt))
+
+    def flat(self, trace: Trace) -> Float[np.ndarray, " values"]:
+        """Return the modelled samples of a trace, signal after signal."""
+        own, parts = np.arange(self.length), []
+        for name, _ in self.signals:
+            signal = np.asarray(trace.signals[name])
+            # Truth values are +1 and -1 in formulas.
+            signal = np.where(signal, 1.0, -1.0) if signal.dtype == bool else signal
+            signal = signal.reshape(len(signal), -1)
+            # A shorter one stays as it ended.
+            signal = signal[np.minimum(own, len(signal) - 1)]
+            parts += [np.interp(self.places, own, column) for column in signal.T]
+        return np.concatenate(parts).astype(np.float32)
+
+    def trace(self, flat: Float[Array, " values"]) -> Trace:
+        """Return the trace of modelled samples; traced by JAX."""
+        places = self.places
+        left = np.arange(self.length) * (len(places) - 1) // max(self.length - 1, 1)
+        left = np.minimum(left, max(len(places) - 2, 0))
+        right = np.minimum(left + 1, len(places) - 1)
+        gap = np.maximum(places[right] - places[left], 1e-9)
+        weight = ((np.arange(self.length) - places[left]) / gap).astype(np.float32)
+        columns = flat.reshape(-1, len(places))
+        columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
+        signals, first = {}, 0
+        for name, components in self.signals:
+            signal = columns[first : first + max(components, 1)]
+            signals[name] = signal.T if components else signal[0]
+            first += max(components, 1)
+        return Trace(signals, self.dt, finite=tuple(signals))
+
+
+class Surrogate:
+    """The rows of a run with their traces, and proposals from a model of them.
+
+    **Arguments:**
+
+    - `problem`: of the run; its monitored signals are modelled.
+    - `search`: with the options.
+    - `key`: of its random numbers.
+    """
+
+    def __init__(self, problem: Problem, search: TraceSurrogate, key: Key[Array, ""]) -> None:
+        self.problem, self.search = problem, search
+        self.cube = problem.space.cube
+        self.key = jax.random.fold_in(key, 0x7ACE)
+        self.form: TraceForm | None = None
+        self.u = np.zeros((0, self.cube.dim), np.float32)
+        self.traces = np.zeros((0, 0), np.float32)
+        self.rho = np.zeros(0, np.float32)
+        self.round = self.fitted = 0
+        self.hyper = models.first_hyper(_width(self.cube))
+        self._programs = problem.programs.get(DESCENTS, search, lambda: Descents(problem, search))
+
+    def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
+        """Keep the rows that have a verdict and a trace like that of the others."""
+        proper = verdicts.proper & np.isfinite(verdicts.least)
+        given = [
+            (i, trace)
+            for i, trace in enumerate(verdicts.traces or [])
+            if trace is not None and proper[i]
+        ]
+        for _, trace in given:
+            self._extend(trace)
+        form = self.form
+        if form is None:
+            return
+        given = [(i, trace) for i, trace in given if form.fits(trace)]
+        if not given:
+            return
+        rows = np.array([i for i, _ in given])
+        flat = np.stack([form.flat(trace) for _, trace in given])
+        finite = np.all(np.isfinite(flat), axis=1)
+        self.u = np.concatenate([self.u, np.asarray(u, np.float32)[rows][finite]])
+        # Without rows there is no width yet.
+        before = self.traces if len(self.traces) else flat[:0]
+        self.traces = np.concatenate([before, flat[finite]])
+        least = verdicts.least[rows][finite].astype(np.float32)
+        self.rho = np.concatenate([self.rho, least])
+        self._forget()
+
+    def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
+        """Replace the model's share of the points that the search proposes."""
+        self.round += 1
+        count = round(self.search.share * self.round * len(points)) - round(
+            self.search.share * (self.round - 1) * len(points)
+        )
+        enough = len(self.rho) >= self.search.initial and self.cube.dim > 0
+        if not enough or count == 0 or np.ptp(self.traces, axis=0).max() == 0:
+            return points
+        proposed = self._proposals(count)
+        return np.concatenate([proposed, np.asarray(points)[len(proposed) :]])
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Return what decides the next proposals; the arrays are never written to."""
+        form = self.form
+        signals = () if form is None else form.signals
+        return {
+            "surrogate.u": self.u,
+            "surrogate.traces": self.traces,
+            "surrogate.rho": self.rho,
+            "surrogate.counts": np.array([self.round, self.fitted], np.int64),
+            "surrogate.signals": np.array([name for name, _ in signals], "U"),
+            "surrogate.components": np.array([width for _, width in signals], np.int64),
+            "surrogate.clock": np.array(
+                [0, 0] if form is None else [form.dt, form.length], np.float64
+            ),
+            **{f"surrogate.{n}": np.asarray(v) for n, v in self.hyper._asdict().items()},
+        }
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint; from one without a surrogate, with none of its rows."""
+        if "surrogate.u" not in checkpoint:
+            return
+        self.u, self.traces, self.rho = (
+            np.asarray(checkpoint[f"surrogate.{name}"]) for name in ("u", "traces", "rho")
+        )
+        self.round, self.fitted = (int(n) for n in checkpoint["surrogate.counts"])
+        dt, length = checkpoint["surrogate.clock"]
+        names, widths = checkpoint["surrogate.signals"], checkpoint["surrogate.components"]
+        if length:
+            signals = tuple((str(n), int(w)) for n, w in zip(names, widths, strict=True))
+            self.form = TraceForm(signals, float(dt), int(length))
+        self.hyper = models.TraceHyper(
+            *(jnp.asarray(checkpoint[f"surrogate.{n}"]) for n in self.hyper._fields)
+        )
+
+    def _extend(self, trace: Trace) -> None:
+        """Take the form of the first trace, and of a longer one that comes later."""
+        if self.form is None:
+            assert trace.dt is not None
+            signals = _signals(trace, sorted(self.problem.monitored))
+            self.form = TraceForm(signals, float(trace.dt), trace.length)
+        elif trace.length > self.form.length and self.form.fits(trace):
+            before = self.form
+            self.form = TraceForm(before.signals, before.dt, trace.length)
+            whole = [np.asarray(_held(before, row)) for row in self.traces]
+            here = np.minimum(self.form.places, before.length - 1)
+            own = np.arange(before.length)
+            each = [np.concatenate([np.interp(here, own, c) for c in row]) for row in whole]
+            empty = np.zeros((0, 0), np.float32)
+            self.traces = np.stack(each).astype(np.float32) if each else empty
+
+    def _forget(self) -> None:
+        """Keep no more rows than the capacity: the best half, and the last ones."""
+        extra = len(self.rho) - self.search.capacity
+        if extra <= 0:
+            return
+        best = np.argsort(self.rho, kind="stable")[: self.search.capacity // 2]
+        spare = np.setdiff1d(np.arange(len(self.rho)), best)[:extra]
+        kept = np.setdiff1d(np.arange(len(self.rho)), spare)
+        self.u, self.traces, self.rho = self.u[kept], self.traces[kept], self.rho[kept]
+
+    def _proposals(self, count: int) -> Float[np.ndarray, "m d"]:
+        """Return so many points, or fewer where there are no more that differ."""
+        form = self.form
+        assert form is not None
+        # Signals count alike, whatever their unit.
+        grouped = self.traces.reshape(len(self.traces), -1, len(form.places))
+        scale = np.std(grouped, axis=(0, 2))
+        scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.places)).astype(np.float32)
+        mean, components = models.principal_components(self.traces / scale)
+        coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
+        size = next(size for size in SIZES if size >= len(self.rho))
+        missing = size - len(self.rho)
+        coefficients = np.pad(coefficients, ((0, missing), (0, 0)))
+        x = np.pad(np.asarray(_embed(self.u, self.cube)), ((0, missing), (0, 0)))
+        mask = np.arange(size) < len(self.rho)
+        if 4 * (len(self.rho) - self.fitted) >= self.fitted:
+            self.hyper = self._programs.fit(self.hyper, x, mask, coefficients)
+            self.fitted = len(self.rho)
+        parents = self.u[np.argsort(self.rho, kind="stable")[:PARENTS]]
+        parents = np.resize(parents, (PARENTS, self.cube.dim))
+        key = jax.random.fold_in(self.key, np.uint32(self.round))
+        u, value = self._programs.descend(
+            form, count, self.hyper, x, mask, coefficients, mean * scale, components * scale,
+            parents, key,
+        )  # fmt: skip
+        return self._distinct(np.asarray(u), np.asarray(value))
+
+    def _distinct(
+        self, u: Float[np.ndarray, "draws starts d"], value: Float[np.ndarray, "draws starts"]
+    ) -> Float[np.ndarray, "m d"]:
+        """Return the best point of each draw that is neither simulated nor proposed."""
+        taken, chosen = self.u, []
+        for points, values in zip(u, value, strict=True):
+            for i in np.argsort(values, kind="stable"):
+                near = np.max(np.abs(taken - points[i]), axis=1, initial=0.0) < APART
+                if not near.any():
+                    chosen.append(points[i])
+                    taken = np.concatenate([taken, points[i][None]])
+                    break
+        return np.array(chosen, np.float32).reshape(-1, self.cube.dim)
+
+
+class Descents:
+    """Programs of a problem: the fit, and descents on simulators drawn from the model."""
+
+    def __init__(self, problem: Problem, search: TraceSurrogate) -> None:
+        self.end: End = problem.end
+        self.search, self.cube = search, problem.space.cube
+        self.goals = goals_of(problem.formulas.values())
+        self.fit = jax.jit(models.fit)
+        self.descend: Any = jax.jit(self._descend, static_argnums=(0, 1))
+
+    def _descend(
+        self,
+        form: TraceForm,
+        count: int,
+        hyper: models.TraceHyper,
+        x: Float[Array, "n x"],
+        mask: Array,
+        coefficients: Float[Array, "n c"],
+        mean: Float[Array, " values"],
+        components: Float[Array, "c values"],
+        parents: Float[Array, "parents d"],
+        key: Key[Array, ""],
+    ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
+        """Return where the descents on `count` drawn simulators end, and the value there."""
+        cube = self.cube
+        model = models.condition(hyper, x, mask, coefficients, mean, components)
+        drawing, placing = jax.random.split(key)
+        waves, weights = models.draw(model, drawing, count)
+        pool = _pool(placing, parents, cube)
+
+        def values(
+            u: Float[Array, "m d"], weights: Float[Array, "terms c"], semantics: Semantics
+        ) -> Float[Array, " m"]:
+            terms = models.basis(model, waves, _embed(u, cube))
+            flat = model.decode(terms @ weights)
+            return jax.vmap(lambda row: self._value(form.trace(row), semantics))(flat)
+
+        def slope(u: Array, weights: Array, tau: Array) -> Float[Array, "m d"]:
+            gradient = jax.grad(lambda u: jnp.sum(values(u, weights, smooth(tau))))(u)
+            return jnp.where(jnp.isfinite(gradient), gradient, 0.0)
+
+        def one(weights: Float[Array, "terms c"]) -> tuple[Array, Array]:
+            least, place = jax.lax.top_k(-_number(values(pool, weights, hard)), self.search.starts)
+            start = pool[place]
+
+            def step(carry: tuple, part: Array) -> tuple:
+                u, first, second, best, least = carry
+                tau = TEMPERATURES[0] * (TEMPERATURES[1] / TEMPERATURES[0]) ** part
+                gradient = slope(u, weights, tau)
+                # A common size for all coordinates of a point keeps its direction.
+                first = 0.8 * first + 0.2 * gradient
+                second = 0.9 * second + 0.1 * gradient**2
+                size = RATE[0] * (RATE[1] / RATE[0]) ** part
+                moved = jnp.clip(u - size * first / (jnp.sqrt(second) + 1e-9), 0.0, 1.0)
+                u = moved.at[:, cube.discrete].set(u[:, cube.discrete])
+                value = _number(values(u, weights, hard))
+                better = value < least
+                best = jnp.where(better[:, None], u, best)
+                return (u, first, second, best, jnp.where(better, value, least)), None
+
+            zero = jnp.zeros_like(start)
+            parts = jnp.linspace(0.0, 1.0, self.search.steps)
+            (_, _, _, best, value), _ = jax.lax.scan(
+                step, (start, zero, zero, start, -least), parts
+            )
+            return best, value
+
+        return jax.lax.map(one, weights)
+
+    def _value(self, trace: Trace, semantics: Semantics) -> Float[Array, ""]:
+        """Return the least value of a goal, each of whose clauses is to be broken."""
+        clauses = self.goals.values(trace, semantics, self.end)
+        return jnp.min(jnp.max(clauses, axis=1))
+
+
+DESCENTS: Slot[TraceSurrogate, Descents] = Slot("descents on a model of the traces")
+"""The programs of a problem for its surrogates, by their search."""
+
+
+def _signals(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
+    """Return these signals of a trace, each with its components, 0 for a plain one."""
+    shapes = [(name, np.shape(trace.signals[name])) for name in names]
+    return tuple((name, int(np.prod(s[1:])) if len(s) > 1 else 0) for name, s in shapes)
+
+
+def _held(form: TraceForm, row: Float[np.ndarray, " values"]) -> Float[np.ndarray, "signals time"]:
+    own = np.arange(form.length)
+    return np.stack([np.interp(own, form.places, c) for c in row.reshape(-1, len(form.places))])
+
+
+def _number(value: Float[Array, " m"]) -> Float[Array, " m"]:
+    return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+
+def _width(cube: Cube) -> int:
+    """Return the number of coordinates of embedded points."""
+    codes = [n for n, ordered in zip(cube.levels, cube.ordered, strict=True) if n and not ordered]
+    return cube.dim - len(codes) + sum(codes)
+
+
+def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
+    """Return points as the model takes them: about zero, a coordinate for each unordered choice."""
+    u = snap(jnp.asarray(u), cube)
+    columns: list[Array] = []
+    cells = cube.cells(u)
+    for i, (levels, ordered) in enumerate(zip(cube.levels, cube.ordered, strict=True)):
+        if levels and not ordered:
+            cell = cells[:, int(np.searchsorted(cube.discrete, i))]
+            columns.append(0.7 * jax.nn.one_hot(cell, levels, dtype=jnp.float32))
+        else:
+            columns.append(u[:, i : i + 1] - 0.5)
+    return jnp.concatenate(columns, axis=1)
+
+
+def _pool(
+    key: Key[Array, ""], parents: Float[Array, "parents d"], cube: Cube
+) -> Float[Array, "pool d"]:
+    """Return points of the prior, corners among them, and points around the best rows."""
+    d = cube.dim
+    random = draw_uniform(key, (POOL, 2 * d + 2))
+    half = POOL // 2
+    fresh = random[:half, :d]
+    # Failures lie in corners more often than not.
+    fresh = jnp.where(jnp.arange(half)[:, None] % 2 == 0, fresh, jnp.round(fresh))
+    rest = random[half:]
+    noise, pick = standard_normal(rest[:, :d]), rest[:, d : 2 * d]
+    share = float(d) ** -rest[:, 2 * d :][:, :1]
+    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
+    size = 0.5 * 0.05 ** rest[:, 2 * d + 1 :]
+    parent = parents[jnp.arange(half) % PARENTS]
+    codes = np.array([n > 0 and not o for n, o in zip(cube.levels, cube.ordered, strict=True)])
+    moved = jnp.where(codes, rest[:, :d], jnp.clip(parent + size * noise, 0.0, 1.0))
+    return snap(jnp.concatenate([fresh, jnp.where(moves, moved, parent)]), cube)

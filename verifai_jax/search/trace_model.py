@@ -1,0 +1,260 @@
+"""Regression of whole traces on points of the cube, with functions drawn from its posterior.
+
+    model = condition(hyper, x, mask, coefficients, mean, components)     # the rows so far
+    waves, weights = draw(model, key, 8)                # eight simulators that agree with all rows
+    model.decode(basis(model, waves, x) @ weights[j])   # the traces that one of them gives at x
+
+Traces are means plus a few principal components, whose coefficients are Gaussian processes over the
+points with one covariance: constant, linear, quadratic and Matern-5/2 parts over shared length
+scales. What is nearly linear in its inputs is so learned from about as many rows as it has inputs,
+and the rest as by any other process (for traces of simulators: Higdon, Gattiker, Williams,
+Rightley, Computer model calibration using high-dimensional output, JASA 2008). Functions are drawn
+by pathwise conditioning, as in `gaussian_process`; the quadratic part by random products
+(Kar, Karnick, Random feature maps for dot product kernels, AISTATS 2012).
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve
+from jax.scipy.special import ndtri
+from jaxtyping import Array, Bool, Float, Key
+
+from verifai_jax.search.gaussian_process import SMALLEST, matern
+
+COMPONENTS = 24
+"""Principal components at most."""
+NEGLIGIBLE = 1e-5
+"""Share of the variance below which a component is left out."""
+WAVES = 256
+"""Random waves of the Matern part of a drawn function."""
+PRODUCTS = 256
+"""Random products of its quadratic part."""
+STEPS = 40
+"""Steps of Adam in a fit."""
+PARTS = np.array([0.0, 0.0, -2.0, -1.0], np.float32)
+"""Prior means of the logarithms of the variances: constant, linear, quadratic, Matern."""
+NOISE = -8.0
+"""Prior mean of the logarithm of the noise's variance."""
+LEAST_NOISE = -10.0
+"""Least of it, which keeps 32-bit factors finite."""
+
+
+class TraceHyper(NamedTuple):
+    """Natural logarithms of the hyper-parameters; variances are in those of a component."""
+
+    lengths: Float[Array, " x"]
+    parts: Float[Array, " 4"]
+    noise: Float[Array, ""]
+
+
+def first_hyper(width: int) -> TraceHyper:
+    """Return the start of the first fit, the mode of the prior."""
+    return TraceHyper(
+        jnp.full(width, _mean_length(width), jnp.float32),
+        jnp.asarray(PARTS),
+        jnp.float32(NOISE),
+    )
+
+
+class TraceModel(NamedTuple):
+    """A model of traces `[samples]` over points `[x]`; rows that are absent change nothing.
+
+    - `hyper`: hyper-parameters.
+    - `x`: points of the rows, about zero.
+    - `mask`: which rows are present.
+    - `coefficients`: of the components, by row.
+    - `factor`: Cholesky factor of the covariance of the rows.
+    - `scale`: standard deviations of the components under the process.
+    - `mean`, `components`: the mean trace, and the components as traces.
+    """
+
+    hyper: TraceHyper
+    x: Float[Array, "n x"]
+    mask: Bool[Array, " n"]
+    coefficients: Float[Array, "n c"]
+    factor: Float[Array, "n n"]
+    scale: Float[Array, " c"]
+    mean: Float[Array, " samples"]
+    components: Float[Array, "c samples"]
+
+    def decode(self, coefficients: Float[Array, "*m c"]) -> Float[Array, "*m samples"]:
+        """Return traces from coefficients of the components."""
+        return self.mean + coefficients @ self.components
+
+
+class Waves(NamedTuple):
+    """Random functions of the prior, as a basis that all components share."""
+
+    products: Float[Array, "2 x p"]
+    frequencies: Float[Array, "x f"]
+    phases: Float[Array, " f"]
+
+
+def fit(
+    hyper: TraceHyper,
+    x: Float[Array, "n x"],
+    mask: Bool[Array, " n"],
+    coefficients: Float[Array, "n c"],
+) -> TraceHyper:
+    """Find the most probable hyper-parameters, by Adam from `hyper` on.
+
+    The variance of each component is the most probable one given the others, in closed form;
+    components count by their share of the variance.
+    """
+    variance = jnp.sum(coefficients**2, axis=0)
+    share = variance / jnp.maximum(jnp.sum(variance), 1e-30)
+    worth = share / jnp.maximum(jnp.sum(share**2), 1e-30)  # as many as there are in effect
+    count = jnp.maximum(jnp.sum(mask), 1)
+
+    def loss(hyper: TraceHyper) -> Float[Array, ""]:
+        factor = jnp.linalg.cholesky(_noisy(hyper, x, mask))
+        half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
+        square = jnp.sum(half**2, axis=0) / count
+        inside = jnp.log(jnp.maximum(square, 1e-12)) * count / 2
+        evidence = jnp.sum(worth * inside) + jnp.sum(worth) * jnp.sum(
+            jnp.where(mask, jnp.log(jnp.diag(factor)), 0.0)
+        )
+        prior = jnp.sum((hyper.lengths - _mean_length(x.shape[1])) ** 2) / 2
+        prior += jnp.sum((hyper.parts - PARTS) ** 2) / 8 + (hyper.noise - NOISE) ** 2 / 8
+        return evidence + prior
+
+    def step(carry: tuple[TraceHyper, ...], number: Array) -> tuple[tuple[TraceHyper, ...], None]:
+        hyper, first, second = carry
+        gradient = jax.grad(loss)(hyper)
+        finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]
+        ok = jnp.all(jnp.stack(finite))
+        gradient = jax.tree.map(lambda leaf: jnp.where(ok, leaf, 0.0), gradient)
+        first = jax.tree.map(lambda m, g: 0.8 * m + 0.2 * g, first, gradient)
+        second = jax.tree.map(lambda v, g: 0.95 * v + 0.05 * g**2, second, gradient)
+
+        def update(value: Array, m: Array, v: Array) -> Array:
+            root = jnp.sqrt(v / (1 - 0.95**number)) + 1e-8
+            return value - 0.1 * (m / (1 - 0.8**number)) / root
+
+        return (_bounded(jax.tree.map(update, hyper, first, second)), first, second), None
+
+    zero = jax.tree.map(jnp.zeros_like, hyper)
+    numbers = jnp.arange(1, STEPS + 1, dtype=jnp.float32)
+    (fitted, _, _), _ = jax.lax.scan(step, (hyper, zero, zero), numbers)
+    return fitted
+
+
+def condition(
+    hyper: TraceHyper,
+    x: Float[Array, "n x"],
+    mask: Bool[Array, " n"],
+    coefficients: Float[Array, "n c"],
+    mean: Float[Array, " samples"],
+    components: Float[Array, "c samples"],
+) -> TraceModel:
+    """Return the model of these rows."""
+    factor = jnp.linalg.cholesky(_noisy(hyper, x, mask))
+    half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
+    scale = jnp.sqrt(jnp.sum(half**2, axis=0) / jnp.maximum(jnp.sum(mask), 1))
+    return TraceModel(hyper, x, mask, coefficients, factor, scale, mean, components)
+
+
+def draw(
+    model: TraceModel, key: Key[Array, ""], count: int
+) -> tuple[Waves, Float[Array, "count terms c"]]:
+    """Draw simulators from the posterior, the first one of which is its mean.
+
+    **Returns:** what `basis` needs, and the weights of its terms for each of them.
+    """
+    n, width = model.x.shape
+    components = model.coefficients.shape[1]
+    terms = 1 + width + PRODUCTS + WAVES
+    sizes = [2 * width * PRODUCTS, (width + 5) * WAVES, WAVES, count * (terms + n) * components]
+    uniform = jax.random.uniform(key, (sum(sizes),), jnp.float32)
+    uniform = jax.lax.optimization_barrier(uniform)
+    normal = ndtri(jnp.maximum(uniform, SMALLEST))
+    places = np.cumsum(sizes)[:-1].tolist()
+    products, spectrum, _, amplitudes = jnp.split(normal, places)
+    phases = jnp.split(uniform, places)[2]
+    spectrum = spectrum.reshape(width + 5, WAVES)
+    # The spectral density of Matern-5/2 is a t distribution with five degrees of freedom.
+    size = jnp.sqrt(5 / jnp.maximum(jnp.sum(spectrum[width:] ** 2, axis=0), 1e-6))
+    waves = Waves(
+        products.reshape(2, width, PRODUCTS), spectrum[:width] * size, 2 * math.pi * phases
+    )
+    amplitudes = amplitudes.reshape(count, terms + n, components)
+    # The mean is the function that the prior's mean, zero, is taken to.
+    amplitudes = amplitudes.at[0].set(0.0) * model.scale
+    prior, noise = amplitudes[:, :terms], amplitudes[:, terms:]
+    drawn = jnp.einsum("nt,jtc->jnc", _prior_basis(model, waves, model.x), prior)
+    left = model.coefficients - drawn - jnp.exp(model.hyper.noise / 2) * noise
+    left = jnp.where(model.mask[:, None], left, 0.0)
+    update = jax.vmap(lambda rows: cho_solve((model.factor, True), rows))(left)
+    return waves, jnp.concatenate([prior, update], axis=1)
+
+
+def basis(model: TraceModel, waves: Waves, x: Float[Array, "m x"]) -> Float[Array, "m terms"]:
+    """Return the terms of drawn simulators; times their weights the coefficients of traces."""
+    cross = jnp.where(model.mask, _covariance(model.hyper, x, model.x), 0.0)
+    return jnp.concatenate([_prior_basis(model, waves, x), cross], axis=1)
+
+
+def principal_components(
+    traces: Float[np.ndarray, "n samples"],
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "c samples"]]:
+    """Return the mean trace and the principal components, `COMPONENTS` of them, some zero."""
+    mean = traces.mean(axis=0)
+    _, size, rows = np.linalg.svd((traces - mean).astype(np.float64), full_matrices=False)
+    kept = (size**2 > NEGLIGIBLE * np.sum(size**2))[:COMPONENTS]
+    components = np.zeros((COMPONENTS, traces.shape[1]), np.float32)
+    components[: kept.sum()] = rows[: len(kept)][kept]
+    return mean.astype(np.float32), components
+
+
+def _prior_basis(
+    model: TraceModel, waves: Waves, x: Float[Array, "m x"]
+) -> Float[Array, "m terms"]:
+    z = x * jnp.exp(-model.hyper.lengths)
+    constant, linear, quadratic, rough = jnp.exp(model.hyper.parts / 2)
+    one, two = z @ waves.products[0], z @ waves.products[1]
+    return jnp.concatenate(
+        [
+            jnp.full((len(x), 1), constant),
+            linear * z,
+            quadratic * math.sqrt(1 / PRODUCTS) * one * two,
+            rough * math.sqrt(2 / WAVES) * jnp.cos(z @ waves.frequencies + waves.phases),
+        ],
+        axis=1,
+    )
+
+
+def _covariance(
+    hyper: TraceHyper, a: Float[Array, "n x"], b: Float[Array, "m x"]
+) -> Float[Array, "n m"]:
+    left, right = (x * jnp.exp(-hyper.lengths) for x in (a, b))
+    inner = left @ right.T
+    square = jnp.sum(left**2, 1)[:, None] + jnp.sum(right**2, 1)[None] - 2 * inner
+    constant, linear, quadratic, rough = jnp.exp(hyper.parts)
+    return (
+        constant + linear * inner + quadratic * inner**2 + rough * matern(jnp.maximum(square, 0.0))
+    )
+
+
+def _noisy(
+    hyper: TraceHyper, x: Float[Array, "n x"], mask: Bool[Array, " n"]
+) -> Float[Array, "n n"]:
+    both = mask[:, None] & mask[None]
+    value = jnp.where(both, _covariance(hyper, x, x), 0.0)
+    return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
+
+
+def _mean_length(width: int) -> float:
+    """Return the prior mean of the logarithms of length scales: about half the cube's diagonal."""
+    return math.log(0.5 * math.sqrt(max(width, 1)))
+
+
+def _bounded(hyper: TraceHyper) -> TraceHyper:
+    return TraceHyper(
+        jnp.clip(hyper.lengths, -4.0, 6.0),
+        jnp.clip(hyper.parts, -8.0, 5.0),
+        jnp.clip(hyper.noise, LEAST_NOISE, 0.0),
+    )
