@@ -1,5 +1,6 @@
 """A guide steers the search, and nothing else: not one verdict, not one robustness."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import jax
@@ -132,6 +133,15 @@ def test_a_black_box_is_guided_too_and_goes_on_as_it_was(tmp_path):
     resumed = vj.resume(tmp_path / "run", problem, budget=600, stop_after=1)
     assert resumed.table.all.equals(whole.table.all)
     assert vj.load(tmp_path / "run").guide["weight"] == 0.5
+
+
+@pytest.mark.thorough
+def test_workers_of_an_executor_tell_the_same():
+    options = {"budget": 96, "batch": 16, "seed": 0, "diverse": "behaviour"}
+    here = vj.falsify(GUIDED, "cross_entropy", **options)
+    with ThreadPoolExecutor(2) as pool:
+        there = vj.falsify(GUIDED, "cross_entropy", executor=pool, **options)
+    assert there.table.all.equals(here.table.all)
 
 
 def test_it_is_refused_where_it_has_no_effect_and_where_it_is_wrong():
