@@ -204,6 +204,7 @@ def fill(case, checkout, caches, cache):
         with tempfile.TemporaryDirectory() as place:
             before = "cold" if case in ("again", "bound", "budget") else case
             measure(command_of(before, Path(place)), checkout, cache)
+        cache.mkdir(parents=True, exist_ok=True)  # Some compile nothing that is kept.
         shutil.copytree(cache, earlier)
     else:
         shutil.copytree(earlier, cache)

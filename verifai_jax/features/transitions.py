@@ -8,7 +8,6 @@ Guards look at what has happened before. They are asked here, once for each stat
 be reached, so that a simulation only looks up tables, and what can be covered is counted exactly.
 """
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -44,8 +43,8 @@ class Past:
 
     def then(self, name: str) -> "Past":
         """Return the past after one more event."""
-        counts = Counter(dict(self.counts))
-        counts[name] += 1
+        counts = dict(self.counts)
+        counts[name] = counts.get(name, 0) + 1
         return Past(tuple(sorted(counts.items())), name)
 
 
