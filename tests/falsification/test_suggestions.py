@@ -13,6 +13,7 @@ import verifai_jax as vj
 from verifai_jax import search
 from verifai_jax.core.cube import Cube
 from verifai_jax.falsification.suggestions import point_of
+from verifai_jax.reports.commands import run_python
 from verifai_jax.search import Absent
 
 SPACE = {
@@ -155,6 +156,7 @@ def test_nobody_is_asked_twice(tmp_path):
         again = vj.resume(place, PROBLEM, budget=72)
         assert len(again.table) == 72
     stored = vj.load(folder, PROBLEM)
+    assert "search=suggested," in run_python(stored)
     assert isinstance(search.from_json(stored.search_data).suggest, Absent)
     assert search.from_json(stored.search_data).times == 3
 
