@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.cube import Cube
 
@@ -145,6 +145,15 @@ class Search(abc.ABC, Generic[State]):
     def temperature(self, state: State) -> Float[Array, ""]:
         """Return the temperature of the smooth robustness; only where `wants_gradient`."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
+
+
+Part = TypeVar("Part", bound=PyTree)
+"""A state of a search, or a part of one."""
+
+
+def choose(first: Bool[Array, ""], one: Part, two: Part) -> Part:
+    """Return one of two states of the same form; what is the same in both is left alone."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)
 
 
 def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:

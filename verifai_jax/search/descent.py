@@ -175,14 +175,11 @@ class Descent(Search[DescentState]):
         step = state.step + 1
         slow = jnp.where(merit < CLEARLY * state.best, 0, state.slow + 1)
         over = ~informative | (told.rho < 0) | (step >= self.steps) | (slow >= self.patience)
-        rungs = state.rungs
-        for i, rung in enumerate(self.rungs):
-            arrives = (step == rung) & ~over & ~state.given
-            rungs = rungs.at[i].set(_latest(rungs[i], jnp.where(arrives, best, jnp.inf)))
-            there = jnp.sum(jnp.isfinite(rungs[i]))
-            place = jnp.ceil(self.kept * there).astype(jnp.int32) - 1
-            limit = jnp.sort(rungs[i])[jnp.maximum(place, 0)]
-            over |= arrives & (best > limit)
+        arrives = (step[None] == np.array(self.rungs)[:, None]) & ~over & ~state.given
+        rungs = _latest(jnp.where(arrives, best, jnp.inf), state.rungs)
+        better = jnp.sum(rungs[:, None] < best[:, None], axis=2)
+        goes_on = better < self.kept * jnp.sum(jnp.isfinite(rungs), axis=1)[:, None]
+        over |= jnp.any(arrives & ~goes_on, axis=0)
 
         mean = FIRST_DECAY * state.mean + (1 - FIRST_DECAY) * gradient
         square = SECOND_DECAY * state.square + (1 - SECOND_DECAY) * gradient**2
@@ -191,7 +188,7 @@ class Descent(Search[DescentState]):
         direction /= jnp.sqrt(square / (1 - SECOND_DECAY**count)) + 1e-12
         falling = 0.525 + 0.475 * jnp.cos(np.pi * self._progress(state.step))
         rate = self.rate * jnp.where(state.given, NEARER, 1.0) * falling
-        point = jnp.clip(state.point - rate[:, None] * direction, 0.0, 1.0)
+        point = jnp.clip(told.u - rate[:, None] * direction, 0.0, 1.0)
 
         def kept(new: Array, fresh: float) -> Array:
             return jnp.where(over.reshape(-1, *(1,) * (new.ndim - 1)), fresh, new)
@@ -231,8 +228,11 @@ def _clauses(told: Observations) -> Float[Array, "n clauses"]:
     return jnp.where(told.usable[:, None], clauses, 0.0)
 
 
-def _latest(remembered: Float[Array, " m"], new: Float[Array, " n"]) -> Float[Array, " m"]:
+def _latest(
+    new: Float[Array, "rungs n"], remembered: Float[Array, "rungs m"]
+) -> Float[Array, "rungs m"]:
     """Put the finite ones of new numbers before those that are remembered."""
-    both = jnp.concatenate([new, remembered])
-    order = jnp.argsort(~jnp.isfinite(both), stable=True)
-    return both[order][: len(remembered)]
+    both = jnp.concatenate([new, remembered], axis=1)
+    # Of equal ones the first comes first.
+    _, order = jax.lax.top_k(jnp.isfinite(both).astype(jnp.int32), remembered.shape[1])
+    return jnp.take_along_axis(both, order, axis=1)

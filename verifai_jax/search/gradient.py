@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search, choose
 from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
@@ -155,7 +155,7 @@ class Gradient(Search[GradientState]):
         known = jnp.sum(state.known)
         differentiates = 2 * (n - known) >= n
         starts, begun = self._starts(state, cube)
-        state = _either(differentiates, begun, state)
+        state = choose(differentiates, begun, state)
 
         first = jnp.argsort(jnp.where(differentiates, state.known, ~state.known), stable=True)
         there = jnp.where(differentiates, n - known, jnp.maximum(known, 1))
@@ -263,7 +263,7 @@ class Gradient(Search[GradientState]):
             steps=jnp.where(visited & better, state.steps + 1, state.steps),
             slow=jnp.where(visited & better, slow, state.slow).astype(jnp.int32),
         )
-        return _either(state.differentiates, differentiated, undifferentiated)
+        return choose(state.differentiates, differentiated, undifferentiated)
 
     def warm_start(
         self, state: GradientState, cube: Cube, observations: Observations
@@ -313,10 +313,6 @@ class Gradient(Search[GradientState]):
             number=jnp.where(state.fresh, number, state.number),
             near=jnp.where(state.fresh, jnp.inf, state.near),
         )
-
-
-def _either(first: Bool[Array, ""], one: GradientState, two: GradientState) -> GradientState:
-    return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)
 
 
 def _rows(chosen: Bool[Array, " n"], new: Array, old: Array) -> Array:

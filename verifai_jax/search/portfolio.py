@@ -6,9 +6,13 @@ batches. A bandit learns on the way which one helps: it gives each a share of th
 rate at which its points come among the best so far, discounted, and none less than a little; a
 member whose gradients turn out zero or not finite gets next to nothing at once. Every point is told
 to all, and descents start from the best points of the others as often as from new ones.
+
+Where these have found no failure for long, a fourth member joins them, with an account of its own:
+descents into the interior of the space (`interior`, `descent`).
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -17,9 +21,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search
+from verifai_jax.search.base import Observations, Plan, Search, choose
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
+from verifai_jax.search.interior import InteriorState, begin, learn, plan, propose
 from verifai_jax.search.mutation import Mutation, MutationState
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
@@ -55,6 +60,7 @@ class PortfolioState(NamedTuple):
     rows: Int[Array, " members"]  # of the last ask, one member after the other
     differentiates: Bool[Array, ""]
     opening: Bool[Array, ""]  # the first descents are on their way, beyond their share
+    interior: InteriorState | None
 
 
 @dataclass(frozen=True)
@@ -100,11 +106,13 @@ class Portfolio(Search[PortfolioState]):
             rows=jnp.zeros(3, jnp.int32),
             differentiates=jnp.array(False),
             opening=jnp.array(False),
+            interior=None if gradient is None else begin(jax.random.fold_in(key, 3), cube, batch),
         )
 
     def ask(
         self, state: PortfolioState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], PortfolioState]:
+        before = state
         mutated, mutation = Mutation().ask(state.mutation, cube, batch)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
         state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
@@ -123,13 +131,7 @@ class Portfolio(Search[PortfolioState]):
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
             descents = jnp.where(turn, jnp.minimum(plan.rows, allowed), 0)
             descents = jnp.where(differentiates, plan.rows, descents)
-            state = state._replace(
-                gradient=jax.tree.map(
-                    lambda new, old: new if new is old else jnp.where(turn, new, old),
-                    gradient,
-                    state.gradient,
-                )
-            )
+            state = state._replace(gradient=choose(turn, gradient, state.gradient))
         others = jnp.where(differentiates, 0, batch - descents)
         draws = jnp.minimum(jnp.floor(credit[CROSS_ENTROPY]).astype(jnp.int32), others)
         draws = jnp.maximum(draws, 0)
@@ -138,26 +140,69 @@ class Portfolio(Search[PortfolioState]):
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
-        return u, state._replace(rows=rows, differentiates=differentiates, opening=opening)
+        state = state._replace(rows=rows, differentiates=differentiates, opening=opening)
+        if before.interior is None:
+            return u, state
+        points, descents = propose(before.interior, cube, batch)
+        # At their turn the others have not been asked.
+        none = before._replace(
+            rows=jnp.zeros(3, jnp.int32),
+            differentiates=jnp.array(True),
+            opening=jnp.array(False),
+            interior=descents,
+        )
+        state = choose(descents.turn, none, state._replace(interior=descents))
+        return jnp.where(descents.turn, points, u), state
 
     def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
         if state.gradient is None:
             temperature = jnp.ones(batch, jnp.float32)
         else:
             temperature = state.gradient.temperature[state.gradient.descent]
-        return Plan(jnp.sum(state.rows), state.differentiates, temperature)
+        usual = Plan(jnp.sum(state.rows), state.differentiates, temperature)
+        if state.interior is None:
+            return usual
+        own = plan(state.interior, cube, batch)
+        return jax.tree.map(partial(jnp.where, state.interior.turn), own, usual)
 
     def tell(self, state: PortfolioState, cube: Cube, observations: Observations) -> PortfolioState:
         batch = len(observations.rho)
-        simulated = jnp.arange(batch) < jnp.sum(state.rows)
+        rows = self.plan(state, cube, batch).rows
+        simulated = jnp.arange(batch) < rows
         observations = observations._replace(valid=observations.valid & simulated)
+        if state.interior is None:
+            return self._learn(state, cube, observations)
+        score, turn = self._common(observations).score, state.interior.turn
+        costs = jnp.where(turn | state.differentiates, 2.0, 1.0)
+        interior = learn(
+            state.interior,
+            cube,
+            observations,
+            score,
+            rows * costs,
+            (state.mutation.points, state.mutation.score),
+        )
+        # The steps of a descent are many, and of use to the others where they are good.
+        limit = state.mutation.score[AMONG - 1]
+        good = jnp.isfinite(limit) & ((score < limit) | (score == 0))
+        valid = observations.valid & (good | ~turn)
+        learned = self._learn(state, cube, observations._replace(valid=valid))
+        learned = choose(turn & ~jnp.any(valid), state, learned)
+        return learned._replace(interior=interior)
+
+    def _learn(
+        self, state: PortfolioState, cube: Cube, observations: Observations
+    ) -> PortfolioState:
+        """Tell the three members, and count what the one that proposed a point has gained."""
+        batch = len(observations.rho)
         common = self._common(observations)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them.
         limit = state.mutation.score[AMONG - 1]
         gained = jnp.isfinite(limit) & ((common.score < limit) | (common.score == 0))
         gained &= common.usable
-        is_member = (member[None] == jnp.arange(3)[:, None]) & simulated[None]
+        proposed = jnp.arange(batch) < jnp.sum(state.rows)
+        is_member = (member[None] == jnp.arange(3)[:, None]) & proposed[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
@@ -184,11 +229,7 @@ class Portfolio(Search[PortfolioState]):
         own = observations._replace(valid=observations.valid & (member == GRADIENT))
         updated = Gradient().tell(state.gradient, cube, own)
         turn = state.rows[GRADIENT] > 0
-        updated = jax.tree.map(
-            lambda new, old: new if new is old else jnp.where(turn, new, old),
-            updated,
-            state.gradient,
-        )
+        updated = choose(turn, updated, state.gradient)
         # Every fourth start is from one of the best points of all.
         n = len(updated.fresh)
         ranks = ((state.mutation.round + jnp.arange(n)) % AMONG).astype(jnp.int32)
