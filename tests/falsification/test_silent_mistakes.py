@@ -135,7 +135,7 @@ def test_the_specifications_of_this_project_get_no_false_note():
     right = ("feature 'psi' influences no signal", "features 'car_hue', 'car_value', 'car_gap'")
     checked = 0
     for file in sorted((ROOT / "specs").glob("**/*.py")):
-        if file.stem in ("__init__", "tuning", "hopper", "reacher"):
+        if file.stem in ("__init__", "tuning", "hopper", "reacher", "lstm"):
             continue
         for name, problem in definitions(str(file), vj.Problem).items():
             found = [note for note in silent_mistakes(problem) if not note.startswith(right)]

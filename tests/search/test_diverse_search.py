@@ -198,7 +198,9 @@ def test_the_gradient_is_that_of_the_raised_robustness():
     u = jax.random.uniform(jax.random.key(1), (4, 3), jnp.float32)
     told_of = Observations(u, jax.vmap(rho)(u), jnp.ones(4, bool), jax.vmap(jax.grad(rho))(u))
     seen = search._deflate(state, cube, told_of)
-    wanted = jax.vmap(jax.grad(lambda p: search._raise(state, cube, p[None], rho(p)[None])[0]))(u)
+    wanted = jax.vmap(
+        jax.grad(lambda p: search._raise(state, cube, p[None], None, rho(p)[None])[0])
+    )(u)
     assert seen.gradient is not None
     np.testing.assert_allclose(seen.gradient, wanted, rtol=1e-4, atol=1e-5)
 
@@ -226,7 +228,7 @@ def test_clauses_and_their_gradients_are_raised_alike():
     )
 
     def raised(point):
-        near, _ = search._nearness(state, cube, point[None])
+        near, _ = search._nearness(state, cube, point[None], None)
         return jnp.where(
             near[0] > 0, jnp.maximum(clauses(point)[:2], 0) + near[0], clauses(point)[:2]
         )
