@@ -156,6 +156,23 @@ def choose(first: Bool[Array, ""], one: Part, two: Part) -> Part:
     return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)
 
 
+def nearest_to_failing(
+    observations: Observations, offered: Float[Array, "k d"], near: Float[Array, " k"]
+) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+    """Return the points nearest to failing, failures left out, of a batch and of those offered.
+
+    **Arguments:**
+
+    - `observations`: the batch.
+    - `offered`, `near`: earlier points and their robustness, infinite where there is none.
+    """
+    usable = observations.usable & (observations.rho >= 0)
+    rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), near])
+    points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), offered])
+    _, nearest = jax.lax.top_k(-rho, len(near))
+    return points[nearest], rho[nearest]
+
+
 def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
     """Draw uniform numbers in `[0, 1)`: those of `jax.random.uniform`, compiled much sooner.
 

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, choose
+from verifai_jax.search.base import Observations, Plan, Search, choose, nearest_to_failing
 from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
@@ -269,11 +269,8 @@ class Gradient(Search[GradientState]):
         self, state: GradientState, cube: Cube, observations: Observations
     ) -> GradientState:
         """Start the first descents from the points nearest to failing, failures left out."""
-        usable = observations.usable & (observations.rho >= 0)
-        rho = jnp.concatenate([jnp.where(usable, observations.rho, jnp.inf), state.near])
-        points = jnp.concatenate([jnp.where(usable[:, None], observations.u, 0.5), state.offered])
-        _, nearest = jax.lax.top_k(-rho, len(state.near))
-        return state._replace(offered=points[nearest], near=rho[nearest])
+        offered, near = nearest_to_failing(observations, state.offered, state.near)
+        return state._replace(offered=offered, near=near)
 
     def start_from(
         self, state: GradientState, cube: Cube, observations: Observations
