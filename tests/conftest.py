@@ -134,3 +134,19 @@ def pytest_testnodedown(node: Any, error: Any) -> None:
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Print the peak memory, in GB, of the process that ran tests and needed most."""
     terminalreporter.write_line(f"peak memory of a worker: {max(PEAKS or [peak_memory()]):.1f} GB")
+
+
+@pytest.fixture
+def compiled():
+    """Names of the programs that are compiled, as they are."""
+    import jax.monitoring
+
+    names = []
+
+    def listen(event, duration, **more):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(more["fun_name"])
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)

@@ -1,25 +1,9 @@
 """What a first run compiles: no more programs than it needs, and none of them twice."""
 
-import jax
-import jax.monitoring
 import jax.numpy as jnp
 import pytest
 
 import verifai_jax as vj
-
-
-@pytest.fixture
-def compiled():
-    """Names of the programs that are compiled, as they are."""
-    names = []
-
-    def listen(event, duration, **more):
-        if event == "/jax/core/compile/backend_compile_duration":
-            names.append(more["fun_name"])
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def problem(bound=1.0):

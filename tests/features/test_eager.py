@@ -10,21 +10,6 @@ import verifai_jax as vj
 from verifai_jax.features.domain import as_real, on_device
 from verifai_jax.rl import Discrete, Policy, load_policy, save_policy
 
-
-@pytest.fixture
-def compiled():
-    """Names of the programs that are compiled, as they are."""
-    names = []
-
-    def listen(event, duration, **more):
-        if event == "/jax/core/compile/backend_compile_duration":
-            names.append(more["fun_name"])
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 SPACE = {
     "x": vj.Box(-1.25, 1.35),
     "closed": vj.Box(0.1, 61.2, closed="left"),
