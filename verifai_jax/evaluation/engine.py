@@ -12,49 +12,34 @@ small enough for the cache, so that there is one executable for each (problem, b
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
 
-from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
 from verifai_jax.core.devices import spread_over_devices
+from verifai_jax.core.fingerprint import fingerprint
 from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.remembered import lower_or_recall, remembered_as
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
+from verifai_jax.evaluation.row import Row, RowFunction
 from verifai_jax.evaluation.steering import NOTHING, Steering
-from verifai_jax.evaluation.streaming_monitor import streaming_monitor
-from verifai_jax.evaluation.verdicts import (
-    Verdicts,
-    boolean_semantics,
-    trace_marks,
-    trace_verdict,
-    violations,
-)
-from verifai_jax.mtl import hard, robustness, smooth
-from verifai_jax.mtl.clauses import ABSENT, Goals, goals_of
+from verifai_jax.evaluation.verdicts import Verdicts, violations
+from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 
 Mode = Literal["evaluate", "holds"]
 """Programs of an engine: robustness and derivatives, or the Boolean semantics of the same rows."""
-
-
-class Row(NamedTuple):
-    """The result of one row under `jax.vmap`; see `Verdicts`."""
-
-    rho: Float[Array, " formulas"]
-    status: Int[Array, ""]
-    features: PyTree
-    derivatives: dict[str, Array]
 
 
 class Engine:
@@ -98,7 +83,6 @@ class Engine:
         self.steering = steering
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
-        self.goals: Goals | None = goals_of(problem.formulas.values()) if clauses else None
         self.precision, self.own_keys, self.alone = precision, own_keys, alone
         self.effort: Effort = effort
         devices = jax.local_devices() if devices is None else devices
@@ -112,6 +96,9 @@ class Engine:
         self.compile_seconds = 0.0
         self.notes: tuple[str, ...] = ()
         self._derivative = Derivative(self.inputs.dim, problem.system.forward_up_to)
+        goals = goals_of(problem.formulas.values()) if clauses else None
+        self.goals = goals
+        self._function = RowFunction(problem, self.inputs, precision, gradient, goals, steering)
         self._packing: dict[Mode, Packing] = {}
         self._traced: dict[Mode, jax.stages.Traced] = {}
         self._compiling: dict[Mode, Compilation] = {}
@@ -167,30 +154,7 @@ class Engine:
         self, row: PyTree, key: Key[Array, ""], temperature: Float[Array, ""], shared: PyTree = ()
     ) -> Row:
         """Evaluate one row under `jax.vmap`, in a program that a caller compiles."""
-        coordinates = self.inputs.coordinates(row, shared, self.precision)
-
-        def simulated(coordinates: Array) -> tuple[PyTree, Any]:
-            return self.inputs.simulated(coordinates, row, shared)
-
-        if self.goals is not None:
-            return self._clauses(self.goals, simulated, coordinates, key, temperature)
-        if self.gradient:
-            return self._gradient(simulated, coordinates, key, temperature)
-        features, system = simulated(coordinates)
-        traced = self.problem.behaviour is not None and self.inputs.streaming
-        if traced or self.steering.size:
-            trace = system(features, key)
-            rho, status = trace_verdict(self.problem, trace)
-            more = self._steering(trace, features)
-            if traced:
-                more |= {"marks": trace_marks(self.problem, trace)}
-            return Row(rho.astype(coordinates.dtype), status, features, more)
-        monitor = streaming_monitor(self.problem) if self.inputs.streaming else None
-        if monitor is not None:
-            rho, status = monitor(features, key)
-        else:
-            rho, status = trace_verdict(self.problem, system(features, key))
-        return Row(rho.astype(coordinates.dtype), status, features, {})
+        return self._function(row, key, temperature, shared, self._derivative)
 
     def draws(self) -> bool:
         """Return whether the system uses its random key; needs `own_keys` and `alone`.
@@ -268,7 +232,7 @@ class Engine:
         differentiates = self.gradient and mode == "evaluate"
         name = "gradients" if differentiates else self.inputs.purpose
         with tracing(name):
-            lowered = self._trace(mode).lower()
+            lowered = self._lower_gradient() if differentiates else self._trace(mode).lower()
             self._compiling[mode] = compile_soon(name, lowered, self.effort)
         self.compile_seconds += time.perf_counter() - started
 
@@ -276,19 +240,6 @@ class Engine:
         if mode in self._traced:
             return self._traced[mode]
         one_row = {"evaluate": self.row, "holds": self.row_holds}[mode]
-        key = jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
-        first = jax.ShapeDtypeStruct((), jnp.int32)
-        leading = () if self.alone else (self.padded,)
-        arguments = (
-            jax.tree.map(
-                lambda form: jax.ShapeDtypeStruct((*leading, *form.shape), form.dtype),
-                self.inputs.row_form,
-            ),
-            jax.ShapeDtypeStruct(leading, key.dtype) if self.own_keys else (key, first),
-            jax.ShapeDtypeStruct(leading, jnp.float32),
-            self.inputs.shared_form,
-            jax.ShapeDtypeStruct((CAPACITY,), self.precision),
-        )
         packing = self._packing[mode] = Packing()
         numbers = self._numbers[mode] = LiftedNumbers()
 
@@ -302,9 +253,74 @@ class Engine:
 
         program = packed_row if self.alone else self._batched(packed_row)
         # A new function object each time: JAX remembers what it traced by the function.
-        traced = self.differentiable(lambda: jax.jit(partial(program)).trace(*arguments))
-        self._traced[mode] = traced
+        traced = self._traced[mode] = jax.jit(partial(program)).trace(*self._arguments)
         return traced
+
+    def _lower_gradient(self) -> jax.stages.Lowered:
+        """Lower the program of derivatives; only the simulation and its monitor are always traced.
+
+        The derivatives follow from these, and are recalled where an earlier process had the same.
+        """
+        function, shared = self._function, self.inputs.shared_form
+        numbers = self._numbers["evaluate"] = LiftedNumbers()
+        *_, vector = self._arguments
+        row = self.inputs.row_form
+        coordinates = jax.eval_shape(function.coordinates, row, shared)
+        one = (coordinates, row, _key_form(), jax.ShapeDtypeStruct((), jnp.float32), shared, vector)
+
+        def objective(coordinates: Array, *others: Any) -> Any:
+            vector, rest = others[-1], others[:-1]
+            return numbers.read_from(vector, lambda: function.objective(coordinates, *rest))
+
+        traced = jax.jit(objective).trace(*one)
+        values, results = traced.out_info
+        # Traced once, and all else is made of that: nothing that a user's code may do comes in.
+        known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
+        form = jax.tree.structure(traced.out_info)
+        packing = self._packing["evaluate"] = Packing()
+
+        def packed(derivatives: Array, results: PyTree) -> Any:
+            result = function.finish(derivatives, results)
+            keeps = self.inputs.keeps_features
+            return packing.pack(result if keeps else result._replace(features=None))
+
+        derivatives = jax.ShapeDtypeStruct((*values.shape, *coordinates.shape), values.dtype)
+        jax.eval_shape(packed, derivatives, results)
+
+        def packed_row(row: PyTree, *others: Any) -> Any:
+            def objective(coordinates: Array) -> Any:
+                return jax.tree.unflatten(form, known(*jax.tree.leaves((coordinates, row, others))))
+
+            *_, shared, _ = others
+            derivative = self._derivative if self.goals is None else self._derivative.of_several
+            return packed(*derivative(objective, function.coordinates(row, shared)))
+
+        program = packed_row if self.alone else self._batched(packed_row)
+        identity = fingerprint(traced.jaxpr)
+        shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
+
+        def lower() -> jax.stages.Lowered:
+            name = remembered_as("gradients", identity, shape, self._derivative)
+            return lower_or_recall(name, partial(program), self._arguments)
+
+        return self.differentiable(lower)
+
+    @cached_property
+    def _arguments(self) -> tuple[Any, ...]:
+        """Shapes and types of the arguments of the programs of batches."""
+        first = jax.ShapeDtypeStruct((), jnp.int32)
+        leading = () if self.alone else (self.padded,)
+        key = _key_form()
+        return (
+            jax.tree.map(
+                lambda form: jax.ShapeDtypeStruct((*leading, *form.shape), form.dtype),
+                self.inputs.row_form,
+            ),
+            jax.ShapeDtypeStruct(leading, key.dtype) if self.own_keys else (key, first),
+            jax.ShapeDtypeStruct(leading, jnp.float32),
+            self.inputs.shared_form,
+            jax.ShapeDtypeStruct((CAPACITY,), self.precision),
+        )
 
     def _batched(self, one_row: Callable[..., Any]) -> Callable[..., Any]:
         """Spread `one_row` over chunks of lanes and over the devices."""
@@ -347,83 +363,6 @@ class Engine:
 
         return program
 
-    def _gradient(
-        self, simulated: Callable[..., Any], coordinates: Array, key: Array, temperature: Array
-    ) -> Row:
-        """Robustness, and the gradient of the least smooth robustness."""
-
-        def objective(coordinates: Array) -> tuple[Array, Any]:
-            features, system = simulated(coordinates)
-            trace = system(features, key).hold()
-            semantics = smooth(temperature.astype(coordinates.dtype))
-            smoothed = [
-                robustness(formula, trace, semantics, end=self.problem.end)
-                for formula in self.problem.formulas.values()
-            ]
-            verdict = trace_verdict(self.problem, trace)
-            least = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
-            return least, (*verdict, features, self._steering(trace, features))
-
-        gradient, (rho, status, features, more) = self._derivative(objective, coordinates)
-        dtype = coordinates.dtype
-        more |= {"gradient": gradient.astype(dtype)}
-        return Row(rho.astype(dtype), status, features, more)
-
-    def _steering(self, trace: Trace, features: PyTree) -> dict[str, Array]:
-        if not self.steering.size:
-            return {}
-        return {"steering": self.steering.values(self.problem, trace, features)}
-
-    def _guided(self, values: Array, trace: Trace, features: PyTree) -> Array:
-        """Return robustness, or clauses, with the guide's share, for their derivatives."""
-        guide = self.problem.guide
-        if not self.steering.guide or guide is None:
-            return values
-        share = guide.share(guide.value(trace, features, self.problem.end))
-        return (1 - guide.weight) * values + guide.weight * share.astype(values.dtype)
-
-    def _clauses(
-        self,
-        goals: Goals,
-        simulated: Callable[..., Any],
-        coordinates: Array,
-        key: Array,
-        temperature: Array,
-    ) -> Row:
-        """Robustness as ever, and the clauses of the goal that is nearest to being broken."""
-        dtype = coordinates.dtype
-
-        def objective(coordinates: Array) -> tuple[Array, Any]:
-            features, system = simulated(coordinates)
-            trace = system(features, key).hold()
-            values = goals.values(trace, hard, self.problem.end)
-            nearest = jnp.argmin(jnp.max(values, axis=1))
-            verdict = trace_verdict(self.problem, trace)
-            # A goal that is broken is a failure, whatever the guide says.
-            broken = jnp.max(values[nearest]) < 0
-            told = self._guided(values[nearest], trace, features)
-            # And clauses that there are not stay absent.
-            told = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], told)
-            results = (*verdict, features, told, self._steering(trace, features))
-            if not self.gradient:
-                return values[nearest], results
-            semantics = smooth(temperature.astype(dtype))
-            smoothed = goals.values(trace, semantics, self.problem.end)[nearest]
-            return self._guided(smoothed, trace, features), results
-
-        if self.gradient:
-            sweep = self._derivative.of_several(objective, coordinates)
-            derivatives, (rho, status, features, values, more) = sweep
-        else:
-            _, (rho, status, features, values, more) = objective(coordinates)
-            derivatives = None
-        missing = CLAUSES - len(values)
-        padded = jnp.pad(values, (0, missing), constant_values=ABSENT)
-        more |= {"clauses": padded.astype(dtype)}
-        if derivatives is not None:
-            more["clause_gradients"] = jnp.pad(derivatives, ((0, missing), (0, 0))).astype(dtype)
-        return Row(rho.astype(dtype), status, features, more)
-
     def row_holds(
         self,
         row: PyTree,
@@ -432,9 +371,11 @@ class Engine:
         shared: PyTree = (),
     ) -> Bool[Array, " formulas"]:
         """Return the Boolean semantics of one row under `jax.vmap`, in a caller's program."""
-        coordinates = self.inputs.coordinates(row, shared, self.precision)
-        features, system = self.inputs.simulated(coordinates, row, shared)
-        return boolean_semantics(self.problem, system(features, key))
+        return self._function.holds(row, key, shared)
+
+
+def _key_form() -> Any:
+    return jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
 
 
 def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:

@@ -22,9 +22,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.compilation import Compilation, compile_soon, tracing
+from verifai_jax.core.compilation import compile_soon, tracing
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
+from verifai_jax.core.remembered import lower_or_recall, remembered_as
 from verifai_jax.search import Diverse, Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_own
 
@@ -350,10 +352,20 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
     state: Any = begun.out_info
+    states = jax.tree.structure(state)
+    # What a search of this package does follows from its options; a user's may do anything.
+    kept = None if is_own(search) else identity(search, cube, batch, marks)
+
+    def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
+        name = remembered_as(f"search-{verb}", kept, verb)
+        lowered = lower_or_recall(name, function, arguments, form)
+        return compile_soon("the search", lowered, "little")
+
     # What takes longest to compile begins first.
-    ask = _compiled(lambda state: search.ask(state, cube, batch), state)
-    init = compile_soon("the search", begun.lower(), "little")
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
+    asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
+    ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
+    init = compile_soon("the search", begun.lower(), "little")
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
     observations = Observations(points, rho, valid, points if search.wants_gradient else None)
@@ -369,15 +381,16 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
             clauses=jax.ShapeDtypeStruct((batch, CLAUSES), jnp.float32),
             clause_gradients=jax.ShapeDtypeStruct((batch, CLAUSES, cube.dim), jnp.float32),
         )
-        plan = _compiled(lambda state: search.plan(state, cube, batch), state)
+        form = jax.tree.structure(Plan(0, 0, 0))  # pyright: ignore[reportArgumentType]
+        plan = compiled("plan", lambda state: search.plan(state, cube, batch), state, form=form)
     tell: Any = None
     if search.learns:
-        tell = _compiled(lambda state, rows: search.tell(state, cube, rows), state, observations)
+        tell = compiled(
+            "tell", lambda state, rows: search.tell(state, cube, rows), state, observations,
+            form=states,
+        )  # fmt: skip
     temperature: Any = lambda state: 1.0  # noqa: E731
     if search.wants_gradient:
-        temperature = _compiled(search.temperature, state)
+        form = jax.tree.structure(0)
+        temperature = compiled("temperature", search.temperature, state, form=form)
     return SearchProgram(init, ask, tell, temperature, plan)
-
-
-def _compiled(function: Callable[..., Any], *arguments: PyTree) -> Compilation:
-    return compile_soon("the search", jax.jit(function).lower(*arguments), "little")

@@ -44,7 +44,15 @@ def checkpointed_scan(
 
 
 def _segment_length(length: int) -> int:
-    """Return a length of segments near the root of the length, that divides it if one does."""
+    """Return a length of segments near the root of the length, that divides it if one does.
+
+    Or else one that leaves a single step over, as whole seconds and the sample at their end do: XLA
+    writes a loop of one step out, and finds that nothing comes of moving on from there, where any
+    other rest compiles the step once more.
+    """
     root = math.isqrt(length)
-    divisors = [n for n in range(root // 2, 2 * root) if length % n == 0]
-    return min(divisors, key=lambda n: abs(n - root), default=root)
+    for whole in (length, length - 1):
+        divisors = [n for n in range(root // 2, 2 * root) if whole % n == 0]
+        if divisors:
+            return min(divisors, key=lambda n: abs(n - root))
+    return root

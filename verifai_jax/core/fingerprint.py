@@ -1,0 +1,222 @@
+"""The identity of a traced function: all of what it computes, and of how it is differentiated.
+
+    traced = jax.jit(function).trace(*arguments)
+    fingerprint(traced.jaxpr)                           # a hash, or None where one cannot be taken
+
+Two functions of equal fingerprints compute the same, and so do all programs that are derived from
+them by the same rules, such as their derivatives. A user's code itself cannot be read for that:
+what it does may depend on anything. What JAX has just traced of it does not.
+"""
+
+import enum
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.core
+import jax.extend.core
+import jax.numpy as jnp
+import numpy as np
+
+_CUSTOM = ("custom_jvp_call", "custom_vjp_call")
+"""Primitives of functions that bring their own derivative."""
+_NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device")
+"""Classes of JAX whose text says all of them."""
+
+
+class _Unknown(Exception):
+    """Something of which it cannot be said what it does."""
+
+
+def fingerprint(program: jax.extend.core.ClosedJaxpr) -> str | None:
+    """Return a hash of all that a traced function computes, with its constants.
+
+    **Arguments:**
+
+    - `program`: what JAX traced.
+
+    **Returns:** the hash in hexadecimal digits; None where a part of the function is opaque, such
+    as a call of Python from the device.
+    """
+    reader = _Reader()
+    try:
+        reader.read(program)
+    except _Unknown:
+        return None
+    return reader.digest()
+
+
+def identity(*values: object) -> str | None:
+    """Return a hash of plain values: numbers, texts, arrays, tuples, and dataclasses of them.
+
+    **Returns:** the hash in hexadecimal digits; None where one of them is something else.
+    """
+    reader = _Reader()
+    try:
+        reader.read(values)
+    except _Unknown:
+        return None
+    return reader.digest()
+
+
+class _Reader:
+    """Reads values and programs into one hash, each part of a program once."""
+
+    def __init__(self) -> None:
+        self._texts: list[str] = []
+        self._known: dict[int, int] = {}
+        self._kept: list[Any] = []  # So that their identities stay theirs.
+
+    def digest(self) -> str:
+        return hashlib.sha256("\0".join(self._texts).encode()).hexdigest()
+
+    def read(self, value: Any) -> None:
+        """Read any value.
+
+        **Raises:** `_Unknown` for one of which it cannot be said what it does.
+        """
+        add = self._texts.append
+        if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
+            add(f"{type(value).__name__} {value!r}")
+        elif isinstance(value, jax.extend.core.ClosedJaxpr):
+            self._program(value.jaxpr, value.consts)
+        elif isinstance(value, jax.extend.core.Jaxpr):
+            self._program(value, ())
+        elif isinstance(value, (np.ndarray, np.generic, jax.Array)):
+            self._array(value)
+        elif isinstance(value, (tuple, list)):
+            add(f"{type(value).__name__} {len(value)}")
+            for each in value:
+                self.read(each)
+        elif isinstance(value, Mapping):
+            add(f"mapping {len(value)}")
+            for key in sorted(value, key=repr):
+                self.read(key)
+                self.read(value[key])
+        elif isinstance(value, (set, frozenset)):
+            add(f"set {sorted(map(repr, value))}")
+        elif isinstance(value, (np.dtype, jax.core.ShapedArray)):
+            add(_form(value) if isinstance(value, jax.core.ShapedArray) else str(value))
+        elif isinstance(value, (enum.Enum, type)):
+            add(f"{_place(value if isinstance(value, type) else type(value))} {value}")
+        elif type(value).__name__ in _NAMED and _place(type(value)).startswith("jax"):
+            add(f"{_place(type(value))} {value}")
+        elif hasattr(type(value), "__dataclass_fields__"):
+            add(_place(type(value)))
+            for name in type(value).__dataclass_fields__:
+                add(name)
+                self.read(getattr(value, name))
+        else:
+            raise _Unknown(_place(type(value)))
+
+    def _array(self, value: Any) -> None:
+        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            self._texts.append(str(value.dtype))
+            value = jax.random.key_data(value)
+        array = np.asarray(value)
+        if array.dtype == object:
+            raise _Unknown("an array of objects")
+        data = array.tobytes()
+        weak = getattr(value, "weak_type", False)
+        text = data.hex() if len(data) <= 64 else hashlib.sha256(data).hexdigest()
+        self._texts.append(f"{array.dtype}{array.shape}{weak} {text}")
+
+    def _program(self, program: Any, constants: Any, derived: bool = False) -> None:
+        add = self._texts.append
+        if id(program) in self._known and not constants:
+            add(f"program {self._known[id(program)]}")
+            return
+        self._known[id(program)] = len(self._known)
+        self._kept.append(program)
+        numbers: dict[Any, int] = {}
+
+        def defined(variables: Any) -> str:
+            for variable in variables:
+                numbers[variable] = len(numbers)
+            return " ".join(_form(variable.aval) for variable in variables)
+
+        add(f"constants {defined(program.constvars)} inputs {defined(program.invars)}")
+        for constant in constants:
+            self.read(constant)
+        for step in program.eqns:
+            name = step.primitive.name
+            add(name)
+            for value in step.invars:
+                self._operand(value, numbers)
+            add(defined(step.outvars))
+            if name in _CUSTOM:
+                if not derived:
+                    self._custom(program, step)
+                    continue
+                self.read(step.params["call_jaxpr"])
+                continue
+            hidden = ()
+            if name == "custom_vmap_call":
+                _check_rule(step.params["rule"])
+                hidden = ("rule",)
+            for parameter in sorted(set(step.params).difference(hidden)):
+                add(parameter)
+                self.read(step.params[parameter])
+        for value in program.outvars:
+            self._operand(value, numbers)
+
+    def _operand(self, value: Any, numbers: Mapping[Any, int]) -> None:
+        if isinstance(value, jax.extend.core.Literal):
+            self._texts.append(_form(value.aval))
+            self.read(value.val)
+        else:
+            self._texts.append(str(numbers[value]))
+
+    def _custom(self, program: Any, step: Any) -> None:
+        """Read a function that brings its own derivative: what it computes, and that as traced."""
+        if step.params.get("symbolic_zeros"):
+            raise _Unknown("a derivative that depends on which tangents are zero")
+        self.read(step.params["call_jaxpr"])
+        inputs = [v for v in step.invars if not isinstance(v, jax.extend.core.Literal)]
+        inputs = list(dict.fromkeys(inputs))
+        places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.floating)]
+        if not places:
+            return
+        alone = program.replace(
+            constvars=[], invars=inputs, outvars=step.outvars, eqns=[step], effects=step.effects,
+            debug_info=step.params["call_jaxpr"].jaxpr.debug_info.with_unknown_names(),
+        )  # fmt: skip
+        call = jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(alone, []))
+        forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inputs]
+
+        def derivative(arguments: Any, directions: Any) -> Any:
+            def function(*values: Any) -> Any:
+                whole = list(arguments)
+                for i, value in zip(places, values, strict=True):
+                    whole[i] = value
+                results = call(*whole)
+                return [each for each in results if jnp.issubdtype(each.dtype, jnp.floating)]
+
+            values = [arguments[i] for i in places]
+            if step.primitive.name == "custom_jvp_call":
+                return jax.jvp(function, values, directions)
+            results, pull = jax.vjp(function, *values)
+            return pull([jnp.ones_like(result) for result in results])
+
+        # Only of these: the derivative of all else follows from what it computes.
+        traced = jax.make_jaxpr(derivative)(forms, [forms[i] for i in places])
+        self._program(traced.jaxpr, traced.consts, derived=True)
+
+
+def _check_rule(rule: Any) -> None:
+    """Refuse a batching rule of somebody else's: it may compute something else than the function.
+
+    Those of JAX and of this package compute the same for each lane.
+    """
+    package = str(getattr(rule, "__module__", "")).partition(".")[0]
+    if package not in ("jax", "verifai_jax"):
+        raise _Unknown("a batching rule")
+
+
+def _form(value: Any) -> str:
+    return f"{value.dtype}{value.shape}{getattr(value, 'weak_type', False)}"
+
+
+def _place(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
