@@ -13,9 +13,11 @@ and if it fails by more than the finer step has moved it, and by far more than r
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -97,6 +99,19 @@ class Confirmer:
         self.raised: tuple[str, ...] = ()
         self._plan: _Plan | None = None
 
+    def prepare(self) -> None:
+        """Trace what replays a row before there is one, while something else compiles.
+
+        What cannot be traced is told once there are rows.
+        """
+        if self._plan is not None or self.problem.black_box or self.other is not None:
+            return
+        space = self.problem.space
+        forms = jax.eval_shape(space.unflatten, space.point_form)
+        features = jax.tree.map(lambda form: np.zeros((1, *form.shape), form.dtype), forms)
+        with suppress(Exception):
+            self._plan = _make_plan(self, space.rows(features))
+
     def __call__(
         self,
         rows: Mapping[str, Any],
@@ -121,6 +136,7 @@ class Confirmer:
         run = np.asarray(rows["rho"], np.float64) if "rho" in rows else None
         if self._plan is None:
             self._plan = _make_plan(self, rows)
+        if not self.checked:
             self.checked = describe_checks(self._plan.checks, self.problem.system.exact_step)
         most = max(MOST, COST // self._plan.cost) if self.most is None else self.most
         order = np.arange(len(numbers)) if run is None else _order(run)

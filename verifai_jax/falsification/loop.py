@@ -141,6 +141,9 @@ class Rounds:
         self.evaluate.begin_compiling()
         if self._differentiate is not None and not resumed:
             self._differentiate.begin_compiling()
+        if self._confirmer is not None:
+            # Meanwhile; whatever fails will be replayed.
+            self._confirmer.prepare()
         self.evaluate.compile()
         self._propose()
 
