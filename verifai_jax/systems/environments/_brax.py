@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Bool, Int, Key, PyTree
 
 from verifai_jax.core.errors import (
     MissingExtra,
@@ -27,6 +27,7 @@ from verifai_jax.core.errors import (
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.environments.brax_joined import Joined, join
 from verifai_jax.systems.environments.brax_model import (
     Env,
     Place,
@@ -50,6 +51,7 @@ from verifai_jax.systems.environments.episode import (
     features_at,
     fold,
     has_waveforms,
+    in_form,
     policy_function,
     policy_that_sees,
     read_signals,
@@ -85,6 +87,7 @@ class Brax(System):
     exact_step: bool = True
     observation_delay: Delay = NO_DELAY
     action_delay: Delay = NO_DELAY
+    joined: Joined | None = None
 
     @property
     def duration(self) -> float:
@@ -171,6 +174,32 @@ class Brax(System):
                 self.signals, moment, action, now, _named_parts(moment.state), self.name
             )
 
+        def either(
+            fresh: Bool[Array, ""] | bool,
+            time: Time,
+            state: Env,
+            action: PyTree,
+            keys: tuple[Key[Array, ""], Key[Array, ""]],
+            form: Moment | None,
+        ) -> Moment:
+            assert self.joined is not None
+
+            def begin(env: Env) -> Any:
+                now = features_at(features, 0.0)
+                if callable(self.initial):
+                    return self.initial(env, now, keys[0])
+                if self.initial:
+                    values = {place: now[name] for name, place in self.initial.items()}
+                    env = with_start(env, values)
+                return env.reset(keys[0])
+
+            def finish(state: Any) -> Moment:
+                moment = _moment(state, self.name)
+                return moment if form is None else in_form(moment, form)
+
+            with explain_errors(self.env, self.name, "reset and step"):
+                return self.joined.moment(fresh, env_at(time), begin, state, action, finish)
+
         decide, size = policy_function(self.policy, self.policy_memory), self.env.action_size
 
         def decide_checked(
@@ -190,6 +219,7 @@ class Brax(System):
             self.steps,
             self.dt,
             Delays.under(self.observation_delay, self.action_delay, features),
+            None if self.joined is None else either,
         )
 
     def _configure(self, features: Features, time: Time) -> Any:
@@ -347,6 +377,7 @@ def brax(
         exact_step=exact_step,
         observation_delay=as_delay(observation_delay, "observation_delay"),
         action_delay=as_delay(action_delay, "action_delay"),
+        joined=join(env),
     )
 
 
