@@ -4,7 +4,8 @@
 
 Each case is run in turn with both checkouts, in processes of their own, and the order of a pair
 changes from pair to pair. Processor time (user and system, all threads, from the operating system)
-is what a busy machine disturbs least; the wall-clock time is beside it. The ratio is the median of
+is what a busy machine disturbs least; beside it are the time by the clock and that to the first
+line that the process prints, which says what was found, before pictures. The ratio is the median of
 those of the pairs.
 
 | case | what runs |
@@ -146,18 +147,20 @@ def run_brax():
 
 
 def measure(command, checkout, cache):
-    """Return processor seconds and seconds of a process, and what it printed."""
+    """Return processor seconds and seconds of a process, those to its first line, and its lines."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "VERIFAI_JAX_CACHE": str(cache)}
     started = time.perf_counter()
     process = subprocess.Popen(command, cwd=checkout, env=environment, stdout=subprocess.PIPE)
     assert process.stdout is not None
-    said = process.stdout.read().decode()
+    first = process.stdout.readline()
+    answered = time.perf_counter() - started
+    said = (first + process.stdout.read()).decode()
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     seconds = time.perf_counter() - started
     if process.returncode:
         raise SystemExit(f"{' '.join(command)} failed in {checkout}")
-    return usage.ru_utime + usage.ru_stime, seconds, said
+    return usage.ru_utime + usage.ru_stime, seconds, answered, said
 
 
 def command_of(case, place):
@@ -182,7 +185,7 @@ def command_of(case, place):
 
 
 def one(case, checkout, caches):
-    """Run a case once and return its processor seconds, its seconds and what it printed."""
+    """Run a case once and return what `measure` does."""
     # One place for all: JAX knows a compiled program by the folder of its cache, too.
     cache = caches / checkout.name / "compiled"
     if case not in ("cold", "small", "brax", "help", "import"):
@@ -237,7 +240,8 @@ def main():
         return
     now = Path(__file__).resolve().parents[1]
     checkouts = [now] if options.before is None else [options.before.resolve(), now]
-    print(f"{'case':<10}{'before':>16}{'now':>16}{'ratio':>8}   processor s (wall s)")
+    head = "processor s (s by the clock, s to its first line)"
+    print(f"{'case':<10}{'before':>20}{'now':>20}{'ratio':>8}   {head}")
     with tempfile.TemporaryDirectory() as caches:
         for case in options.cases.split(","):
             rows = {checkout: [] for checkout in checkouts}
@@ -245,10 +249,11 @@ def main():
                 for checkout in checkouts if pair % 2 else checkouts[::-1]:
                     rows[checkout].append(one(case, checkout, Path(caches)))
             if case in ("cold", "again", "bound", "budget", "small"):
-                assert len({said for runs in rows.values() for _, _, said in runs}) == 1, rows
+                assert len({run[-1] for runs in rows.values() for run in runs}) == 1, rows
             shown = [
                 f"{statistics.median(r[0] for r in runs):.2f} "
-                f"({statistics.median(r[1] for r in runs):.1f})"
+                f"({statistics.median(r[1] for r in runs):.1f}, "
+                f"{statistics.median(r[2] for r in runs):.1f})"
                 for runs in rows.values()
             ]
             ratio = ""
@@ -256,7 +261,7 @@ def main():
                 pairs = zip(rows[now], rows[checkouts[0]], strict=True)
                 ratio = f"{statistics.median(a[0] / b[0] for a, b in pairs):.2f}"
             before = shown[0] if len(checkouts) == 2 else ""
-            print(f"{case:<10}{before:>16}{shown[-1]:>16}{ratio:>8}", flush=True)
+            print(f"{case:<10}{before:>20}{shown[-1]:>20}{ratio:>8}", flush=True)
 
 
 if __name__ == "__main__":
