@@ -299,8 +299,11 @@ class Engine:
         identity = fingerprint(traced.jaxpr)
         shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
 
+        # A program from a file runs on the first devices.
+        first = list(self.devices) == jax.local_devices()[: len(self.devices)]
+
         def lower() -> jax.stages.Lowered:
-            name = remembered_as("gradients", identity, shape, self._derivative)
+            name = remembered_as("gradients", identity, shape, self._derivative) if first else None
             return lower_or_recall(name, partial(program), self._arguments)
 
         return self.differentiable(lower)
