@@ -59,7 +59,7 @@ class Engine:
     - `alone`: whether the engine takes one row at a time, which compiles without `jax.vmap` and so
       takes less time; with `own_keys` only.
     - `lanes`: rows that a device works on together; as the system says when left out.
-    - `effort`: how much XLA does to make its programs fast.
+    - `effort`: how much XLA does to make its programs fast; as the system says when left out.
     - `steering`: what it computes for a search beside the robustness.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
@@ -77,14 +77,14 @@ class Engine:
         own_keys: bool = False,
         alone: bool = False,
         lanes: int | None = None,
-        effort: Effort = "most",
+        effort: Effort | None = None,
         steering: Steering = NOTHING,
     ) -> None:
         self.steering = steering
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
         self.precision, self.own_keys, self.alone = precision, own_keys, alone
-        self.effort: Effort = effort
+        self.effort: Effort = problem.system.effort if effort is None else effort
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]

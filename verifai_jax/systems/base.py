@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
+from verifai_jax.core.compilation import Effort
 from verifai_jax.core.trace import Status, Trace
 
 Features: TypeAlias = PyTree
@@ -38,6 +39,8 @@ class System:
 
     - `black_box`: True for a system that runs on the host; JAX must be able to trace any other.
     - `lanes`: simulations that a device works on together.
+    - `effort`: how much XLA does to make programs that simulate it fast; one for all numbers of
+      rows, since a row's last digits may depend on it.
     - `forward_up_to`: features up to which forward mode is no slower than reverse mode.
     - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
     - `dt`: the sampling period in seconds of what `fold` simulates.
@@ -52,6 +55,7 @@ class System:
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
     lanes: int = 512
+    effort: Effort = "most"
     forward_up_to: int = 1
     reverse_hint: str = ""
     dt: float | None = None
@@ -168,7 +172,7 @@ class System:
 
 
 _VALUES = (
-    *("black_box", "lanes", "forward_up_to", "reverse_hint", "dt", "exact_step"),
+    *("black_box", "lanes", "effort", "forward_up_to", "reverse_hint", "dt", "exact_step"),
     *("traced_factor", "backends", "backend", "likely"),
 )
 

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import verifai_jax as vj
 from verifai_jax.core.waveform import Waveform
+from verifai_jax.evaluation.engine import Engine
 
 pytest.importorskip("brax")
 
@@ -112,6 +114,14 @@ def test_the_program_is_much_smaller(pole):
     given = features(0.02, g=jnp.float32(-9.0))
     sizes = [len(jax.jit(s).lower(given, KEY).as_text()) for s in (pole, plain(pole))]
     assert sizes[0] < 0.75 * sizes[1]
+
+
+def test_all_its_engines_compile_with_less_effort(pole):
+    space = {"angle": vj.Box(0.0, 0.1), "late": vj.Constant(0), "g": vj.Constant(-9.0)}
+    for system, effort in ((pole, "little"), (plain(pole), "most")):
+        problem = vj.Problem("pole", space, system, "always angle < 1")
+        assert Engine(problem, 2).effort == Engine(problem, 2, gradient=True).effort == effort
+        assert Engine(problem, 2, effort="least").effort == "least"
 
 
 def test_physics_of_another_kind_is_left_as_it_is():

@@ -18,6 +18,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Bool, Int, Key, PyTree
 
+from verifai_jax.core.compilation import Effort
 from verifai_jax.core.errors import (
     MissingExtra,
     require,
@@ -88,6 +89,11 @@ class Brax(System):
     observation_delay: Delay = NO_DELAY
     action_delay: Delay = NO_DELAY
     joined: Joined | None = None
+
+    @property
+    def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """How much XLA does: as measured, `little` is compiled in half the time, and as fast."""
+        return "most" if self.joined is None else "little"
 
     @property
     def duration(self) -> float:
