@@ -19,6 +19,7 @@ from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmation import Confirmer
 from verifai_jax.evaluation.confirmation_verdicts import Checked
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.systems.base import System
 
 
 def oscillator(bound=1.5):
@@ -278,6 +279,27 @@ def test_random_systems_keep_their_numbers_and_their_precision():
     assert found.counts == {"unchecked": len(found)}
     finer = confirm(run, int(run.best.name), simulator=noisy)
     assert finer.verdict == "confirmed"
+
+
+def test_a_system_that_draws_is_traced_in_the_precision_of_the_run_alone():
+    traced = []
+
+    class Noisy(System):
+        def __call__(self, features, key=None):
+            traced.append(features["x"].dtype)
+            x = features["x"] + 0.1 * jax.random.uniform(key)
+            return Trace({"x": x[None]}, dt=1.0)
+
+        def refined(self, factor):
+            return self
+
+    problem = vj.Problem("noisy", {"x": vj.Box(0.0, 1.0)}, Noisy(), "always x <= 0.5")
+    found = checked(problem, [0.9])
+    assert found.notes == (
+        "not checked in float64: in it the system would draw other random numbers",
+    )
+    assert set(found.rho) == {"again", "half_step", "quarter_step", "nudged"}
+    assert set(traced) == {np.dtype(np.float32)}
 
 
 def test_a_run_in_double_precision_without_a_finer_step_is_unchecked():

@@ -325,12 +325,18 @@ def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarr
         return _Base(HostReplays(problem, run, key), run, notes)
     # All of one form: one row is enough to trace.
     first = {name: column[:1] for name, column in rows.items()}
+    note = "not checked in float64: in it the system would draw other random numbers"
+    if run != "float64" and problem.system.can_refine:
+        # It is traced in this precision in any case.
+        with suppress(Exception):
+            single = Replays(problem, run, key, problem.space.features_of(first, run))
+            if single.draws:
+                return _Base(single, run, (note,))
     raised = ""
     try:
         replays = Replays(problem, "float64", key, problem.space.features_of(first, "float64"))
         if not (replays.draws and run != "float64"):
             return _Base(replays, "float64", ())
-        note = "not checked in float64: in it the system would draw other random numbers"
     except Exception as error:
         raised = f"the replay in float64 raised: {format_error(error)}"
         note = f"not checked in float64: {format_error(error)}"

@@ -208,8 +208,8 @@ def _either(fresh: Bool[Array, ""] | bool, start: Any, step: Any, *operands: Any
 
 
 def _array(fresh: bool) -> Bool[Array, ""]:
-    """Return an array of the kind that programs compute, of which JAX traces no part twice."""
-    return jnp.full((), fresh)
+    """Return an array as programs compute it, on their mesh: JAX traces no part of them twice."""
+    return jnp.full(1, fresh)[0]
 
 
 def _arguments(call: Callable[[Env], Any], env: Env, physics: str) -> Any:
