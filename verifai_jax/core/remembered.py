@@ -64,6 +64,11 @@ def remembered_as(kind: str, *values: object) -> str | None:
     return None if name is None else f"{kind}-{name}"
 
 
+def is_kept(name: str | None) -> bool:
+    """Return whether there is a file of this name, as `remembered_as` gives it."""
+    return name is not None and (_folder() / name).is_file()
+
+
 def lower_or_recall(
     name: str | None, function: Callable[..., Any], arguments: tuple[Any, ...], form: Any = None
 ) -> jax.stages.Lowered:

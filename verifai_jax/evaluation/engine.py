@@ -28,7 +28,7 @@ from verifai_jax.core.keys import IMPLEMENTATION, as_key, simulation_key
 from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.remembered import lower_or_recall, remembered_as
+from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
@@ -110,6 +110,19 @@ class Engine:
         """Trace now and compile in the background, beside whatever else is compiled."""
         with in_precision(self.precision):
             self._begin("evaluate")
+
+    def begin_if_recalled(self) -> None:
+        """Begin to compile derivatives if an earlier process had the same: they only have to load.
+
+        Simulation and monitor are traced to know.
+        """
+        with in_precision(self.precision):
+            started = time.perf_counter()
+            with tracing("gradients"):
+                known = self.gradient and is_kept(self._kept_as)
+            self.compile_seconds += time.perf_counter() - started
+            if known:
+                self._begin("evaluate")
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
@@ -256,10 +269,11 @@ class Engine:
         traced = self._traced[mode] = jax.jit(partial(program)).trace(*self._arguments)
         return traced
 
-    def _lower_gradient(self) -> jax.stages.Lowered:
-        """Lower the program of derivatives; only the simulation and its monitor are always traced.
+    @cached_property
+    def _derivatives(self) -> tuple[str | None, Callable[..., Any]]:
+        """The fingerprint of simulation and monitor, and the program of derivatives made of these.
 
-        The derivatives follow from these, and are recalled where an earlier process had the same.
+        Only these are traced here. All else follows from them.
         """
         function, shared = self._function, self.inputs.shared_form
         numbers = self._numbers["evaluate"] = LiftedNumbers()
@@ -296,17 +310,22 @@ class Engine:
             return packed(*derivative(objective, function.coordinates(row, shared)))
 
         program = packed_row if self.alone else self._batched(packed_row)
-        identity = fingerprint(traced.jaxpr)
+        return fingerprint(traced.jaxpr), program
+
+    @property
+    def _kept_as(self) -> str | None:
+        """The name under which the program of derivatives is kept on disk, if it can be."""
+        if list(self.devices) != jax.local_devices()[: len(self.devices)]:
+            return None  # A program from a file runs on the first ones.
         shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
+        return remembered_as("gradients", self._derivatives[0], shape, self._derivative)
 
-        # A program from a file runs on the first devices.
-        first = list(self.devices) == jax.local_devices()[: len(self.devices)]
-
-        def lower() -> jax.stages.Lowered:
-            name = remembered_as("gradients", identity, shape, self._derivative) if first else None
-            return lower_or_recall(name, partial(program), self._arguments)
-
-        return self.differentiable(lower)
+    def _lower_gradient(self) -> jax.stages.Lowered:
+        """Lower the program of derivatives, or recall it; see `core.remembered`."""
+        _, program = self._derivatives
+        return self.differentiable(
+            lambda: lower_or_recall(self._kept_as, partial(program), self._arguments)
+        )
 
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:

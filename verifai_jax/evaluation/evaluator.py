@@ -88,6 +88,11 @@ class Evaluator:
         """Trace now and compile in the background, beside whatever else is compiled."""
         self.engine.begin_compiling()
 
+    def begin_if_recalled(self) -> None:
+        """Begin to compile derivatives now where they need not be traced; see `Engine`."""
+        if isinstance(self.engine, Engine):
+            self.engine.begin_if_recalled()
+
     def compile(self) -> None:
         """Compile now, so that calls only run."""
         self.engine.compile()

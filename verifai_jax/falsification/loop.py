@@ -137,6 +137,9 @@ class Rounds:
           where the search wants those of clauses.
         """
         space, marks = self.problem.space, 0 if self._marks is None else self._marks.width
+        if self._differentiate is not None and not resumed:
+            # They take longest to load: first, where nothing of them is to be traced.
+            self._differentiate.begin_if_recalled()
         compiled_search(self.search, space.cube, self.batch, marks)
         self.evaluate.begin_compiling()
         if self._differentiate is not None and not resumed:
