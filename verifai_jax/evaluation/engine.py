@@ -59,7 +59,8 @@ class Engine:
     - `alone`: whether the engine takes one row at a time, which compiles without `jax.vmap` and so
       takes less time; with `own_keys` only.
     - `lanes`: rows that a device works on together; as the system says when left out.
-    - `effort`: how much XLA does to make its programs fast; as the system says when left out.
+    - `effort`: how much XLA does to make its programs fast; when left out as the system says, and
+      for derivatives, which are of few rows, at most a little.
     - `steering`: what it computes for a search beside the robustness.
 
     `notes` says, once compiled, what the engine decided that a user may not expect.
@@ -84,7 +85,10 @@ class Engine:
         self.problem, self.batch, self.gradient = problem, batch, gradient
         self.inputs = CubePoints(problem) if inputs is None else inputs
         self.precision, self.own_keys, self.alone = precision, own_keys, alone
-        self.effort: Effort = problem.system.effort if effort is None else effort
+        if effort is None:
+            effort = problem.system.effort
+            effort = "little" if gradient and effort == "most" else effort
+        self.effort: Effort = effort
         devices = jax.local_devices() if devices is None else devices
         # A batch smaller than the number of devices is not worth splitting.
         self.devices = devices[: max(1, min(len(devices), batch))]
