@@ -1,4 +1,4 @@
-"""What an engine computes of one row: robustness and status, clauses, derivatives, the Booleans.
+"""The function of one row that engines batch: robustness, status, clauses, derivatives, Booleans.
 
     function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, steering=NOTHING)
     function(row, key, temperature, shared, Derivative(d))          # Row, traced by JAX

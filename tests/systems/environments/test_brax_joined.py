@@ -120,7 +120,9 @@ def test_all_its_engines_compile_with_less_effort(pole):
     space = {"angle": vj.Box(0.0, 0.1), "late": vj.Constant(0), "g": vj.Constant(-9.0)}
     for system, effort in ((pole, "little"), (plain(pole), "most")):
         problem = vj.Problem("pole", space, system, "always angle < 1")
-        assert Engine(problem, 2).effort == Engine(problem, 2, gradient=True).effort == effort
+        assert Engine(problem, 2).effort == effort
+        # Those of derivatives do anyway.
+        assert Engine(problem, 2, gradient=True).effort == "little"
         assert Engine(problem, 2, effort="least").effort == "least"
 
 

@@ -92,7 +92,7 @@ class Brax(System):
 
     @property
     def effort(self) -> Effort:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """How much XLA does: as measured, `little` is compiled in half the time, and as fast."""
+        """Effort of XLA: as measured, `little` is compiled in half the time, and as fast."""
         return "most" if self.joined is None else "little"
 
     @property
