@@ -147,10 +147,9 @@ class _Reader:
                 self._operand(value, numbers)
             add(defined(step.outvars))
             if name in _CUSTOM:
-                if not derived:
-                    self._custom(program, step)
-                    continue
                 self.read(step.params["call_jaxpr"])
+                if not derived:
+                    self._derivative(program, step)
                 continue
             hidden = ()
             if name == "custom_vmap_call":
@@ -169,11 +168,10 @@ class _Reader:
         else:
             self._texts.append(str(numbers[value]))
 
-    def _custom(self, program: Any, step: Any) -> None:
-        """Read a function that brings its own derivative: what it computes, and that as traced."""
+    def _derivative(self, program: Any, step: Any) -> None:
+        """Read the derivative that a function brings, as it is traced."""
         if step.params.get("symbolic_zeros"):
             raise _Unknown("a derivative that depends on which tangents are zero")
-        self.read(step.params["call_jaxpr"])
         inputs = [v for v in step.invars if not isinstance(v, jax.extend.core.Literal)]
         inputs = list(dict.fromkeys(inputs))
         places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.floating)]

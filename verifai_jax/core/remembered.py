@@ -132,7 +132,8 @@ def _folder() -> Path:
 
 def _read(path: Path) -> "jax.export.Exported | None":
     try:
-        seal, data = path.read_bytes()[:SEAL], path.read_bytes()[SEAL:]
+        content = path.read_bytes()
+        seal, data = content[:SEAL], content[SEAL:]
         if hashlib.sha256(data).digest() != seal:
             return None
         return jax.export.deserialize(bytearray(data))
