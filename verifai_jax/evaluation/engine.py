@@ -264,14 +264,18 @@ class Engine:
             row: PyTree, key: Array, temperature: Array, shared: PyTree, vector: Array
         ) -> Any:
             result = numbers.read_from(vector, lambda: one_row(row, key, temperature, shared))
-            if isinstance(result, Row) and not self.inputs.keeps_features:
-                result = result._replace(features=None)
-            return packing.pack(result)
+            return self._packed(packing, result)
 
         program = packed_row if self.alone else self._batched(packed_row)
         # A new function object each time: JAX remembers what it traced by the function.
         traced = self._traced[mode] = jax.jit(partial(program)).trace(*self._arguments)
         return traced
+
+    def _packed(self, packing: Packing, result: Row | Array) -> dict[str, Array]:
+        """Pack the result of one row, without its features where the inputs have them already."""
+        if isinstance(result, Row) and not self.inputs.keeps_features:
+            result = result._replace(features=None)
+        return packing.pack(result)
 
     @cached_property
     def _derivatives(self) -> tuple[str | None, Callable[..., Any]]:
@@ -298,9 +302,7 @@ class Engine:
         packing = self._packing["evaluate"] = Packing()
 
         def packed(derivatives: Array, results: PyTree) -> Any:
-            result = function.finish(derivatives, results)
-            keeps = self.inputs.keeps_features
-            return packing.pack(result if keeps else result._replace(features=None))
+            return self._packed(packing, function.finish(derivatives, results))
 
         derivatives = jax.ShapeDtypeStruct((*values.shape, *coordinates.shape), values.dtype)
         jax.eval_shape(packed, derivatives, results)
@@ -322,6 +324,7 @@ class Engine:
         if list(self.devices) != jax.local_devices()[: len(self.devices)]:
             return None  # A program from a file runs on the first ones.
         shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
+        shape = (*shape, self.precision, type(self.inputs).__qualname__)
         return remembered_as("gradients", self._derivatives[0], shape, self._derivative)
 
     def _lower_gradient(self) -> jax.stages.Lowered:
