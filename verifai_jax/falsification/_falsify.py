@@ -1,7 +1,7 @@
 """The falsification loop: budgets, stopping, progress, storing, resuming.
 
 run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
-run = falsify(problem, search=search.Gradient(learning_rate=0.2), stop_after=10)
+run = falsify(problem, search=search.Gradient(patience=8), stop_after=10)
 run = resume(run, budget=50_000)
 """
 

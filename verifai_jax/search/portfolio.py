@@ -5,7 +5,7 @@ mutations need few simulations and no gradients, cross-entropy fills the region 
 batches. A bandit learns on the way which one helps: it gives each a share of the simulations by the
 rate at which its points come among the best so far, discounted, and none less than a little; a
 member whose gradients turn out zero or not finite gets next to nothing at once. Every point is told
-to all, and descents start from the best points of the others as often as from new ones.
+to all, and descents start from the best points of all as often as from new ones.
 
 Where these have found no failure for long, a fourth member joins them, with an account of its own:
 descents into the interior of the space (`interior`, `descent`).
@@ -42,11 +42,17 @@ DISCOUNT = 0.98
 LEAST_SHARE = 0.05
 """Least share of the budget of a member."""
 
-OPENING = 6
+OPENING = 12
 """Descents before the budget is shared by evidence."""
 
 AMONG = 4
 """Number of best points among which a new one is a gain."""
+
+TAKEN = 32
+"""Points that are remembered as starts and ends of descents."""
+
+APART = 0.1
+"""Distance in some coordinate from all of these at which a point is a new start."""
 
 
 class PortfolioState(NamedTuple):
@@ -60,6 +66,7 @@ class PortfolioState(NamedTuple):
     rows: Int[Array, " members"]  # of the last ask, one member after the other
     differentiates: Bool[Array, ""]
     opening: Bool[Array, ""]  # the first descents are on their way, beyond their share
+    taken: Float[Array, "taken d"]  # the latest points where descents began or ended
     interior: InteriorState | None
 
 
@@ -106,6 +113,7 @@ class Portfolio(Search[PortfolioState]):
             rows=jnp.zeros(3, jnp.int32),
             differentiates=jnp.array(False),
             opening=jnp.array(False),
+            taken=jnp.full((TAKEN, cube.dim), jnp.inf, jnp.float32),
             interior=None if gradient is None else begin(jax.random.fold_in(key, 3), cube, batch),
         )
 
@@ -229,16 +237,31 @@ class Portfolio(Search[PortfolioState]):
         own = observations._replace(valid=observations.valid & (member == GRADIENT))
         updated = Gradient().tell(state.gradient, cube, own)
         turn = state.rows[GRADIENT] > 0
-        updated = choose(turn, updated, state.gradient)
-        # Every fourth start is from one of the best points of all.
-        n = len(updated.fresh)
-        ranks = ((state.mutation.round + jnp.arange(n)) % AMONG).astype(jnp.int32)
-        score = state.mutation.score[ranks]
-        offers = updated.fresh & (score > 0) & jnp.isfinite(score)
-        offers &= (updated.starts + jnp.arange(n)) % 4 == 3
-        near = jnp.where(offers, score, jnp.inf)
-        updated = updated._replace(offered=state.mutation.points[ranks], near=near)
-        return state._replace(gradient=updated)
+        return self._offer(state, choose(turn, updated, state.gradient), turn)
+
+    def _offer(
+        self, state: PortfolioState, updated: GradientState, turn: Bool[Array, ""]
+    ) -> PortfolioState:
+        """Offer the best points where no descent began or ended as every second start."""
+        before, n = state.gradient, len(updated.fresh)
+        assert before is not None
+        begins = before.fresh & before.given & state.differentiates & turn
+        ends = updated.fresh & ~before.fresh & turn
+        place = jnp.cumsum(begins | ends) - 1
+        place = jnp.where(begins | ends, place, TAKEN)
+        latest = jnp.where(begins[:, None], before.offered, before.point)
+        count = jnp.sum(begins | ends)
+        taken = jnp.roll(state.taken, count, axis=0).at[place].set(latest, mode="drop")
+
+        points, score = state.mutation.points, state.mutation.score
+        distance = jnp.max(jnp.abs(points[:, None] - taken[None]), axis=2, initial=0.0)
+        free = jnp.all(distance > APART, axis=1) & (score > 0) & jnp.isfinite(score)
+        best = jnp.argsort(~free, stable=True)[:n]
+        later = updated.starts + jnp.arange(n)
+        offers = updated.fresh & free[best] & (later > OPENING) & (later % 2 == 1)
+        near = jnp.where(offers, score[best], jnp.inf)
+        gradient = updated._replace(offered=points[best], near=near)
+        return state._replace(gradient=gradient, taken=taken)
 
     def warm_start(
         self, state: PortfolioState, cube: Cube, observations: Observations
