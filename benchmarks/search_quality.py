@@ -6,7 +6,7 @@
 What counts is the number of the simulation that found the first failure. On the landscapes the
 share of failures is known, and with it what uniform sampling needs in the median, log(2) / share;
 a search's entry is how many times fewer it needs. On the controller the failure rate is measured
-first. A gradient is counted as one simulation; the row `gradient (as 2)` counts it as two.
+first. A simulation with a derivative counts as one; the row `gradient (as 2)` counts it as two.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import numpy as np
 from landscapes import LANDSCAPES
 
 import verifai_jax as vj
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.targets import load_target
 from verifai_jax.search import Observations
 
@@ -50,36 +51,61 @@ def searches(chosen):
 
 @partial(jax.jit, static_argnums=(0, 1, 2, 3, 4))
 def advance(search, rho, cube, batch, rounds, state):
-    """Some rounds of every seed's search; robustness `[seeds, rounds * batch]`."""
+    """Some rounds of every seed's search.
+
+    **Returns:** the states; the robustness `[seeds, rounds * batch]`, and what each simulation
+    counts with a derivative as two: 0 where a search that plans its rounds left a row out.
+    """
 
     def step(state, _):
         u, state = search.ask(state, cube, batch)
-        value = jax.vmap(rho)(u)
-        gradient = jax.vmap(jax.grad(rho))(u) if search.wants_gradient else None
-        observations = Observations(u, value, jnp.ones(batch, bool), gradient)
-        return search.tell(state, cube, observations), value
+        value, gradient = jax.vmap(jax.value_and_grad(rho))(u)
+        observations = Observations(u, value, jnp.ones(batch, bool))
+        cost = jnp.full(batch, 2 if search.wants_gradient else 1)
+        if search.wants_gradient:
+            observations = observations._replace(gradient=gradient)
+        if search.wants_clauses:
+            plan = search.plan(state, cube, batch)
+            simulated = jnp.arange(batch) < plan.rows
+            cost = jnp.where(simulated, jnp.where(plan.differentiate, 2, 1), 0)
+            slopes = jnp.where(plan.differentiate, gradient, 0.0)
+            nothing = jnp.full((batch, CLAUSES), -1e9)
+            observations = observations._replace(
+                valid=simulated,
+                clauses=nothing.at[:, 0].set(value),
+                clause_gradients=jnp.zeros((batch, CLAUSES, u.shape[1])).at[:, 0].set(slopes),
+            )
+        value = jnp.where(cost > 0, value, jnp.inf)
+        return search.tell(state, cube, observations), (value, cost)
 
     def one(state):
-        state, values = jax.lax.scan(step, state, None, length=rounds)
-        return state, values.ravel()
+        state, (values, costs) = jax.lax.scan(step, state, None, length=rounds)
+        return state, values.ravel(), costs.ravel()
 
     return jax.vmap(one)(state)
 
 
 def first_failures(search, landscape, batch, seeds):
-    """Number of the first failing simulation of each seed, counted from 1; infinite without one."""
+    """Number of the first failing simulation of each seed, counted from 1; infinite without one.
+
+    **Returns:** that, and the same with a derivative counted as a simulation more.
+    """
     rho, cube, _ = landscape
     keys = jax.random.split(jax.random.key(2024), seeds)
     state = jax.vmap(lambda key: search.init(key, cube, batch))(keys)
     rounds = max(1, SIMULATIONS_A_CALL // batch)
-    first, done = np.full(seeds, np.inf), 0
-    while done < MOST and np.isinf(first).sum() > (seeds - 1) // 2:
-        state, values = advance(search, rho, cube, batch, rounds, state)
-        failing = np.asarray(values) < 0
+    first, doubled = np.full(seeds, np.inf), np.full(seeds, np.inf)
+    done, spent = np.zeros(seeds), np.zeros(seeds)
+    while done.min() < MOST and np.isinf(first).sum() > (seeds - 1) // 2:
+        state, values, costs = advance(search, rho, cube, batch, rounds, state)
+        failing, costs = np.asarray(values) < 0, np.asarray(costs)
+        number = done[:, None] + np.cumsum(costs > 0, axis=1)
+        price = spent[:, None] + np.cumsum(costs, axis=1)
         found = failing.any(axis=1) & np.isinf(first)
-        first[found] = done + failing.argmax(axis=1)[found] + 1
-        done += rounds * batch
-    return first
+        place = failing.argmax(axis=1)[found]
+        first[found], doubled[found] = number[found, place], price[found, place]
+        done, spent = number[:, -1], price[:, -1]
+    return first, doubled
 
 
 def on_landscapes(options):
@@ -92,13 +118,12 @@ def on_landscapes(options):
     for name, (search, batch) in searches(options.searches).items():
         started, cells, doubled = time.perf_counter(), [], []
         for landscape in chosen:
-            first = first_failures(search, LANDSCAPES[landscape], batch, options.seeds)
-            median = np.median(first)
-            cells.append(f"{median:>8.0f} {expected[landscape] / median:>6.1f}x")
-            doubled.append(f"{2 * median:>8.0f} {expected[landscape] / (2 * median):>6.1f}x")
+            counts = first_failures(search, LANDSCAPES[landscape], batch, options.seeds)
+            for median, row in zip(map(np.median, counts), (cells, doubled), strict=True):
+                row.append(f"{median:>8.0f} {expected[landscape] / median:>6.1f}x")
         seconds = time.perf_counter() - started
         print(f"{name:<19}" + "".join(cells) + f"   batch {batch}, {seconds:.0f} s", flush=True)
-        if search.wants_gradient:
+        if search.wants_gradient or search.wants_clauses:
             print(f"{name + ' (as 2)':<19}" + "".join(doubled), flush=True)
 
 

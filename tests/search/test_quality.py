@@ -97,8 +97,10 @@ def test_goes_on_to_other_failures(search):
     ]
     # The coordinates of a bandit know nothing of each other.
     assert np.mean(corners) >= (1.6 if search == Bandit() else 3)
-    # And goes on failing: at random it would be one in a thousand.
-    assert np.mean(value[:, value.shape[1] // 2 :] < 0) > 0.06
+    # And goes on failing: at random it would be one in a thousand. Descents end where they fail,
+    # and begin anew elsewhere.
+    least = 0.03 if search == Gradient() else 0.06
+    assert np.mean(value[:, value.shape[1] // 2 :] < 0) > least
 
 
 @pytest.mark.thorough

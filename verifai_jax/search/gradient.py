@@ -18,7 +18,7 @@ The descents from there on are many and short: their box is smaller, it does not
 temperatures are higher, and those whose first jump is no better are given up at once. From random
 starts on ten requirements of the ARCH competition this took fewer simulations a failure than long
 descents whose box is the whole cube (`benchmarks/RESULTS.md`); where failures are in corners it
-takes more, so every fourth descent begins with the whole cube. From a start that somebody offers,
+takes more, so every second descent begins with the whole cube. From a start that somebody offers,
 which is a good point already, the first box is smaller still.
 """
 
@@ -49,7 +49,7 @@ SIZES = 6
 FIRST_BOX = 0.4
 """Size of the first box of most descents: beyond it gradients say little."""
 
-WHOLE_CUBE = 4
+WHOLE_CUBE = 2
 """Of so many descents one begins with the whole cube."""
 
 OFFERED_BOX = 0.16

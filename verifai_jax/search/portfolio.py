@@ -42,7 +42,7 @@ DISCOUNT = 0.98
 LEAST_SHARE = 0.05
 """Least share of the budget of a member."""
 
-OPENING = 12
+OPENING = 6
 """Descents before the budget is shared by evidence."""
 
 AMONG = 4
