@@ -100,7 +100,7 @@ def test_diverse_failures_are_of_both_kinds():
 
     space = {"x": vj.Box(0, 1), "y": vj.Box(0, 1)}
     problem = vj.Problem("two", space, system, "far > 0")
-    run = vj.falsify(problem, budget=1500, batch=16, stop_after=4, diverse=True, confirm=False)
+    run = vj.falsify(problem, budget=2000, batch=16, stop_after=4, diverse=True, confirm=False)
     failing = run.table.counterexamples
     assert run.stopped == "stop_after"
     assert (failing["x"] < 0.5).any()
