@@ -11,7 +11,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
+from verifai_jax.mtl.clauses import ABSENT
+from verifai_jax.search import Observations
 
 
 class Landscape(NamedTuple):
@@ -96,3 +99,17 @@ LANDSCAPES = {
     "all_of_many": Landscape(all_of_many, Cube((0,) * 50), 9.1e-4),
     "needle": Landscape(needle, FLAT, math.pi**2 / 2 * 0.1193**4),
 }
+
+
+def tell_of(search, state, cube, u, rho, slope):
+    """Return the observations of points of one clause, as far as the search asks for them."""
+    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
+    if not search.wants_clauses:
+        return told
+    plan = search.plan(state, cube, len(u))
+    gradients = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
+    return told._replace(
+        valid=jnp.arange(len(u)) < plan.rows,
+        clauses=jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho),
+        clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),
+    )

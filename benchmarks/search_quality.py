@@ -18,12 +18,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from landscapes import LANDSCAPES
+from landscapes import LANDSCAPES, tell_of
 
 import verifai_jax as vj
-from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.targets import load_target
-from verifai_jax.search import Observations
 
 BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}
 ACTIVE_BATCH = 16
@@ -60,21 +58,11 @@ def advance(search, rho, cube, batch, rounds, state):
     def step(state, _):
         u, state = search.ask(state, cube, batch)
         value, gradient = jax.vmap(jax.value_and_grad(rho))(u)
-        observations = Observations(u, value, jnp.ones(batch, bool))
-        cost = jnp.full(batch, 2 if search.wants_gradient else 1)
-        if search.wants_gradient:
-            observations = observations._replace(gradient=gradient)
+        observations = tell_of(search, state, cube, u, value, gradient)
+        differentiates = search.wants_gradient
         if search.wants_clauses:
-            plan = search.plan(state, cube, batch)
-            simulated = jnp.arange(batch) < plan.rows
-            cost = jnp.where(simulated, jnp.where(plan.differentiate, 2, 1), 0)
-            slopes = jnp.where(plan.differentiate, gradient, 0.0)
-            nothing = jnp.full((batch, CLAUSES), -1e9)
-            observations = observations._replace(
-                valid=simulated,
-                clauses=nothing.at[:, 0].set(value),
-                clause_gradients=jnp.zeros((batch, CLAUSES, u.shape[1])).at[:, 0].set(slopes),
-            )
+            differentiates = search.plan(state, cube, batch).differentiate
+        cost = jnp.where(observations.valid, jnp.where(differentiates, 2, 1), 0)
         value = jnp.where(cost > 0, value, jnp.inf)
         return search.tell(state, cube, observations), (value, cost)
 

@@ -10,10 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.landscapes import LANDSCAPES
-from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.mtl.clauses import ABSENT
-from verifai_jax.search import Observations
+from benchmarks.landscapes import LANDSCAPES, tell_of
 
 SEEDS = 25
 # Those on one cube run in one program: compiling is what takes time.
@@ -21,20 +18,6 @@ FLAT = ("ball", "ridge", "saddles", "corner", "ripples", "needle")
 MIXED = ("mixed",)
 WIDE = ("few_of_many", "all_of_many")
 ROUNDS = {FLAT: 75, MIXED: 50, WIDE: 22}
-
-
-def tell_of(search, state, cube, u, rho, slope):
-    """What a search is told of points of one clause."""
-    told = Observations(u, rho, jnp.ones(len(u), bool), slope if search.wants_gradient else None)
-    if not search.wants_clauses:
-        return told
-    plan = search.plan(state, cube, len(u))
-    gradients = jnp.zeros((len(u), CLAUSES, u.shape[1])).at[:, 0].set(slope)
-    return told._replace(
-        valid=jnp.arange(len(u)) < plan.rows,
-        clauses=jnp.full((len(u), CLAUSES), ABSENT).at[:, 0].set(rho),
-        clause_gradients=jnp.where(plan.differentiate, gradients, 0.0),
-    )
 
 
 @lru_cache

@@ -8,7 +8,8 @@ from playing import tell_of
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Portfolio
-from verifai_jax.search.portfolio import APART, OPENING, TAKEN
+from verifai_jax.search.interior import APART
+from verifai_jax.search.portfolio import OPENING, TAKEN
 
 CUBE = Cube((0,) * 4)
 

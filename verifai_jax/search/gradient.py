@@ -16,10 +16,10 @@ not finite, the descent starts again elsewhere.
 
 The descents from there on are many and short: their box is smaller, it does not grow, their
 temperatures are higher, and those whose first jump is no better are given up at once. From random
-starts on ten requirements of the ARCH competition this took fewer simulations a failure than long
-descents whose box is the whole cube (`benchmarks/RESULTS.md`); where failures are in corners it
-takes more, so every second descent begins with the whole cube. From a start that somebody offers,
-which is a good point already, the first box is smaller still.
+starts this took fewer simulations a failure than longer descents on eight of nine requirements of
+the ARCH competition (`benchmarks/RESULTS.md`), and more on CC2, which fails in corners; so every
+second descent begins with the whole cube. From a start that somebody offers, which is a good point
+already, the first box is smaller still.
 """
 
 from dataclasses import dataclass

@@ -149,12 +149,19 @@ def _offer(
         jnp.concatenate([state.descent.point[place][None], state.taken[:-1]]),
         state.taken,
     )
-    distance = jnp.max(jnp.abs(points[:, None] - taken[None]), axis=2)
-    free = jnp.all(distance > APART, axis=1) & (score > 0) & jnp.isfinite(score)
+    free = not_taken(points, score, taken)
     chosen = jnp.argmin(jnp.where(free, score, jnp.inf))
     offers = (descent.step[place] == 0) & free[chosen] & (descent.starts % 2 == 0)
     near = descent.near.at[place].set(jnp.where(offers, score[chosen], jnp.inf))
     return descent._replace(offered=descent.offered.at[place].set(points[chosen]), near=near), taken
+
+
+def not_taken(
+    points: Float[Array, "k d"], score: Float[Array, " k"], taken: Float[Array, "taken d"]
+) -> Bool[Array, " k"]:
+    """Return which points can be new starts: apart from those taken, and not failing."""
+    distance = jnp.max(jnp.abs(points[:, None] - taken[None]), axis=2)
+    return jnp.all(distance > APART, axis=1) & (score > 0) & jnp.isfinite(score)
 
 
 def _share(state: InteriorState) -> Float[Array, ""]:

@@ -24,7 +24,14 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search, choose
 from verifai_jax.search.cross_entropy import CrossEntropy, CrossEntropyState
 from verifai_jax.search.gradient import NOTHING, Gradient, GradientState
-from verifai_jax.search.interior import InteriorState, begin, learn, plan, propose
+from verifai_jax.search.interior import (
+    InteriorState,
+    begin,
+    learn,
+    not_taken,
+    plan,
+    propose,
+)
 from verifai_jax.search.mutation import Mutation, MutationState
 
 GRADIENT, MUTATION, CROSS_ENTROPY = range(3)
@@ -50,9 +57,6 @@ AMONG = 4
 
 TAKEN = 32
 """Points that are remembered as starts and ends of descents."""
-
-APART = 0.1
-"""Distance in some coordinate from all of these at which a point is a new start."""
 
 
 class PortfolioState(NamedTuple):
@@ -254,8 +258,7 @@ class Portfolio(Search[PortfolioState]):
         taken = jnp.roll(state.taken, count, axis=0).at[place].set(latest, mode="drop")
 
         points, score = state.mutation.points, state.mutation.score
-        distance = jnp.max(jnp.abs(points[:, None] - taken[None]), axis=2, initial=0.0)
-        free = jnp.all(distance > APART, axis=1) & (score > 0) & jnp.isfinite(score)
+        free = not_taken(points, score, taken)
         best = jnp.argsort(~free, stable=True)[:n]
         later = updated.starts + jnp.arange(n)
         offers = updated.fresh & free[best] & (later > OPENING) & (later % 2 == 1)
