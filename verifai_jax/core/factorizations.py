@@ -1,0 +1,128 @@
+"""Batches of matrix factorizations on a processor that cannot wait for themselves for ever.
+
+Jaxlib 0.10.0 up to 0.11.1 cuts a large batch of matrices into parts, and the thread that asked for
+them waits until other threads of XLA's pool have done them. That thread may be of the pool itself:
+where each thread waits in this way nobody is left to do the parts, and the program hangs. One
+Cholesky factorization or one linear solve of 20 rows in the dynamics of a batch is enough. Later
+versions do not cut (jax-ml/jax, commit 859992407d), nor did earlier ones.
+
+`avoid_deadlock` lowers these batches as a loop over blocks that are too small to be cut. Each
+matrix is factorized by the same routine of LAPACK as before, so results are the same.
+"""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jaxlib.version
+from jax.interpreters import mlir
+
+_BEGINS, _ENDS = (0, 10, 0), (0, 11, 2)
+"""Versions of jaxlib that cut batches, the second one no more."""
+
+_UNCUT = 200_000
+"""Operations of a batch up to which jaxlib does not cut it."""
+
+
+class _Factorization(NamedTuple):
+    """What jaxlib takes for the work of a factorization, or a little more.
+
+    - `ranks`: of the operands of one problem.
+    - `work`: number of operations, from the shapes of these operands.
+    """
+
+    ranks: tuple[int, ...]
+    work: Callable[..., float]
+
+
+def _of_matrix(weight: float) -> _Factorization:
+    return _Factorization((2,), lambda a: weight * a[0] * a[1] * min(a))
+
+
+_FACTORIZATIONS = {
+    "cholesky": _of_matrix(1 / 3),
+    "lu": _of_matrix(1),
+    "geqrf": _of_matrix(2),
+    "svd": _of_matrix(10),
+    "eigh": _of_matrix(5),
+    "eig": _of_matrix(10),
+    "schur": _of_matrix(5),
+    "hessenberg": _of_matrix(2),
+    "tridiagonal": _of_matrix(4 / 3),
+    "geqp3": _Factorization((2, 1), lambda a, _: 2 * a[0] * a[1] * min(a)),
+    "householder_product": _Factorization((2, 1), lambda a, taus: 4 * a[0] * a[1] * taus[0]),
+    "ormqr": _Factorization((2, 1, 2), lambda a, taus, c: 4 * taus[0] * c[0] * c[1]),
+    "triangular_solve": _Factorization((2, 2), lambda a, b: a[0] * b[0] * b[1]),
+    "tridiagonal_solve": _Factorization((1, 1, 1, 2), lambda _, d, __, b: 5 * b[0] * b[1]),
+}
+"""Primitives of JAX whose batches jaxlib cuts, by their names."""
+
+
+def avoid_deadlock() -> None:
+    """Let this process lower large batches of factorizations block by block, where it is needed.
+
+    It holds for all programs of the process, which compute what they did before.
+    """
+    if not _BEGINS <= jaxlib.version.__version_info__[:3] < _ENDS:
+        return
+    rules = mlir._platform_specific_lowerings["cpu"]
+    for primitive, entry in list(rules.items()):
+        known = _FACTORIZATIONS.get(primitive.name)
+        if known is not None and getattr(entry.rule, "func", None) is not _lower:
+            rule = partial(_lower, primitive, known, entry.rule)
+            mlir.register_lowering(primitive, rule, platform="cpu")
+
+
+def _lower(
+    primitive: Any,
+    known: _Factorization,
+    original: Callable[..., Any],
+    context: Any,
+    *operands: Any,
+    **parameters: Any,
+) -> Any:
+    """Lower a factorization as JAX does, or as a loop over blocks of its batch."""
+    forms = context.avals_in
+    batch = forms[0].shape[: forms[0].ndim - known.ranks[0]]
+    if all(isinstance(size, int) for form in forms for size in form.shape):
+        count, block = math.prod(batch), _block(known, forms)
+        if count > block:
+            call = partial(primitive.bind, **parameters)
+            blocks = partial(_in_blocks, call, known.ranks, block)
+            lower = mlir.lower_fun(blocks, multiple_results=primitive.multiple_results)
+            return lower(context, *operands)
+    return original(context, *operands, **parameters)
+
+
+def _block(known: _Factorization, forms: Any) -> int:
+    """Return how many problems of these forms jaxlib takes at once without cutting them."""
+    shapes = (form.shape[form.ndim - rank :] for form, rank in zip(forms, known.ranks, strict=True))
+    work = known.work(*shapes)
+    if any(jnp.issubdtype(form.dtype, jnp.complexfloating) for form in forms):
+        work *= 3
+    return max(1, int(_UNCUT / max(work, 1)))
+
+
+def _in_blocks(call: Callable[..., Any], ranks: tuple[int, ...], block: int, *operands: Any) -> Any:
+    """Call a primitive on one block of the batch after the other."""
+    batch = operands[0].shape[: operands[0].ndim - ranks[0]]
+    count = math.prod(batch)
+    whole = -(-count // block) * block
+
+    def cut(operand: Any, rank: int) -> Any:
+        matrices = operand.reshape(count, *operand.shape[operand.ndim - rank :])
+        # The last matrix again, where the last block is not full.
+        again = jnp.broadcast_to(matrices[-1:], (whole - count, *matrices.shape[1:]))
+        return jnp.concatenate([matrices, again]).reshape(-1, block, *matrices.shape[1:])
+
+    blocks = [cut(operand, rank) for operand, rank in zip(operands, ranks, strict=True)]
+    results = jax.lax.map(lambda parts: call(*parts), tuple(blocks))
+
+    def join(result: Any) -> Any:
+        matrices = result.reshape(whole, *result.shape[2:])[:count]
+        return matrices.reshape(*batch, *matrices.shape[1:])
+
+    return jax.tree.map(join, results)
