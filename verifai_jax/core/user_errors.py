@@ -12,11 +12,12 @@ package, nor of Python, nor of an installed library.
 """
 
 import ast
+import inspect
 import linecache
 import os
 import re
 import sysconfig
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import CodeType, FrameType, TracebackType
@@ -131,6 +132,35 @@ def defined_at(function: Callable[..., object] | None) -> str:
     if not isinstance(code, CodeType) or not is_user_file(code.co_filename):
         return ""
     return f" ({_shown_file(code.co_filename)}, line {code.co_firstlineno})"
+
+
+def check_called_with(
+    role: str, function: Callable[..., object] | None, arguments: Sequence[str]
+) -> None:
+    """Check that a function of a user takes the positional arguments that it will be called with.
+
+    **Arguments:**
+
+    - `role`: what the function is, for the message: "dynamics".
+    - `function`: what was given; None where nothing was.
+    - `arguments`: names of the arguments.
+
+    **Raises:** `ValueError`, with what it takes and where it is defined.
+    """
+    if function is None:
+        return
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return  # Such as a function written in C, which says nothing of its arguments.
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        taken = ", ".join(signature.parameters)
+        raise ValueError(
+            f"{role} is called with ({', '.join(arguments)}); got a function of ({taken})"
+            f"{defined_at(function)}"
+        ) from None
 
 
 def source_line(traceback: object) -> str | None:

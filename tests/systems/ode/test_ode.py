@@ -342,6 +342,42 @@ def test_names_of_the_signals(state, derivative, signals, names):
     assert sorted(system({}, KEY).signals) == sorted(names)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"dynamics": lambda t, s, f: s},
+            r"dynamics is called with \(time, state, control, features\); got a function of "
+            r"\(t, s, f\) \(.*test_ode.py, line \d+\)",
+        ),
+        ({"initial": lambda f: 0.0}, r"initial is called with \(features, key\); got a func"),
+        (
+            {"controller": lambda t, s, m, f: (0.0, m)},
+            r"controller is called with \(time, state, features\); got a function of \(t, s, m, f",
+        ),
+        (
+            {"controller": lambda t, s, f: 0.0, "controller_memory": 0.0},
+            r"controller is called with \(time, state, memory, features\)",
+        ),
+        ({"signals": lambda t, s, f: {}}, r"signals is called with \(time, state, control, f"),
+        ({"terminate": lambda t, s, f: True}, r"terminate is called with \(state, features\)"),
+        ({"update": lambda s, f: s}, r"update is called with \(time, state, features\)"),
+    ],
+)
+def test_functions_of_other_arguments_are_refused_at_once(options, message):
+    parts = {"dynamics": oscillator, "initial": start, "dt": 0.01, "steps": 5, **options}
+    with pytest.raises(ValueError, match=message):
+        ode(**parts)
+
+
+def test_functions_may_have_further_arguments_with_defaults():
+    def dynamics(time, state, control, features, gain=1.0):
+        return {"x": -gain * state["x"]}
+
+    system = ode(dynamics, lambda *given: {"x": 1.0}, dt=0.1, steps=2)
+    assert system({}, KEY)["x"].shape == (3,)
+
+
 def test_named_control_keeps_its_names():
     trace = ramp(
         controller=lambda t, s, f: {"u": t, "flag": 1.0},

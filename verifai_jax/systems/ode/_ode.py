@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import defined_at
+from verifai_jax.core.user_errors import check_called_with, defined_at
 from verifai_jax.core.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
@@ -412,8 +412,8 @@ def ode(
     **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
     infinite.
 
-    **Raises:** `ValueError` for times that do not fit, and an unknown method; once the system is
-    traced, for functions whose results do not fit together.
+    **Raises:** `ValueError` for times that do not fit, an unknown method, and functions of other
+    arguments; once the system is traced, for functions whose results do not fit together.
     """
     if not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
@@ -430,6 +430,13 @@ def ode(
     for switch in switches:
         if not isinstance(switch, Switch):
             raise ValueError(f"switches must be a list of vj.blocks.Switch; got {switch!r}")
+    memory = () if controller_memory is None else ("memory",)
+    check_called_with("dynamics", dynamics, ("time", "state", "control", "features"))
+    check_called_with("initial", initial, ("features", "key"))
+    check_called_with("controller", controller, ("time", "state", *memory, "features"))
+    check_called_with("signals", signals, ("time", "state", "control", "features"))
+    check_called_with("terminate", terminate, ("state", "features"))
+    check_called_with("update", update, ("time", "state", "features"))
     return Ode(
         dynamics=dynamics,
         initial=initial,
