@@ -3,7 +3,7 @@
     ask = compile_soon("the search", jax.jit(f).lower(state))   # at once, in the background
     ask(state)                                          # waits until it is compiled, and calls it
     describe_compilation()                              # "compiling the search, 3 s"
-    while_compiling(import_matplotlib)                  # at the first wait, or never
+    while_compiling(import_matplotlib)                  # at the first long wait, or never
 
 What a program computes does not depend on when it was compiled, so neither do results.
 
@@ -15,7 +15,7 @@ import gc
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Literal
@@ -40,8 +40,12 @@ _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
 
+LONG = 0.4
+"""Seconds of waiting for a program, from which on other work is done meanwhile: none that delays a
+result which only has to be loaded."""
+
 _meanwhile: list[Callable[[], object]] = []
-"""What is done at the next wait for a program."""
+"""What is done at the next long wait for a program."""
 
 
 class Compilation:
@@ -63,9 +67,11 @@ class Compilation:
         **Raises:** what the compiler raised.
         """
         if self._program is None:
-            while _meanwhile and not self._future.done():
-                _meanwhile.pop(0)()
             try:
+                if _meanwhile:
+                    wait([self._future], LONG)
+                while _meanwhile and not self._future.done():
+                    _meanwhile.pop(0)()
                 self._program = self._future.result()
             except CancelledError:
                 assert self._lowered is not None
@@ -96,7 +102,7 @@ def compile_soon(name: str, lowered: jax.stages.Lowered, effort: Effort = "most"
 
 
 def while_compiling(work: Callable[[], object]) -> None:
-    """Have work done once where this process first waits for a program; never where it does not.
+    """Have work done once where this process first waits long for a program; else never.
 
     **Arguments:**
 

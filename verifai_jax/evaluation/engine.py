@@ -123,7 +123,7 @@ class Engine:
         with in_precision(self.precision):
             started = time.perf_counter()
             with tracing("gradients"):
-                known = self.gradient and is_kept(self._kept_as)
+                known = self.gradient and is_kept(self._gradient_kept_as)
             self.compile_seconds += time.perf_counter() - started
             if known:
                 self._begin("evaluate")
@@ -249,11 +249,12 @@ class Engine:
         differentiates = self.gradient and mode == "evaluate"
         name = "gradients" if differentiates else self.inputs.purpose
         with tracing(name):
-            lowered = self._lower_gradient() if differentiates else self._trace(mode).lower()
+            lowered = self._lower_gradient() if differentiates else self._lower(mode)
             self._compiling[mode] = compile_soon(name, lowered, self.effort)
         self.compile_seconds += time.perf_counter() - started
 
     def _trace(self, mode: Mode) -> jax.stages.Traced:
+        """Trace one row; the program of a batch is made of that."""
         if mode in self._traced:
             return self._traced[mode]
         one_row = {"evaluate": self.row, "holds": self.row_holds}[mode]
@@ -266,10 +267,25 @@ class Engine:
             result = numbers.read_from(vector, lambda: one_row(row, key, temperature, shared))
             return self._packed(packing, result)
 
-        program = packed_row if self.alone else self._batched(packed_row)
+        *_, shared, vector = self._arguments
+        one = (self.inputs.row_form, _key_form(), _temperature_form(), shared, vector)
         # A new function object each time: JAX remembers what it traced by the function.
-        traced = self._traced[mode] = jax.jit(partial(program)).trace(*self._arguments)
+        traced = self._traced[mode] = jax.jit(packed_row).trace(*one)
         return traced
+
+    def _lower(self, mode: Mode) -> jax.stages.Lowered:
+        """Lower a program without derivatives, or recall it; see `core.remembered`."""
+        traced = self._trace(mode)
+        if self.alone:
+            return traced.lower()
+        known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
+        form = jax.tree.structure(traced.out_info)
+
+        def packed_row(*arguments: Any) -> Any:
+            return jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
+
+        name = self._kept_as("simulations", fingerprint(traced.jaxpr))
+        return lower_or_recall(name, self._batched(packed_row), self._arguments)
 
     def _packed(self, packing: Packing, result: Row | Array) -> dict[str, Array]:
         """Pack the result of one row, without its features where the inputs have them already."""
@@ -288,7 +304,7 @@ class Engine:
         *_, vector = self._arguments
         row = self.inputs.row_form
         coordinates = jax.eval_shape(function.coordinates, row, shared)
-        one = (coordinates, row, _key_form(), jax.ShapeDtypeStruct((), jnp.float32), shared, vector)
+        one = (coordinates, row, _key_form(), _temperature_form(), shared, vector)
 
         def objective(coordinates: Array, *others: Any) -> Any:
             vector, rest = others[-1], others[:-1]
@@ -318,20 +334,23 @@ class Engine:
         program = packed_row if self.alone else self._batched(packed_row)
         return fingerprint(traced.jaxpr), program
 
-    @property
-    def _kept_as(self) -> str | None:
-        """The name under which the program of derivatives is kept on disk, if it can be."""
+    def _kept_as(self, kind: str, computes: str | None, *values: object) -> str | None:
+        """Return the name under which a program of batches is kept on disk, if it can be."""
         if list(self.devices) != jax.local_devices()[: len(self.devices)]:
             return None  # A program from a file runs on the first ones.
         shape = (self.padded, self.chunks, self.own_keys, self.alone, len(self.devices))
         shape = (*shape, self.precision, type(self.inputs).__qualname__)
-        return remembered_as("gradients", self._derivatives[0], shape, self._derivative)
+        return remembered_as(kind, computes, shape, *values)
+
+    @property
+    def _gradient_kept_as(self) -> str | None:
+        return self._kept_as("gradients", self._derivatives[0], self._derivative)
 
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.remembered`."""
         _, program = self._derivatives
         return self.differentiable(
-            lambda: lower_or_recall(self._kept_as, partial(program), self._arguments)
+            lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
         )
 
     @cached_property
@@ -405,6 +424,10 @@ class Engine:
 
 def _key_form() -> Any:
     return jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
+
+
+def _temperature_form() -> Any:
+    return jax.ShapeDtypeStruct((), jnp.float32)
 
 
 def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:
