@@ -139,3 +139,15 @@ def test_another_process_says_the_same():
     }
     assert len(said) == 1
     assert "None" not in said.pop()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_program_that_is_not_differentiated_does_not_depend_on_derivatives(reverse):
+    def alone(function):
+        return fingerprint(jax.jit(function).trace(X).jaxpr, derivatives=False)
+
+    one = with_derivative(jnp.cos, reverse=reverse)
+    other_slope = with_derivative(jnp.sin, reverse=reverse)
+    other_value = with_derivative(jnp.cos, jnp.tan, reverse=reverse)
+    assert alone(one) == alone(other_slope) != alone(other_value)
+    assert of(one) != of(other_slope)

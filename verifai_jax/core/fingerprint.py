@@ -29,17 +29,19 @@ class _Unknown(Exception):
     """Something of which it cannot be said what it does."""
 
 
-def fingerprint(program: jax.extend.core.ClosedJaxpr) -> str | None:
+def fingerprint(program: jax.extend.core.ClosedJaxpr, derivatives: bool = True) -> str | None:
     """Return a hash of all that a traced function computes, with its constants.
 
     **Arguments:**
 
     - `program`: what JAX traced.
+    - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
+      programs that differentiate this one depend on them.
 
     **Returns:** the hash in hexadecimal digits; None where a part of the function is opaque, such
     as a call of Python from the device.
     """
-    reader = _Reader()
+    reader = _Reader(derivatives)
     try:
         reader.read(program)
     except Exception:
@@ -64,7 +66,8 @@ def identity(*values: object) -> str | None:
 class _Reader:
     """Reads values and programs into one hash, each part of a program once."""
 
-    def __init__(self) -> None:
+    def __init__(self, derivatives: bool = True) -> None:
+        self._derivatives = derivatives
         self._texts: list[str] = []
         self._known: dict[int, int] = {}
         self._kept: list[Any] = []  # So that their identities stay theirs.
@@ -148,7 +151,7 @@ class _Reader:
             add(defined(step.outvars))
             if name in _CUSTOM:
                 self.read(step.params["call_jaxpr"])
-                if not derived:
+                if self._derivatives and not derived:
                     self._derivative(program, step)
                 continue
             hidden = ()

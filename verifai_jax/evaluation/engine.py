@@ -284,7 +284,8 @@ class Engine:
         def packed_row(*arguments: Any) -> Any:
             return jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
 
-        name = self._kept_as("simulations", fingerprint(traced.jaxpr))
+        computes = fingerprint(traced.jaxpr, derivatives=False)
+        name = self._kept_as("simulations", computes)
         return lower_or_recall(name, self._batched(packed_row), self._arguments)
 
     def _packed(self, packing: Packing, result: Row | Array) -> dict[str, Array]:
