@@ -2,6 +2,8 @@
 
 import gc
 import threading
+import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ class Slow:
     def __init__(self):
         self.go, self.begun = threading.Event(), threading.Event()
 
-    def compile(self):
+    def compile(self, **options):
         self.begun.set()
         self.go.wait(10)
         return lambda x: x + 1
@@ -60,6 +62,26 @@ def test_work_is_done_once_while_this_process_waits_for_a_program():
     assert compiling(1) == 2
     assert done == [1]
     assert not compilation._meanwhile
+
+
+def test_what_is_needed_later_is_done_in_long_waits_alone():
+    done = []
+
+    class Short(Slow):
+        def compile(self, **options):
+            time.sleep(0.05)
+            return super().compile(**options)
+
+    short = Short()
+    short.go.set()
+    needed, later = partial(done.append, "needed"), partial(done.append, "later")
+    while_compiling(later)
+    while_compiling(needed, after=0.0)
+    while_compiling(needed, after=0.0)
+    assert compile_soon("short", short)(1) == 2
+    assert done == ["needed"]
+    assert list(compilation._meanwhile) == [later]
+    compilation._meanwhile.clear()
 
 
 def test_less_effort_gives_the_same_numbers_and_unknown_options_are_left_out(monkeypatch):

@@ -41,11 +41,11 @@ _running: dict[int, tuple[str, float]] = {}
 _lock = threading.Lock()
 
 LONG = 0.4
-"""Seconds of waiting for a program, from which on other work is done meanwhile: none that delays a
-result which only has to be loaded."""
+"""Seconds of waiting for a program, from which on work is done that is needed later only: it would
+delay a result for which programs need but be loaded."""
 
-_meanwhile: list[Callable[[], object]] = []
-"""What is done at the next long wait for a program."""
+_meanwhile: dict[Callable[[], object], float] = {}
+"""What is done at the next wait for a program, and after how many seconds of it."""
 
 
 class Compilation:
@@ -68,10 +68,12 @@ class Compilation:
         """
         if self._program is None:
             try:
-                if _meanwhile:
-                    wait([self._future], LONG)
-                while _meanwhile and not self._future.done():
-                    _meanwhile.pop(0)()
+                for work, after in sorted(_meanwhile.items(), key=lambda each: each[1]):
+                    wait([self._future], after)
+                    if self._future.done():
+                        break
+                    if _meanwhile.pop(work, None) is not None:
+                        work()
                 self._program = self._future.result()
             except CancelledError:
                 assert self._lowered is not None
@@ -101,14 +103,15 @@ def compile_soon(name: str, lowered: jax.stages.Lowered, effort: Effort = "most"
     return Compilation(name, lowered, effort)
 
 
-def while_compiling(work: Callable[[], object]) -> None:
-    """Have work done once where this process first waits long for a program; else never.
+def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
+    """Have work done once where this process next waits for a program; never where it does not.
 
     **Arguments:**
 
     - `work`: what will be needed anyway, such as an import; nothing that results depend on.
+    - `after`: seconds of the wait before; 0 for what a first result needs.
     """
-    _meanwhile.append(work)
+    _meanwhile[work] = after
 
 
 @contextmanager

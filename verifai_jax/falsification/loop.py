@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
@@ -24,6 +25,7 @@ from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.ahead import Ahead
 from verifai_jax.falsification.checkpoint import write_checkpoint
+from verifai_jax.falsification.columns import import_tables
 from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.question import describe_run
 from verifai_jax.falsification.suggestions import Suggestions
@@ -137,6 +139,7 @@ class Rounds:
           where the search wants those of clauses.
         """
         space, marks = self.problem.space, 0 if self._marks is None else self._marks.width
+        while_compiling(import_tables, after=0.0)
         if self._differentiate is not None and not resumed:
             # They take longest to load: first, where nothing of them is to be traced.
             self._differentiate.begin_if_recalled()
