@@ -19,6 +19,8 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
+from verifai_jax.core.steps import as_function
+
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
 _NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device")
@@ -175,16 +177,10 @@ class _Reader:
         """Read the derivative that a function brings, as it is traced."""
         if step.params.get("symbolic_zeros"):
             raise _Unknown("a derivative that depends on which tangents are zero")
-        inputs = [v for v in step.invars if not isinstance(v, jax.extend.core.Literal)]
-        inputs = list(dict.fromkeys(inputs))
+        call, inputs = as_function(program, step)
         places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.floating)]
         if not places:
             return
-        alone = program.replace(
-            constvars=[], invars=inputs, outvars=step.outvars, eqns=[step], effects=step.effects,
-            debug_info=step.params["call_jaxpr"].jaxpr.debug_info.with_unknown_names(),
-        )  # fmt: skip
-        call = jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(alone, []))
         forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inputs]
 
         def derivative(arguments: Any, directions: Any) -> Any:

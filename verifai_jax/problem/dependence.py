@@ -4,18 +4,34 @@ A signal that is a whole number (a gear, a count) or a truth value is constant b
 its derivative is zero wherever there is one. Where formulas speak of nothing else, slopes would
 cost simulations and say nothing. JAX knows: what does not depend differentiably on the features has
 a derivative that does not depend on them either.
+
+To differentiate a simulation takes JAX many times as long as to trace it. So a sweep over the steps
+of the traced simulation finds what depends on the features through steps that have derivatives.
+Only steps that bring a derivative of their own are differentiated, each for itself.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
+import jax.extend.core
 import jax.numpy as jnp
+from jax.interpreters import ad
 from jaxtyping import Array
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.steps import as_function
 from verifai_jax.problem.problem import Problem
 
 DEPENDENCE: Slot[None, bool] = Slot("dependence")
 """Whether the robustness of a problem depends differentiably on a feature."""
+
+_FLAT = frozenset({"ceil", "floor", "nextafter", "round", "sign", "stop_gradient"})
+"""Steps with real results whose derivative is zero."""
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr"}
+_CALLS |= {"remat2": "jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "custom_vmap_call": "call"}
+"""Steps that call a function as it is, and the name of its program among their parameters."""
 
 
 def has_gradient(problem: Problem) -> bool:
@@ -26,20 +42,112 @@ def has_gradient(problem: Problem) -> bool:
 @truncate_silently()
 def _depends(problem: Problem) -> bool:
     key = jax.eval_shape(lambda: jax.random.key(0))
+    mapped, features = jax.make_jaxpr(problem.space.unflatten, return_shape=True)(
+        problem.space.point_form
+    )
+    moved = _sweep(mapped.jaxpr, [True])
+    # Traced already, when the problem was checked.
+    program, trace = jax.make_jaxpr(problem.system, return_shape=True)(features, key)
+    of_key = [False] * (len(program.jaxpr.invars) - len(moved))
+    reached = _sweep(program.jaxpr, [*moved, *of_key])
+    signals = jax.tree.unflatten(jax.tree.structure(trace), reached).signals
+    return any(any(jax.tree.leaves(signals[name])) for name in problem.monitored)
 
-    def signals(u: Array, key: Array) -> list[Array]:
-        trace = problem.system(problem.space.unflatten(u), key)
-        found = [jnp.asarray(trace.signals[name]) for name in problem.monitored]
-        return [signal for signal in found if jnp.issubdtype(signal.dtype, jnp.inexact)]
 
-    def along(u: Array, direction: Array, key: Array) -> list[Array]:
-        return jax.jvp(lambda u: signals(u, key), (u,), (direction,))[1]
+def _sweep(program: jax.extend.core.Jaxpr, moved: Sequence[bool]) -> list[bool]:
+    """Return which results of a program depend differentiably on the inputs that are `moved`."""
+    depends = {each for each, moves in zip(program.invars, moved, strict=True) if moves}
 
-    u = problem.space.point_form
-    program = jax.make_jaxpr(along)(u, u, key).jaxpr
-    # Which values depend on the direction: a forward sweep over the steps of the program.
-    moved = {program.invars[1]}
+    def of(values: Sequence[Any]) -> list[bool]:
+        return [
+            not isinstance(value, jax.extend.core.Literal) and value in depends for value in values
+        ]
+
     for step in program.eqns:
-        if any(not hasattr(value, "val") and value in moved for value in step.invars):
-            moved.update(step.outvars)
-    return any(not hasattr(value, "val") and value in moved for value in program.outvars)
+        inputs = of(step.invars)
+        if any(inputs):
+            results = _results(program, step, inputs)
+            pairs = zip(step.outvars, results, strict=True)
+            depends.update(each for each, moves in pairs if moves and _is_real(each))
+    return of(program.outvars)
+
+
+def _is_real(value: Any) -> bool:
+    dtype = getattr(value.aval, "dtype", None)
+    return dtype is not None and jnp.issubdtype(dtype, jnp.inexact)
+
+
+def _results(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
+    """Return which results of a step depend differentiably on the inputs that are `moved`."""
+    name, options = step.primitive.name, step.params
+    if name in _CALLS and _CALLS[name] in options:
+        return _sweep(_program(options[_CALLS[name]]), moved)
+    if name == "scan":
+        count = options["num_consts"]
+        fixed, carry = moved[:count], moved[count : count + options["num_carry"]]
+        rows = moved[count + options["num_carry"] :]
+        return _repeated(_program(options["jaxpr"]), fixed, carry, rows)
+    if name == "while":
+        test, count = options["cond_nconsts"], options["body_nconsts"]
+        body = _program(options["body_jaxpr"])
+        return _repeated(body, moved[test : test + count], moved[test + count :], [])
+    if name == "cond":
+        branches = [_sweep(_program(each), moved[1:]) for each in options["branches"]]
+        return [any(each) for each in zip(*branches, strict=True)]
+    if name.startswith("scatter") or (step.primitive in ad.primitive_jvps and not _nested(step)):
+        return [name not in _FLAT] * len(step.outvars)
+    return _differentiated(program, step, moved)
+
+
+def _nested(step: Any) -> bool:
+    """Return whether a step has programs among its parameters."""
+    kinds = (jax.extend.core.Jaxpr, jax.extend.core.ClosedJaxpr)
+    leaves = jax.tree.leaves(
+        list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
+    )
+    return any(isinstance(each, kinds) for each in leaves)
+
+
+def _differentiated(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> list[bool]:
+    """Return the same from the derivative of the step along a direction."""
+    call, inputs = as_function(program, step)
+    pairs = zip(step.invars, moved, strict=True)
+    moving = {each for each, moves in pairs if moves and _is_real(each)}
+    places = [i for i, each in enumerate(inputs) if each in moving]
+    forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
+
+    def along(values: list[Array], direction: list[Array]) -> list[Any]:
+        def function(*some: Array) -> list[Any]:
+            whole = list(values)
+            for i, value in zip(places, some, strict=True):
+                whole[i] = value
+            results = call(*whole)
+            return [each for each in results if jnp.issubdtype(each.dtype, jnp.inexact)]
+
+        return jax.jvp(function, [values[i] for i in places], direction)[1]
+
+    derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
+    # All that it is computed from in any way: the derivative is linear in the direction.
+    reached = set(derivative.invars[len(inputs) :])
+    for each in derivative.eqns:
+        if any(not isinstance(v, jax.extend.core.Literal) and v in reached for v in each.invars):
+            reached.update(each.outvars)
+    literal = jax.extend.core.Literal
+    found = iter(not isinstance(v, literal) and v in reached for v in derivative.outvars)
+    return [_is_real(each) and next(found) for each in step.outvars]
+
+
+def _repeated(
+    body: jax.extend.core.Jaxpr, fixed: list[bool], carry: list[bool], rows: list[bool]
+) -> list[bool]:
+    """Return the same of a loop: what is carried goes round until no more of it depends."""
+    while True:
+        results = _sweep(body, [*fixed, *carry, *rows])
+        after = [old or new for old, new in zip(carry, results[: len(carry)], strict=True)]
+        if after == carry:
+            return [*carry, *results[len(carry) :]]
+        carry = after
+
+
+def _program(program: Any) -> jax.extend.core.Jaxpr:
+    return getattr(program, "jaxpr", program)
