@@ -5,6 +5,7 @@ verifai-jax replay runs/balance-1 417
 verifai-jax monitor "always[0, 4] abs(x) <= 2.4" trace.csv
 """
 
+import atexit
 import contextlib
 import gc
 import os
@@ -120,6 +121,8 @@ class _Group(click.Group):
         # A command imports and traces millions of objects that stay: looking at all of them as
         # often as Python does by itself takes a tenth of the time.
         gc.set_threshold(50_000, 20, 20)
+        # And Python does at its end, for up to half a second.
+        atexit.register(gc.freeze)
         with _signals_interrupt() as received:
             try:
                 result = super().invoke(ctx)
