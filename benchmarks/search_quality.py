@@ -122,6 +122,15 @@ def first_failure(problem, search, batch, seed, budget):
     return (int(failing[0]) + 1, True) if len(failing) else (budget, False)
 
 
+def median_cost(problem, search, batch, options):
+    """Median of what the first failure costs, a derivative as a simulation more."""
+    trials = vj.repeat(
+        problem, search, options.budget, batch=batch, seeds=options.seeds, confirm=False
+    )
+    cost = trials.cost()
+    return statistics.median(np.where(np.isfinite(cost), cost, options.budget).tolist())
+
+
 def on_cartpole(options):
     """One line a search on a problem of specs/cartpole.py."""
     problem = load_target(f"specs/cartpole.py:{options.problem}", vj.Problem)
@@ -143,7 +152,11 @@ def on_cartpole(options):
         median = statistics.median(counts)
         uniform = uniform or median
         low, high = np.percentile(counts, [25, 75])
-        doubled = f"{uniform / (2 * median):.1f}x" if search.wants_gradient else ""
+        doubled = ""
+        if search.wants_gradient:
+            doubled = f"{uniform / (2 * median):.1f}x"
+        elif search.wants_clauses:
+            doubled = f"{uniform / median_cost(problem, search, batch, options):.1f}x"
         print(
             f"{name:<17}{batch:>6}{sum(f for _, f in results):>5}/{options.seeds}"
             f"{median:>9.0f}{f'{low:.0f} - {high:.0f}':>16}{uniform / median:>10.1f}x"
