@@ -1,7 +1,8 @@
-"""One JAX device per CPU core, claimed as soon as JAX is there and before its backend starts.
+"""What JAX has to know as soon as it is there, and before its backend starts or anything compiles.
 
-JAX fixes the number of its host devices when its backend starts. Importing `verifai_jax` does not
-import JAX, so the claim waits for whoever imports it first.
+That is one device for each core of the processor, whose number JAX fixes when its backend starts,
+and batches of factorizations that do not hang (`core.factorizations`). Importing `verifai_jax` does
+not import JAX, so both wait for whoever imports it first.
 """
 
 import importlib.abc
@@ -32,9 +33,17 @@ def claim_cores() -> None:
     cores = int(wanted) if wanted else available_cores()
     jax = sys.modules.get("jax")
     if jax is not None and hasattr(jax, "config"):
-        _configure(jax, cores)
+        _prepare(jax, cores)
     else:
         sys.meta_path.insert(0, _AfterImport(cores))
+
+
+def _prepare(jax: Any, cores: int) -> None:
+    # It imports JAX.
+    from verifai_jax.core.factorizations import avoid_deadlock
+
+    avoid_deadlock()
+    _configure(jax, cores)
 
 
 def _configure(jax: Any, cores: int) -> None:
@@ -49,7 +58,7 @@ def _configure(jax: Any, cores: int) -> None:
 
 
 class _AfterImport(importlib.abc.MetaPathFinder):
-    """Configures JAX as soon as it is imported, by whomever, and then steps aside."""
+    """Prepares JAX as soon as it is imported, by whomever, and then steps aside."""
 
     def __init__(self, cores: int) -> None:
         self.cores = cores
@@ -65,9 +74,9 @@ class _AfterImport(importlib.abc.MetaPathFinder):
             return None
         execute = spec.loader.exec_module
 
-        def execute_and_configure(module: ModuleType) -> None:
+        def execute_and_prepare(module: ModuleType) -> None:
             execute(module)
-            _configure(module, self.cores)
+            _prepare(module, self.cores)
 
-        spec.loader.exec_module = execute_and_configure  # pyright: ignore[reportAttributeAccessIssue]
+        spec.loader.exec_module = execute_and_prepare  # pyright: ignore[reportAttributeAccessIssue]
         return spec

@@ -18,10 +18,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from verifai_jax.core.factorizations import avoid_deadlock
-
-avoid_deadlock()
-
 Device: TypeAlias = jax.Device  # pyright: ignore[reportInvalidTypeForm]
 """A device of JAX; its own name of the class is a variable to type checkers."""
 

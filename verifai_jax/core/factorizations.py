@@ -86,12 +86,11 @@ def _lower(
 ) -> Any:
     """Lower a factorization as JAX does, or as a loop over blocks of its batch."""
     forms = context.avals_in
-    batch = forms[0].shape[: forms[0].ndim - known.ranks[0]]
     if all(isinstance(size, int) for form in forms for size in form.shape):
-        count, block = math.prod(batch), _block(known, forms)
-        if count > block:
+        batch, block = forms[0].shape[: forms[0].ndim - known.ranks[0]], _block(known, forms)
+        if math.prod(batch) > block:
             call = partial(primitive.bind, **parameters)
-            blocks = partial(_in_blocks, call, known.ranks, block)
+            blocks = partial(_in_blocks, call, known.ranks, batch, block)
             lower = mlir.lower_fun(blocks, multiple_results=primitive.multiple_results)
             return lower(context, *operands)
     return original(context, *operands, **parameters)
@@ -106,9 +105,14 @@ def _block(known: _Factorization, forms: Any) -> int:
     return max(1, int(_UNCUT / max(work, 1)))
 
 
-def _in_blocks(call: Callable[..., Any], ranks: tuple[int, ...], block: int, *operands: Any) -> Any:
+def _in_blocks(
+    call: Callable[..., Any],
+    ranks: tuple[int, ...],
+    batch: tuple[int, ...],
+    block: int,
+    *operands: Any,
+) -> Any:
     """Call a primitive on one block of the batch after the other."""
-    batch = operands[0].shape[: operands[0].ndim - ranks[0]]
     count = math.prod(batch)
     whole = -(-count // block) * block
 

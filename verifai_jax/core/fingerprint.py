@@ -19,7 +19,7 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.steps import as_function
+from verifai_jax.core.steps import as_function, of_some
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
@@ -178,19 +178,13 @@ class _Reader:
         if step.params.get("symbolic_zeros"):
             raise _Unknown("a derivative that depends on which tangents are zero")
         call, inputs = as_function(program, step)
-        places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.floating)]
+        places = [i for i, v in enumerate(inputs) if jnp.issubdtype(v.aval.dtype, jnp.inexact)]
         if not places:
             return
         forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in inputs]
 
         def derivative(arguments: Any, directions: Any) -> Any:
-            def function(*values: Any) -> Any:
-                whole = list(arguments)
-                for i, value in zip(places, values, strict=True):
-                    whole[i] = value
-                results = call(*whole)
-                return [each for each in results if jnp.issubdtype(each.dtype, jnp.floating)]
-
+            function = of_some(call, arguments, places)
             values = [arguments[i] for i in places]
             if step.primitive.name == "custom_jvp_call":
                 return jax.jvp(function, values, directions)

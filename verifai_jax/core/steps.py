@@ -1,9 +1,24 @@
-"""Single steps of programs that JAX has traced, as functions of their own."""
+"""Programs that JAX has traced, and single steps of them, as functions.
 
-from collections.abc import Callable
+traced = jax.jit(simulate).trace(features, key)
+again = as_traced(traced)                           # of the same pytrees; nothing is traced again
+call, variables = as_function(program, step)        # one equation of a program, alone
+moving = of_some(call, values, [0, 2])              # of the first and third of its arguments
+"""
+
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.extend.core
+import jax.numpy as jnp
+
+
+def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
+    """Return what was traced as a function of pytrees: no code of a user's runs again."""
+    known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
+    form = jax.tree.structure(traced.out_info)
+    return lambda *arguments: jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
 
 
 def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list[Any]]:
@@ -24,3 +39,26 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
         debug_info=program.debug_info.with_unknown_names(),
     )  # fmt: skip
     return jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(alone, [])), inputs
+
+
+def of_some(
+    call: Callable[..., list[Any]], values: Sequence[Any], places: Sequence[int]
+) -> Callable[..., list[Any]]:
+    """Return a function of some arguments of another, to be differentiated.
+
+    **Arguments:**
+
+    - `call`: the other function, of arrays.
+    - `values`: all of its arguments.
+    - `places`: numbers of those that the function takes; the others keep their values.
+
+    **Returns:** the function, which returns those results that can have a derivative.
+    """
+
+    def function(*some: Any) -> list[Any]:
+        whole = list(values)
+        for i, value in zip(places, some, strict=True):
+            whole[i] = value
+        return [each for each in call(*whole) if jnp.issubdtype(each.dtype, jnp.inexact)]
+
+    return function

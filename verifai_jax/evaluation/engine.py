@@ -16,7 +16,6 @@ from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree
@@ -29,6 +28,7 @@ from verifai_jax.core.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.remembered import is_kept, lower_or_recall, remembered_as
+from verifai_jax.core.steps import as_traced
 from verifai_jax.evaluation.differentiation import Derivative, reverse_refused
 from verifai_jax.evaluation.inputs import CubePoints, Inputs
 from verifai_jax.evaluation.packing import Packing
@@ -40,6 +40,8 @@ from verifai_jax.problem.problem import Problem
 
 Mode = Literal["evaluate", "holds"]
 """Programs of an engine: robustness and derivatives, or the Boolean semantics of the same rows."""
+_TEMPERATURE = jax.ShapeDtypeStruct((), jnp.float32)
+"""Form of the temperature of one row."""
 
 
 class Engine:
@@ -268,7 +270,7 @@ class Engine:
             return self._packed(packing, result)
 
         *_, shared, vector = self._arguments
-        one = (self.inputs.row_form, _key_form(), _temperature_form(), shared, vector)
+        one = (self.inputs.row_form, _key_form(), _TEMPERATURE, shared, vector)
         # A new function object each time: JAX remembers what it traced by the function.
         traced = self._traced[mode] = jax.jit(packed_row).trace(*one)
         return traced
@@ -278,15 +280,8 @@ class Engine:
         traced = self._trace(mode)
         if self.alone:
             return traced.lower()
-        known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
-        form = jax.tree.structure(traced.out_info)
-
-        def packed_row(*arguments: Any) -> Any:
-            return jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
-
-        computes = fingerprint(traced.jaxpr, derivatives=False)
-        name = self._kept_as("simulations", computes)
-        return lower_or_recall(name, self._batched(packed_row), self._arguments)
+        name = self._kept_as("simulations", fingerprint(traced.jaxpr, derivatives=False))
+        return lower_or_recall(name, self._batched(as_traced(traced)), self._arguments)
 
     def _packed(self, packing: Packing, result: Row | Array) -> dict[str, Array]:
         """Pack the result of one row, without its features where the inputs have them already."""
@@ -305,7 +300,7 @@ class Engine:
         *_, vector = self._arguments
         row = self.inputs.row_form
         coordinates = jax.eval_shape(function.coordinates, row, shared)
-        one = (coordinates, row, _key_form(), _temperature_form(), shared, vector)
+        one = (coordinates, row, _key_form(), _TEMPERATURE, shared, vector)
 
         def objective(coordinates: Array, *others: Any) -> Any:
             vector, rest = others[-1], others[:-1]
@@ -314,8 +309,7 @@ class Engine:
         traced = jax.jit(objective).trace(*one)
         values, results = traced.out_info
         # Traced once, and all else is made of that: nothing that a user's code may do comes in.
-        known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
-        form = jax.tree.structure(traced.out_info)
+        known = as_traced(traced)
         packing = self._packing["evaluate"] = Packing()
 
         def packed(derivatives: Array, results: PyTree) -> Any:
@@ -326,7 +320,7 @@ class Engine:
 
         def packed_row(row: PyTree, *others: Any) -> Any:
             def objective(coordinates: Array) -> Any:
-                return jax.tree.unflatten(form, known(*jax.tree.leaves((coordinates, row, others))))
+                return known(coordinates, row, *others)
 
             *_, shared, _ = others
             derivative = self._derivative if self.goals is None else self._derivative.of_several
@@ -425,10 +419,6 @@ class Engine:
 
 def _key_form() -> Any:
     return jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
-
-
-def _temperature_form() -> Any:
-    return jax.ShapeDtypeStruct((), jnp.float32)
 
 
 def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:

@@ -10,7 +10,7 @@ of the traced simulation finds what depends on the features through steps that h
 Only steps that bring a derivative of their own are differentiated, each for itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import as_function
+from verifai_jax.core.steps import as_function, of_some
 from verifai_jax.problem.problem import Problem
 
 DEPENDENCE: Slot[None, bool] = Slot("dependence")
@@ -57,19 +57,20 @@ def _depends(problem: Problem) -> bool:
 def _sweep(program: jax.extend.core.Jaxpr, moved: Sequence[bool]) -> list[bool]:
     """Return which results of a program depend differentiably on the inputs that are `moved`."""
     depends = {each for each, moves in zip(program.invars, moved, strict=True) if moves}
-
-    def of(values: Sequence[Any]) -> list[bool]:
-        return [
-            not isinstance(value, jax.extend.core.Literal) and value in depends for value in values
-        ]
-
     for step in program.eqns:
-        inputs = of(step.invars)
+        inputs = _among(step.invars, depends)
         if any(inputs):
             results = _results(program, step, inputs)
             pairs = zip(step.outvars, results, strict=True)
             depends.update(each for each, moves in pairs if moves and _is_real(each))
-    return of(program.outvars)
+    return _among(program.outvars, depends)
+
+
+def _among(values: Sequence[Any], variables: Set[Any]) -> list[bool]:
+    """Return which operands of a step are some of these variables."""
+    return [
+        not isinstance(value, jax.extend.core.Literal) and value in variables for value in values
+    ]
 
 
 def _is_real(value: Any) -> bool:
@@ -117,23 +118,16 @@ def _differentiated(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]
     forms = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in inputs]
 
     def along(values: list[Array], direction: list[Array]) -> list[Any]:
-        def function(*some: Array) -> list[Any]:
-            whole = list(values)
-            for i, value in zip(places, some, strict=True):
-                whole[i] = value
-            results = call(*whole)
-            return [each for each in results if jnp.issubdtype(each.dtype, jnp.inexact)]
-
+        function = of_some(call, values, places)
         return jax.jvp(function, [values[i] for i in places], direction)[1]
 
     derivative = jax.make_jaxpr(along)(forms, [forms[i] for i in places]).jaxpr
     # All that it is computed from in any way: the derivative is linear in the direction.
     reached = set(derivative.invars[len(inputs) :])
     for each in derivative.eqns:
-        if any(not isinstance(v, jax.extend.core.Literal) and v in reached for v in each.invars):
+        if any(_among(each.invars, reached)):
             reached.update(each.outvars)
-    literal = jax.extend.core.Literal
-    found = iter(not isinstance(v, literal) and v in reached for v in derivative.outvars)
+    found = iter(_among(derivative.outvars, reached))
     return [_is_real(each) and next(found) for each in step.outvars]
 
 
