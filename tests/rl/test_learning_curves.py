@@ -1,4 +1,4 @@
-"""The algorithms against what is known of classic control, ten seeds each."""
+"""The algorithms against what is known of classic control, five or ten seeds each."""
 
 import gymnasium
 import jax
@@ -9,12 +9,26 @@ import pytest
 from benchmarks.control_tasks import Acrobot, Angles, Pendulum, Swing
 from benchmarks.learning_curves import CURVES, returns
 
+UNSTEADY = {"Pendulum ppo"}
+"""Curves of which a seed in ten stays far behind; see docs/training.md."""
+STEADY = [curve for curve in CURVES if curve.name not in UNSTEADY]
+
 
 @pytest.mark.slow
-@pytest.mark.parametrize("curve", CURVES, ids=lambda curve: curve.name)
-def test_seeds_reach_the_known_return(curve):
+@pytest.mark.parametrize("curve", STEADY, ids=lambda curve: curve.name)
+def test_five_seeds_reach_the_known_return(curve):
+    got = returns(curve, seeds=5)
+    assert got.mean() >= curve.wanted, got
+    # No seed is left behind: four of five are there, the fifth within a fifth.
+    assert np.sum(got >= curve.wanted - 0.05 * abs(curve.wanted)) >= 4, got
+    assert got.min() >= curve.wanted - 0.2 * abs(curve.wanted), got
+
+
+@pytest.mark.slow
+def test_most_of_ten_seeds_reach_the_known_return():
     # What a seed learns depends on the last digits of the processor, so one that stays behind on
     # one machine is another on the next.
+    (curve,) = (curve for curve in CURVES if curve.name in UNSTEADY)
     got = returns(curve, seeds=10)
     assert np.median(got) >= curve.wanted, got
     assert np.sum(got >= curve.wanted - 0.05 * abs(curve.wanted)) >= 7, got
