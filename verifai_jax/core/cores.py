@@ -1,6 +1,6 @@
-"""What JAX has to know as soon as it is there, and before its backend starts or anything compiles.
+"""The preparation of JAX, as soon as it is there and before its backend starts or compiles.
 
-That is one device for each core of the processor, whose number JAX fixes when its backend starts,
+It gets one device for each core of the processor, whose number it fixes when its backend starts,
 and batches of factorizations that do not hang (`core.factorizations`). Importing `verifai_jax` does
 not import JAX, so both wait for whoever imports it first.
 """
