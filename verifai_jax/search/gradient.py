@@ -62,6 +62,10 @@ COOLING = 0.7
 """Factor on the temperature with each step, behind the first descent."""
 
 
+HALVINGS = 24
+"""Halvings of the interval that holds the weight at which two clauses are equal."""
+
+
 class GradientState(NamedTuple):
     key: Key[Array, ""]
     starts: UInt32[Array, ""]  # how many starts were made
@@ -190,25 +194,40 @@ class Gradient(Search[GradientState]):
         size = jnp.where(differentiates, 0, row // there)
         rows = jnp.where(differentiates, there, jnp.minimum(there * min(SIZES, batch // n), batch))
         box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
-        solve = jax.vmap(_minimax, in_axes=(0, 0, 0, 0, None))
-        free = np.array(cube.levels) == 0
-        tried = solve(
-            state.clauses[descent], state.gradients[descent], state.point[descent], box, free
-        )
-        stays = jnp.max(jnp.abs(tried - state.point[descent]), axis=1, initial=0.0) < 1e-6
-        number = state.flips[descent] + size
-        other = jax.vmap(_flip, in_axes=(0, 0, 0, 0, None))(
-            state.clauses[descent], state.gradients[descent], state.point[descent], number, free
-        )
-        tried = jnp.where(stays[:, None], other, tried)
+        # No more rows than these are ever simulated.
+        most = min(n * min(SIZES, batch // n), batch)
+        tried, flipped = self._boxes(state, cube, descent[:most], size[:most], box[:most])
+        tried = jnp.pad(tried, ((0, batch - most), (0, 0)), constant_values=0.5)
         u = jnp.where(differentiates, starts[descent], tried)
         return u, state._replace(
             descent=descent,
             box=box,
-            flipped=stays & ~differentiates,
+            flipped=jnp.pad(flipped, (0, batch - most)) & ~differentiates,
             rows=rows.astype(jnp.int32),
             differentiates=differentiates,
         )
+
+    def _boxes(
+        self,
+        state: GradientState,
+        cube: Cube,
+        descent: Int[Array, " n"],
+        size: Int[Array, " n"],
+        box: Float[Array, " n"],
+    ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+        """Return where the linear clauses are least in boxes of descents, and which are flips."""
+        free = np.array(cube.levels) == 0
+        clauses, gradients = state.clauses[descent], state.gradients[descent]
+        point = state.point[descent]
+        # A goal of a single clause needs none; it is the same for all rows.
+        several = jnp.any(state.known & (state.clauses[:, 1] > NOTHING))
+        halvings = jnp.where(several, HALVINGS, 0)
+        solve = jax.vmap(_minimax, in_axes=(0, 0, 0, 0, None, None))
+        tried = solve(clauses, gradients, point, box, free, halvings)
+        stays = jnp.max(jnp.abs(tried - point), axis=1, initial=0.0) < 1e-6
+        flip = jax.vmap(_flip, in_axes=(0, 0, 0, 0, None))
+        other = flip(clauses, gradients, point, state.flips[descent] + size, free)
+        return jnp.where(stays[:, None], other, tried), stays
 
     def plan(self, state: GradientState, cube: Cube, batch: int) -> Plan:
         return Plan(state.rows, state.differentiates, state.temperature[state.descent])
@@ -353,6 +372,7 @@ def _minimax(
     point: Float[Array, " d"],
     radius: Float[Array, ""],
     free: Bool[np.ndarray, " d"],
+    halvings: Int[Array, ""],
 ) -> Float[Array, " d"]:
     """Minimise the greatest of linear clauses over a box.
 
@@ -384,7 +404,7 @@ def _minimax(
         return jnp.where(above, middle, least), jnp.where(above, most, middle)
 
     zero = jnp.zeros(len(pairs), jnp.float32)
-    least, most = jax.lax.fori_loop(0, 24, halve, (zero, zero + 1))
+    least, most = jax.lax.fori_loop(0, halvings, halve, (zero, zero + 1))
     a, b = (corner(w[:, None] * one + (1 - w)[:, None] * two) for w in (least, most))
     above, below = jnp.maximum(gap(a), 0.0), jnp.maximum(-gap(b), 0.0)
     share = jnp.where(above + below > 0, below / (above + below), 0.5)[:, None]
