@@ -177,13 +177,13 @@ def _cancel_waiting() -> None:
 
 def _compiled(name: str, lowered: jax.stages.Lowered, effort: Effort) -> jax.stages.Compiled:
     with _said(name):
-        options = _options(effort)
+        options = options_of(effort)
         return lowered.compile(compiler_options=options) if options else lowered.compile()
 
 
 @cache
-def _options(effort: Effort) -> dict[str, Any] | None:
-    """Return XLA's options; None where it does the most."""
+def options_of(effort: Effort) -> dict[str, Any] | None:
+    """Return XLA's options for this effort; None where it does the most."""
     options = _OPTIONS[effort]
     if not options or jax.default_backend() != "cpu":
         return None

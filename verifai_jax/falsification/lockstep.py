@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.compilation import options_of
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
@@ -21,6 +22,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
+from verifai_jax.search.proposals import effort_of
 
 VALUES_AT_ONCE = 256
 """Simulations of one call without derivatives."""
@@ -168,10 +170,13 @@ def _search_programs(
         return u, search.plan(state, cube, batch), state
 
     def make() -> tuple[jax.stages.Wrapped, ...]:
+        # As for `falsify`: what is rounded otherwise may end up elsewhere.
+        options = options_of(effort_of(search, batch))
+        compiled = partial(jax.jit, compiler_options=options)
         return (
-            jax.jit(jax.vmap(lambda key: search.init(key, cube, batch))),
-            jax.jit(jax.vmap(ask)),
-            jax.jit(jax.vmap(lambda state, observations: search.tell(state, cube, observations))),
+            compiled(jax.vmap(lambda key: search.init(key, cube, batch))),
+            compiled(jax.vmap(ask)),
+            compiled(jax.vmap(lambda state, observations: search.tell(state, cube, observations))),
         )
 
     return problem.programs.get(SEARCHES, (search, batch), make)

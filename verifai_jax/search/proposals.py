@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import CLAUSES
-from verifai_jax.core.compilation import compile_soon, tracing
+from verifai_jax.core.compilation import Effort, compile_soon, tracing
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
@@ -335,6 +335,16 @@ class Proposals:
         )
 
 
+SMALL = 256
+"""Points of a round up to which a search that plans its rounds is compiled with the least effort:
+its programs are large, and then run nearly as fast."""
+
+
+def effort_of(search: Search, batch: int) -> Effort:
+    """Return how much is done to make the programs of a search fast."""
+    return "least" if search.wants_clauses and batch <= SMALL else "little"
+
+
 class SearchProgram(NamedTuple):
     """Compiled functions of a search."""
 
@@ -359,13 +369,13 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
     def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
         name = remembered_as(f"search-{verb}", kept, verb)
         lowered = lower_or_recall(name, function, arguments, form)
-        return compile_soon("the search", lowered, "little")
+        return compile_soon("the search", lowered, effort_of(search, batch))
 
     # What takes longest to compile begins first.
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
     ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
-    init = compile_soon("the search", begun.lower(), "little")
+    init = compile_soon("the search", begun.lower(), effort_of(search, batch))
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
     observations = Observations(points, rho, valid, points if search.wants_gradient else None)
