@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from verifai_jax.core.cube import Cube
 from verifai_jax.mtl.clauses import ABSENT
 from verifai_jax.search import Gradient, Observations, Portfolio
-from verifai_jax.search.gradient import _minimax
+from verifai_jax.search.gradient import HALVINGS, _minimax
 
 D, K = 5, 4
 FREE = np.ones(D, bool)
@@ -38,7 +38,9 @@ def test_least_against_a_linear_program(seed, count):
     clauses[:count], gradients[:count] = rng.normal(size=count), rng.normal(size=(count, D))
     point, radius = rng.random(D), rng.uniform(0.05, 1)
     arguments = [jnp.asarray(x, jnp.float32) for x in (clauses, gradients, point, radius)]
-    found = np.asarray(solve(*arguments, FREE), np.float64)
+    # A single clause needs no halvings.
+    halvings = HALVINGS if count > 1 else 0
+    found = np.asarray(solve(*arguments, FREE, halvings), np.float64)
     assert np.all(np.abs(found - point) <= radius + 1e-5)
     assert np.all((found >= 0) & (found <= 1))
     value = np.max((clauses + gradients @ (found - point))[:count])
@@ -47,6 +49,31 @@ def test_least_against_a_linear_program(seed, count):
     if count < 3:
         assert value <= best + 1e-3
     assert value <= np.max(clauses[:count]) + 1e-4
+
+
+def test_boxes_of_all_rows_that_are_simulated():
+    """In large batches only the first rows are simulated: each lies in its descent's box."""
+    search, cube, batch = Gradient(), Cube((0,) * D), 256
+    centre = jnp.linspace(0.2, 0.8, D)
+    ask, tell = jax.jit(search.ask, static_argnums=(1, 2)), jax.jit(search.tell, static_argnums=1)
+    measured = jax.jit(jax.vmap(jax.value_and_grad(lambda u: 0.1 + jnp.sum((u - centre) ** 2))))
+    state, boxes = search.init(jax.random.key(0), cube, batch), 0
+    for _ in range(12):
+        u, state = ask(state, cube, batch)
+        plan = search.plan(state, cube, batch)
+        rho, slopes = measured(u)
+        if not plan.differentiate:
+            mine = np.arange(batch) < int(plan.rows)
+            moved = np.max(np.abs(np.asarray(u - state.point[state.descent])), axis=1)
+            inside = mine & ~np.asarray(state.flipped)
+            assert np.all(moved[inside] <= np.asarray(state.box)[inside] + 1e-6)
+            assert np.all(moved[mine] > 0)
+            boxes += int(inside.sum())
+        clauses = jnp.full((batch, K), ABSENT).at[:, 0].set(rho)
+        gradients = jnp.zeros((batch, K, D)).at[:, 0].set(slopes)
+        seen = Observations(u, rho, jnp.ones(batch, bool), None, clauses, gradients)
+        state = tell(state, cube, seen)
+    assert boxes > 300
 
 
 def played(search, rho, clauses, cube, budget, seed=0):
