@@ -196,13 +196,17 @@ class Gradient(Search[GradientState]):
         box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
         # No more rows than these are ever simulated.
         most = min(n * min(SIZES, batch // n), batch)
-        tried, flipped = self._boxes(state, cube, descent[:most], size[:most], box[:most])
+        tried, flipped = jax.lax.cond(
+            differentiates,
+            lambda: (starts[descent[:most]], jnp.zeros(most, bool)),
+            lambda: self._boxes(state, cube, descent[:most], size[:most], box[:most]),
+        )
         tried = jnp.pad(tried, ((0, batch - most), (0, 0)), constant_values=0.5)
         u = jnp.where(differentiates, starts[descent], tried)
         return u, state._replace(
             descent=descent,
             box=box,
-            flipped=jnp.pad(flipped, (0, batch - most)) & ~differentiates,
+            flipped=jnp.pad(flipped, (0, batch - most)),
             rows=rows.astype(jnp.int32),
             differentiates=differentiates,
         )
@@ -391,10 +395,10 @@ def _minimax(
     pairs = np.array(list(combinations(range(CLAUSES), 2)))
     one, two = gradients[pairs[:, 0]], gradients[pairs[:, 1]]
 
+    apart, turned = clauses[pairs[:, 0]] - clauses[pairs[:, 1]], one - two
+
     def gap(points: Float[Array, "m d"]) -> Float[Array, " m"]:
-        values = linear(points)
-        rows = np.arange(len(pairs))
-        return values[rows, pairs[:, 0]] - values[rows, pairs[:, 1]]
+        return apart + jnp.sum((points - point) * turned, axis=1)
 
     def halve(_: Int[Array, ""], weights: tuple[Array, Array]) -> tuple[Array, Array]:
         # At the least weight on the first clause it is the greater one, at the most the second.
