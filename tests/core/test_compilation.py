@@ -94,7 +94,7 @@ def test_less_effort_gives_the_same_numbers_and_unknown_options_are_left_out(mon
     np.testing.assert_allclose(efforts["most"], efforts["least"], rtol=1e-6)
     monkeypatch.setattr(jax.config, "read", lambda name: False)
     monkeypatch.setitem(compilation._OPTIONS, "little", {"no_such_option": True})
-    assert compilation._options.__wrapped__("little") is None
+    assert compilation.options_of.__wrapped__("little") is None
 
 
 def test_what_the_compiler_raises_is_raised_where_the_program_is_called():
