@@ -33,6 +33,28 @@ def data():
     return jnp.asarray(x, jnp.float32), jnp.asarray(coefficients, jnp.float32), jnp.asarray(mask)
 
 
+def test_short_lengths_and_near_rows_leave_a_finite_model_that_can_be_fitted():
+    """In 32 bits squares of points have no digits left for the distance of neighbours."""
+    rng = np.random.default_rng(0)
+    x = rng.random((64, WIDTH)) - 0.5
+    x = x[np.arange(64) % 8] + 1e-3 * rng.normal(size=(64, WIDTH))
+    x, mask = jnp.asarray(x, jnp.float32), np.ones(64, bool)
+    coefficients = jnp.asarray(np.sign(np.sin(200 * np.asarray(x[:, :1]))), jnp.float32)
+    hyper = models.TraceHyper(
+        jnp.log(jnp.array([0.01, 0.5, 2.0])), jnp.array([0.0, -8.0, -8.0, 3.0]), jnp.float32(-9.0)
+    )
+    model = models.condition(hyper, x, mask, coefficients, jnp.zeros(1), jnp.eye(1))
+    assert np.isfinite(model.factor).all()
+    rows = np.asarray(x, np.float64)
+    exact = covariance(hyper, rows, rows) + np.exp(-9.0) * np.eye(64)
+    factor = np.asarray(model.factor, np.float64)
+    np.testing.assert_allclose(
+        factor @ factor.T, exact, rtol=1e-4, atol=2e-5 * np.trace(exact) / 64
+    )
+    fitted = models.fit(hyper, x, mask, coefficients)
+    assert not np.array_equal(fitted.lengths, hyper.lengths)
+
+
 @pytest.mark.thorough
 def test_draws_have_the_moments_of_the_exact_posterior(data):
     x, coefficients, mask = data

@@ -111,7 +111,7 @@ def fit(
     count = jnp.maximum(jnp.sum(mask), 1)
 
     def loss(hyper: TraceHyper) -> Float[Array, ""]:
-        factor = jnp.linalg.cholesky(_noisy(hyper, x, mask))
+        factor = _factor(_noisy(hyper, x, mask))
         half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
         square = jnp.sum(half**2, axis=0) / count
         inside = jnp.log(jnp.maximum(square, 1e-12)) * count / 2
@@ -152,16 +152,16 @@ def condition(
     components: Float[Array, "c samples"],
 ) -> TraceModel:
     """Return the model of these rows."""
-    factor = jnp.linalg.cholesky(_noisy(hyper, x, mask))
+    factor = _factor(_noisy(hyper, x, mask))
     half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
     scale = jnp.sqrt(jnp.sum(half**2, axis=0) / jnp.maximum(jnp.sum(mask), 1))
     return TraceModel(hyper, x, mask, coefficients, factor, scale, mean, components)
 
 
 def draw(
-    model: TraceModel, key: Key[Array, ""], count: int
+    model: TraceModel, key: Key[Array, ""], count: int, guess: Bool[Array, ""] | bool = True
 ) -> tuple[Waves, Float[Array, "count terms c"]]:
-    """Draw simulators from the posterior, the first one of which is its mean.
+    """Draw simulators from the posterior; the first one is its mean where it is to be a `guess`.
 
     **Returns:** what `basis` needs, and the weights of its terms for each of them.
     """
@@ -183,7 +183,7 @@ def draw(
     )
     amplitudes = amplitudes.reshape(count, terms + n, components)
     # The mean is the function that the prior's mean, zero, is taken to.
-    amplitudes = amplitudes.at[0].set(0.0) * model.scale
+    amplitudes = amplitudes.at[0].multiply(jnp.where(guess, 0.0, 1.0)) * model.scale
     prior, noise = amplitudes[:, :terms], amplitudes[:, terms:]
     drawn = jnp.einsum("nt,jtc->jnc", _prior_basis(model, waves, model.x), prior)
     left = model.coefficients - drawn - jnp.exp(model.hyper.noise / 2) * noise
@@ -232,11 +232,10 @@ def _covariance(
 ) -> Float[Array, "n m"]:
     left, right = (x * jnp.exp(-hyper.lengths) for x in (a, b))
     inner = left @ right.T
-    square = jnp.sum(left**2, 1)[:, None] + jnp.sum(right**2, 1)[None] - 2 * inner
+    # Of differences: where a length scale is short, squares of points have no digits left for it.
+    square = jnp.sum((left[:, None] - right[None]) ** 2, axis=2)
     constant, linear, quadratic, rough = jnp.exp(hyper.parts)
-    return (
-        constant + linear * inner + quadratic * inner**2 + rough * matern(jnp.maximum(square, 0.0))
-    )
+    return constant + linear * inner + quadratic * inner**2 + rough * matern(square)
 
 
 def _noisy(
@@ -245,6 +244,22 @@ def _noisy(
     both = mask[:, None] & mask[None]
     value = jnp.where(both, _covariance(hyper, x, x), 0.0)
     return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
+
+
+def _factor(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the Cholesky factor, of as much more noise as 32 bits need for a finite one."""
+    fixed = jax.lax.stop_gradient(covariance)
+    size = jnp.trace(fixed) / len(fixed)
+
+    def more(noise: Array) -> Array:
+        return jnp.maximum(10 * noise, 1e-6 * size)
+
+    def bad(noise: Array) -> Array:
+        factor = jnp.linalg.cholesky(fixed + noise * jnp.eye(len(fixed)))
+        return ~jnp.isfinite(factor[-1, -1]) & (noise < size)
+
+    noise = jax.lax.while_loop(bad, more, jnp.zeros((), covariance.dtype))
+    return jnp.linalg.cholesky(covariance + noise * jnp.eye(len(covariance)))
 
 
 def _mean_length(width: int) -> float:
