@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import loop
-from verifai_jax.falsification.surrogates import TraceForm
+from verifai_jax.falsification.surrogates import Surrogate, TraceForm
 from verifai_jax.search import TraceSurrogate, TuRBO
 
 DIM = 6
@@ -80,17 +81,77 @@ def test_rows_without_a_trace_and_of_other_lengths_are_simulated_as_well():
     assert len(run.checkpoint["surrogate.rho"]) == (table["status"] == "ok").sum()
 
 
+def traced_oscillator(features, key):
+    """The same oscillator in JAX, with a signal that no formula speaks of."""
+
+    def step(state, force):
+        x, v = state
+        v += 0.1 * (force - 0.2 * v - x - 0.2 * x**3)
+        x += 0.1 * v
+        return (x, v), x
+
+    _, xs = jax.lax.scan(step, (0.0, 0.0), jnp.repeat(features["force"], 20))
+    xs = jnp.concatenate([jnp.zeros(1), xs])
+    return vj.Trace({"x": xs, "late": jnp.arange(121) > 60, "other": xs**2}, dt=0.1)
+
+
+def traced_problem(system=traced_oscillator, formula="always (late -> x < 2.1)"):
+    space = {"force": vj.Array(vj.Box(-1, 1), length=DIM)}
+    return vj.Problem("oscillator", space, system, formula)
+
+
+def test_compiled_systems_keep_the_monitored_signals():
+    u = np.random.default_rng(1).random((5, DIM)).astype(np.float32)
+    traces = Evaluator(traced_problem(), 4, keep_traces=True)(u).traces
+    assert traces is not None
+    for point, trace in zip(u, traces, strict=True):
+        expected = oscillator({"force": 2 * point - 1}).signals
+        assert set(trace.signals) == {"x", "late"}
+        np.testing.assert_allclose(trace.signals["x"], expected["x"], atol=1e-4)
+        np.testing.assert_array_equal(trace.signals["late"], expected["late"])
+    assert Evaluator(traced_problem(), 4)(u).traces is None
+
+
+@pytest.mark.thorough
+def test_a_system_that_jax_traces_is_learned_as_a_black_box_is():
+    run = vj.falsify(traced_problem(), SMALL, 64, batch=8, seed=1, progress=False, stop_after=1)
+    assert run.search.startswith("TraceSurrogate(")
+    assert len(run.table.counterexamples)
+    assert len(run.checkpoint["surrogate.rho"]) == len(run.table.all)
+    assert "s to search and simulate (" in str(run)
+    with pytest.raises(ValueError, match="learns from traces between rounds"):
+        vj.repeat(traced_problem(), SMALL, 64, seeds=2)
+
+
 @pytest.mark.thorough
 def test_where_no_traces_come_it_is_turbo():
-    def fall(features, key):
-        return vj.Trace({"x": features["force"]}, dt=1.0)
-
     space = {"force": vj.Array(vj.Box(-1, 1), length=DIM)}
-    traced = vj.Problem("fall", space, fall, "always x < 0.99")
-    run = vj.falsify(traced, "trace_surrogate", 8, batch=8, progress=False)
+    spec = {"low": "always x < 2.1", "high": "always x > -2.1"}
+    ranked = vj.Problem("ranked", space, traced_oscillator, spec, priority=["low", "high"])
+    run = vj.falsify(ranked, SMALL, 8, batch=8, progress=False)
     assert run.search.startswith("TuRBO(")
-    assert any(note.startswith("search turbo: only black boxes") for note in run.notes)
+    assert "search turbo: trace_surrogate knows no priority" in run.notes
     assert isinstance(SMALL.without_traces, TuRBO)
+
+
+def test_one_of_six_proposals_is_the_guess_of_the_model_whatever_the_batch(monkeypatch):
+    """Where all were, a model that is wrong was never left: half of the runs found nothing."""
+    for batch in (1, 2, 8):
+        guesses, count = [], 0
+
+        def propose(self, count, guess, batch=batch, guesses=guesses):
+            guesses.append((count, guess))
+            return np.full((count, DIM), 0.5, np.float32)
+
+        monkeypatch.setattr(Surrogate, "_proposals", propose)
+        surrogate = Surrogate(problem(), SMALL, jax.random.key(0))
+        surrogate.rho = np.ones(SMALL.initial, np.float32)
+        surrogate.traces = np.eye(SMALL.initial, dtype=np.float32)
+        for _ in range(64 // batch):
+            surrogate.improve(np.zeros((batch, DIM), np.float32))
+        count = sum(count for count, _ in guesses)
+        assert count == 48
+        assert sum(guess for _, guess in guesses) == 8
 
 
 class TestDefault:

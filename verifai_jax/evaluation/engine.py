@@ -156,6 +156,11 @@ class Engine:
         - `shared`: what all rows share, for inputs that have such.
         """
         rho, status, features, more = self._run("evaluate", rows, key, first, temperature, shared)
+        if "traces" in more:
+            each = [
+                jax.tree.map(lambda leaf, i=i: leaf[i], more["traces"]) for i in range(len(rho))
+            ]
+            more = {**more, "traces": each}
         holds = partial(self.holds, rows, key, first, shared)
         return Verdicts(rho, status, violations(rho, status, holds), features, **more)
 

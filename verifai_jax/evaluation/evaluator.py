@@ -40,7 +40,7 @@ class Evaluator:
       left out.
     - `steering`: what is computed for a search beside the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-    - `keep_traces`: whether verdicts come with traces; of a problem on the host, in this process.
+    - `keep_traces`: whether verdicts come with traces; in this process.
     """
 
     def __init__(
@@ -70,6 +70,7 @@ class Evaluator:
                 problem, precision, journal, steering=steering, keep_traces=keep_traces
             )
         else:
+            steering = steering._replace(trace=keep_traces)
             self.engine = engine_for(problem, batch, gradient, precision, clauses, steering)
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0

@@ -17,7 +17,7 @@ from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.differentiation import Derivative
 from verifai_jax.evaluation.inputs import Inputs
-from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.streaming_monitor import streaming_monitor
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_marks, trace_verdict
 from verifai_jax.mtl import hard, robustness, smooth
@@ -31,7 +31,7 @@ class Row(NamedTuple):
     rho: Float[Array, " formulas"]
     status: Int[Array, ""]
     features: PyTree
-    derivatives: dict[str, Array]
+    derivatives: dict[str, PyTree]
 
 
 class RowFunction(NamedTuple):
@@ -95,6 +95,7 @@ class RowFunction(NamedTuple):
         features, system = self.inputs.simulated(coordinates, row, shared)
         trace = system(features, key).hold()
         verdict = trace_verdict(self.problem, trace)
+        more = self.steering.all(self.problem, trace, features)
         dtype = coordinates.dtype
         if self.goals is None:
             semantics = smooth(temperature.astype(dtype))
@@ -103,7 +104,7 @@ class RowFunction(NamedTuple):
                 for formula in self.problem.formulas.values()
             ]
             least = self._guided(jnp.min(jnp.stack(smoothed)), trace, features)
-            return least, (*verdict, features, None, self._steering(trace, features))
+            return least, (*verdict, features, None, more)
         values = self.goals.values(trace, hard, self.problem.end)
         nearest = jnp.argmin(jnp.max(values, axis=1))
         # A goal that is broken is a failure, whatever the guide says.
@@ -111,7 +112,7 @@ class RowFunction(NamedTuple):
         told = self._guided(values[nearest], trace, features)
         # And clauses that there are not stay absent.
         told = jnp.where(broken | (values[nearest] <= 0.5 * ABSENT), values[nearest], told)
-        results = (*verdict, features, told, self._steering(trace, features))
+        results = (*verdict, features, told, more)
         if not self.gradient:
             return values[nearest], results
         semantics = smooth(temperature.astype(dtype))
@@ -146,10 +147,10 @@ class RowFunction(NamedTuple):
         features, system = self._simulated(row, shared)
         dtype = jnp.dtype(self.precision)
         traced = self.problem.behaviour is not None and self.inputs.streaming
-        if traced or self.steering.size:
+        if traced or self.steering != NOTHING:
             trace = system(features, key)
             rho, status = trace_verdict(self.problem, trace)
-            more = self._steering(trace, features)
+            more = self.steering.all(self.problem, trace, features)
             if traced:
                 more |= {"marks": trace_marks(self.problem, trace)}
             return Row(rho.astype(dtype), status, features, more)
@@ -162,11 +163,6 @@ class RowFunction(NamedTuple):
 
     def _simulated(self, row: PyTree, shared: PyTree) -> tuple[PyTree, Callable[..., Any]]:
         return self.inputs.simulated(self.coordinates(row, shared), row, shared)
-
-    def _steering(self, trace: Trace, features: PyTree) -> dict[str, Array]:
-        if not self.steering.size:
-            return {}
-        return {"steering": self.steering.values(self.problem, trace, features)}
 
     def _guided(self, values: Array, trace: Trace, features: PyTree) -> Array:
         """Return robustness, or clauses, with the guide's share, for their derivatives."""

@@ -1,4 +1,4 @@
-"""The guide's term and the outcome of a simulation: for a search, beside the robustness.
+"""The guide's term, the outcome and the trace of a simulation, for a search.
 
     steering = Steering(guide=True, outcome=True)
     steering.values(problem, trace, features)           # [size], traced by JAX
@@ -25,15 +25,30 @@ class Steering(NamedTuple):
 
     - `guide`: the value of the guide's term.
     - `outcome`: what happened, of the form that `core.outcomes` says.
+    - `trace`: the monitored signals, of a system that JAX traces.
     """
 
     guide: bool = False
     outcome: bool = False
+    trace: bool = False
 
     @property
     def size(self) -> int:
-        """Numbers of a simulation; 0 where nothing is wanted."""
+        """Numbers of a simulation, without its trace; 0 where none are wanted."""
         return int(self.guide) + OUTCOME * int(self.outcome)
+
+    def all(
+        self, problem: Problem, trace: Trace, features: Mapping[str, PyTree]
+    ) -> dict[str, PyTree]:
+        """Return whatever is wanted of one simulation, as `Verdicts` names it; traced by JAX."""
+        wanted: dict[str, PyTree] = {}
+        if self.size:
+            wanted["steering"] = self.values(problem, trace, features)
+        if self.trace:
+            trace = trace.hold()
+            signals = {name: as_array(trace.signals[name]) for name in problem.monitored}
+            wanted["traces"] = Trace(signals, trace.dt)
+        return wanted
 
     def values(
         self, problem: Problem, trace: Trace, features: Mapping[str, PyTree]

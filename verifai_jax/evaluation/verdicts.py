@@ -38,8 +38,7 @@ class Verdicts(NamedTuple):
       JAX traces.
     - `marks`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
     - `steering`: what a search is told beside (`evaluation.steering`); None unless wanted.
-    - `traces`: the traces themselves, None where there is none; only of a host engine that keeps
-      them.
+    - `traces`: the traces themselves, None where there is none; None unless they are kept.
     """
 
     rho: Float[np.ndarray, "n formulas"]

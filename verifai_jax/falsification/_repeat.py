@@ -35,7 +35,7 @@ from verifai_jax.falsification.validation import (
     usual_batch,
 )
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Observations, Search
+from verifai_jax.search import Observations, Search, TraceSurrogate
 
 SIMULATIONS_A_CALL = 512
 """Of each seed between two looks at who has found a failure."""
@@ -163,8 +163,9 @@ def repeat(
     **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
     of the violations are not claimed.
 
-    **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`), a priority or
-    a guide, which are dealt with between rounds: use `falsify` with one seed after the other.
+    **Raises:** as `falsify`; `ValueError` for a black box, a constraint (`where=`), a priority, a
+    guide or the search `trace_surrogate`, which are dealt with between rounds: use `falsify` with
+    one seed after the other.
     """
     check_options(budget, 1 if batch is None else batch, 0, None, None)
     search = check_search(problem, search)
@@ -186,6 +187,11 @@ def repeat(
                 f"problem {problem.name!r} has {what}, which is dealt with between rounds; use "
                 "falsify with one seed after the other"
             )
+    if isinstance(search, TraceSurrogate):
+        raise ValueError(
+            f"search {search!r} learns from traces between rounds; use falsify with one seed after "
+            "the other"
+        )
     in_precision(precision)
     traced.check()
     search, _ = adapt_search(traced, search)

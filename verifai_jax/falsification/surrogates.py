@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.programs import Slot
@@ -45,6 +45,9 @@ RATE = (0.1, 0.01)
 """First and last step of a descent, in cubes."""
 TEMPERATURES = (0.3, 0.02)
 """First and last temperature of the smooth robustness, without unit."""
+MEANS = 6
+"""Of so many proposals one is the model's own guess, the mean of its posterior; where all are, a
+model that is wrong is not left."""
 APART = 1e-3
 """Distance, greatest over the coordinates, below which two points are the same."""
 
@@ -156,14 +159,16 @@ class Surrogate:
 
     def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
         """Replace the model's share of the points that the search proposes."""
-        self.round += 1
-        count = round(self.search.share * self.round * len(points)) - round(
-            self.search.share * (self.round - 1) * len(points)
+        before, after = (
+            round(self.search.share * number * len(points))
+            for number in (self.round, self.round + 1)
         )
+        self.round += 1
+        count, guess = after - before, after // MEANS > before // MEANS
         enough = len(self.rho) >= self.search.initial and self.cube.dim > 0
         if not enough or count == 0 or np.ptp(self.traces, axis=0).max() == 0:
             return points
-        proposed = self._proposals(count)
+        proposed = self._proposals(count, guess)
         return np.concatenate([proposed, np.asarray(points)[len(proposed) :]])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -226,8 +231,11 @@ class Surrogate:
         kept = np.setdiff1d(np.arange(len(self.rho)), spare)
         self.u, self.traces, self.rho = self.u[kept], self.traces[kept], self.rho[kept]
 
-    def _proposals(self, count: int) -> Float[np.ndarray, "m d"]:
-        """Return so many points, or fewer where there are no more that differ."""
+    def _proposals(self, count: int, guess: bool) -> Float[np.ndarray, "m d"]:
+        """Return so many points, or fewer where there are no more that differ.
+
+        - `guess`: whether the first one is of the posterior's mean.
+        """
         form = self.form
         assert form is not None
         # Signals count alike, whatever their unit.
@@ -249,7 +257,7 @@ class Surrogate:
         key = jax.random.fold_in(self.key, np.uint32(self.round))
         u, value = self._programs.descend(
             form, count, self.hyper, x, mask, coefficients, mean * scale, components * scale,
-            parents, key,
+            parents, key, np.bool_(guess),
         )  # fmt: skip
         return self._distinct(np.asarray(u), np.asarray(value))
 
@@ -290,12 +298,13 @@ class Descents:
         components: Float[Array, "c values"],
         parents: Float[Array, "parents d"],
         key: Key[Array, ""],
+        guess: Bool[Array, ""],
     ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
         """Return where the descents on `count` drawn simulators end, and the value there."""
         cube = self.cube
         model = models.condition(hyper, x, mask, coefficients, mean, components)
         drawing, placing = jax.random.split(key)
-        waves, weights = models.draw(model, drawing, count)
+        waves, weights = models.draw(model, drawing, count, guess)
         pool = _pool(placing, parents, cube)
 
         def values(

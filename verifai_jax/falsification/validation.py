@@ -202,8 +202,6 @@ def adapt_search(
 
 def _why_no_traces(problem: Problem, executor: Executor | None) -> str | None:
     """Return why a search cannot learn from the traces of this problem; None where it can."""
-    if not problem.black_box:
-        return "only black boxes keep the traces that trace_surrogate learns from"
     if executor is not None:
         return "workers of an executor send no traces, which trace_surrogate learns from"
     if problem.rulebook is not None:

@@ -20,7 +20,7 @@ from verifai_jax.search.turbo import TuRBO, TuRBOState
 
 @dataclass(frozen=True)
 class TraceSurrogate(Search[TuRBOState]):
-    """Model of the traces, monitored and descended on; the real system decides. For black boxes.
+    """Model of the traces, monitored and descended on; the real system decides.
 
     **Arguments:**
 
