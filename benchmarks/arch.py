@@ -13,8 +13,8 @@ failures are confirmed by replays in double precision, at half and at a quarter 
 tool: the lowest that could be read for these models, which leaves out tools whose numbers for each
 requirement could not (FReaK of 2024 reports fewer simulations than all participants of 2022 on most
 of them). `trace_surrogate` runs one seed after the other, in batches of two, and only its claimed
-failures count. Other solvers, other seeds, partly freer inputs. SB's networks carry no licence: they
-are read from a folder (`specs/arch/lstm.py`).
+failures count. Other solvers, other seeds, partly freer inputs. SB's networks carry no licence:
+they are read from a folder (`specs/arch/lstm.py`).
 """
 
 import argparse
