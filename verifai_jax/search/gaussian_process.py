@@ -156,19 +156,9 @@ class GaussianProcess:
 
     def condition(self, hyper: Hyper, data: TrainingData) -> Posterior:
         """Condition the process on these observations."""
-        noisy = self._noisy(hyper, data.x, data.mask)
         y = _masked(data)
-
-        def bad(carry: tuple[Array, Array]) -> Array:
-            return ~jnp.isfinite(carry[0][-1, -1]) & (carry[1] < 1)
-
-        def more(carry: tuple[Array, Array]) -> tuple[Array, Array]:
-            jitter = jnp.maximum(10 * carry[1], 1e-6)
-            extra = jitter * jnp.exp(hyper.variance) * jnp.eye(len(y), dtype=y.dtype)
-            return jnp.linalg.cholesky(noisy + extra), jitter
-
-        factor = jnp.linalg.cholesky(noisy)
-        factor, _ = jax.lax.while_loop(bad, more, (factor, jnp.zeros((), y.dtype)))
+        noisy = self._noisy(hyper, data.x, data.mask)
+        factor, _ = finite_factor(noisy, jnp.exp(hyper.variance))
         weights = cho_solve((factor, True), y)
         return Posterior(hyper, data.x, data.mask, y, factor, weights)
 
@@ -249,6 +239,30 @@ class GaussianProcess:
         """Return indices of the quantities and of the codes."""
         codes = np.array(self.unordered, bool)
         return np.flatnonzero(~codes), np.flatnonzero(codes)
+
+
+def finite_factor(
+    covariance: Float[Array, "n n"], variance: Float[Array, ""]
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """Return the Cholesky factor of a covariance with as much noise as makes it finite, and that.
+
+    - `variance`: of a value; the noise is none at first, then a millionth of it, and ten times more
+      each time.
+    """
+
+    def extra(jitter: Array) -> Array:
+        return jitter * variance * jnp.eye(len(covariance), dtype=covariance.dtype)
+
+    def bad(carry: tuple[Array, Array]) -> Array:
+        return ~jnp.isfinite(carry[0][-1, -1]) & (carry[1] < 1)
+
+    def more(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        jitter = jnp.maximum(10 * carry[1], 1e-6)
+        return jnp.linalg.cholesky(covariance + extra(jitter)), jitter
+
+    start = (jnp.linalg.cholesky(covariance), jnp.zeros((), covariance.dtype))
+    factor, jitter = jax.lax.while_loop(bad, more, start)
+    return factor, extra(jitter)
 
 
 def _masked(data: TrainingData) -> Float[Array, " n"]:

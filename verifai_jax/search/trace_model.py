@@ -23,7 +23,7 @@ from jax.scipy.linalg import cho_solve
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.search.gaussian_process import SMALLEST, matern
+from verifai_jax.search.gaussian_process import SMALLEST, finite_factor, matern
 
 COMPONENTS = 24
 """Principal components at most."""
@@ -111,7 +111,11 @@ def fit(
     count = jnp.maximum(jnp.sum(mask), 1)
 
     def loss(hyper: TraceHyper) -> Float[Array, ""]:
-        factor = _factor(_noisy(hyper, x, mask))
+        noisy = _noisy(hyper, x, mask)
+        # The noise that a finite factor needs has no derivative.
+        fixed = jax.lax.stop_gradient(noisy)
+        _, noise = finite_factor(fixed, jnp.trace(fixed) / len(fixed))
+        factor = jnp.linalg.cholesky(noisy + noise)
         half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
         square = jnp.sum(half**2, axis=0) / count
         inside = jnp.log(jnp.maximum(square, 1e-12)) * count / 2
@@ -152,7 +156,8 @@ def condition(
     components: Float[Array, "c samples"],
 ) -> TraceModel:
     """Return the model of these rows."""
-    factor = _factor(_noisy(hyper, x, mask))
+    noisy = _noisy(hyper, x, mask)
+    factor, _ = finite_factor(noisy, jnp.trace(noisy) / len(noisy))
     half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
     scale = jnp.sqrt(jnp.sum(half**2, axis=0) / jnp.maximum(jnp.sum(mask), 1))
     return TraceModel(hyper, x, mask, coefficients, factor, scale, mean, components)
@@ -244,22 +249,6 @@ def _noisy(
     both = mask[:, None] & mask[None]
     value = jnp.where(both, _covariance(hyper, x, x), 0.0)
     return value + jnp.diag(jnp.where(mask, jnp.exp(hyper.noise), 1.0))
-
-
-def _factor(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return the Cholesky factor, of as much more noise as 32 bits need for a finite one."""
-    fixed = jax.lax.stop_gradient(covariance)
-    size = jnp.trace(fixed) / len(fixed)
-
-    def more(noise: Array) -> Array:
-        return jnp.maximum(10 * noise, 1e-6 * size)
-
-    def bad(noise: Array) -> Array:
-        factor = jnp.linalg.cholesky(fixed + noise * jnp.eye(len(fixed)))
-        return ~jnp.isfinite(factor[-1, -1]) & (noise < size)
-
-    noise = jax.lax.while_loop(bad, more, jnp.zeros((), covariance.dtype))
-    return jnp.linalg.cholesky(covariance + noise * jnp.eye(len(covariance)))
 
 
 def _mean_length(width: int) -> float:
