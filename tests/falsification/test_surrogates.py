@@ -9,7 +9,7 @@ import verifai_jax as vj
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import loop
-from verifai_jax.falsification.surrogates import Surrogate, TraceForm
+from verifai_jax.falsification.surrogates import Surrogate, TraceForm, _padded
 from verifai_jax.search import TraceSurrogate, TuRBO
 
 DIM = 6
@@ -211,6 +211,14 @@ def test_traces_in_the_form_of_the_model():
     again = form.trace(jnp.asarray(form.flat(vj.Trace({"x": smooth}, dt=0.1))))
     assert again.length == 1001
     np.testing.assert_allclose(again.signals["x"], smooth, atol=1e-3)
+
+
+@pytest.mark.parametrize("capacity", [16, 512, 5000])
+def test_programs_are_compiled_for_few_numbers_of_rows_whatever_the_capacity(capacity):
+    sizes = [_padded(rows, capacity) for rows in range(1, capacity + 1)]
+    assert all(size >= rows for rows, size in enumerate(sizes, 1))
+    assert max(sizes) == capacity
+    assert len(set(sizes)) <= 5
 
 
 @pytest.mark.parametrize("vectorised", [False, True])

@@ -55,6 +55,37 @@ def test_short_lengths_and_near_rows_leave_a_finite_model_that_can_be_fitted():
     assert not np.array_equal(fitted.lengths, hyper.lengths)
 
 
+def test_the_fit_follows_the_derivative_of_the_evidence(data):
+    """Of the plain formula, by autodiff in double precision."""
+    x, coefficients, mask = data
+    hyper, worth = models.first_hyper(WIDTH), jnp.array([1.0, 0.3])
+
+    def surprise(hyper):
+        count = jnp.float32(ROWS)
+        return models._surprise(models._noisy(hyper, x, mask), coefficients, worth, count)
+
+    def plain(hyper):
+        rows = x.astype(jnp.float64)[:ROWS] / jnp.exp(hyper.lengths)
+        inner = rows @ rows.T
+        square = jnp.sum((rows[:, None] - rows[None]) ** 2, axis=2)
+        r = jnp.sqrt(5 * jnp.where(square > 0, square, 1.0)) * (square > 0)
+        constant, linear, quadratic, rough = jnp.exp(hyper.parts)
+        known = constant + linear * inner + quadratic * inner**2
+        known += rough * (1 + r + r**2 / 3) * jnp.exp(-r) + jnp.exp(hyper.noise) * jnp.eye(ROWS)
+        y = coefficients.astype(jnp.float64)[:ROWS]
+        variance = jnp.sum(y * jnp.linalg.solve(known, y), axis=0) / ROWS
+        size = jnp.linalg.slogdet(known)[1]
+        return jnp.sum(worth * (ROWS * jnp.log(variance) + size)) / 2
+
+    value, slope = jax.value_and_grad(surprise)(hyper)
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), hyper)
+        exact, exact_slope = jax.value_and_grad(plain)(double)
+    np.testing.assert_allclose(value, exact, rtol=1e-4)
+    for got, wanted in zip(slope, exact_slope, strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=2e-3, atol=2e-3)
+
+
 @pytest.mark.thorough
 def test_draws_have_the_moments_of_the_exact_posterior(data):
     x, coefficients, mask = data

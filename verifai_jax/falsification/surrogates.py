@@ -39,8 +39,8 @@ POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
 PARENTS = 8
 """Best rows around which half of them are."""
-SIZES = (64, 256, 1024)
-"""Numbers of rows that programs are compiled for; fewer rows are padded."""
+LEAST_ROWS = 64
+"""Least number of rows that programs are compiled for; fewer are padded, more to four times it."""
 RATE = (0.1, 0.01)
 """First and last step of a descent, in cubes."""
 TEMPERATURES = (0.3, 0.02)
@@ -244,7 +244,7 @@ class Surrogate:
         scale = np.repeat(np.where(scale > 0, scale, 1.0), len(form.places)).astype(np.float32)
         mean, components = models.principal_components(self.traces / scale)
         coefficients = ((self.traces / scale - mean) @ components.T).astype(np.float32)
-        size = next(size for size in SIZES if size >= len(self.rho))
+        size = _padded(len(self.rho), self.search.capacity)
         missing = size - len(self.rho)
         coefficients = np.pad(coefficients, ((0, missing), (0, 0)))
         x = np.pad(np.asarray(_embed(self.u, self.cube)), ((0, missing), (0, 0)))
@@ -389,6 +389,14 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
         else:
             columns.append(u[:, i : i + 1] - 0.5)
     return jnp.concatenate(columns, axis=1)
+
+
+def _padded(rows: int, capacity: int) -> int:
+    """Return the number of rows of the program for so many; each is compiled once."""
+    size = LEAST_ROWS
+    while size < rows:
+        size *= 4
+    return min(size, capacity)
 
 
 def _pool(
