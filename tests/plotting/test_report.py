@@ -1,6 +1,7 @@
 """Pictures: that they are drawn at all for odd tables, and what they say of known ones."""
 
 import base64
+from itertools import combinations
 
 import jax.numpy as jnp
 import pytest
@@ -10,6 +11,7 @@ import verifai_jax as vj
 from verifai_jax.plotting import plot_features, plot_replay, write_run_pictures
 from verifai_jax.plotting.replay import decisive_instant
 from verifai_jax.plotting.scatter import distinguishing_features
+from verifai_jax.plotting.style import BOUND, SAFE
 
 
 def system(features, key):
@@ -88,6 +90,93 @@ def test_a_replay_shows_inputs_and_the_bounds_of_all_formulas(tmp_path):
         replay.plot(signals=["air.wnd"])
 
 
+def ramp(features, key):
+    clock = jnp.arange(9) * 0.25
+    y = features["a"] * clock
+    return vj.Trace(
+        {"y": y, "z": clock + 0.1, "hit": 0 * y, "pos": jnp.stack([y, -y], -1), "fine": y < 1,
+         "a_signal.with_a.long_name": 1e6 * y, "gear": jnp.where(clock > 1, 2.0, 1.0)},
+        dt=0.25,
+    )  # fmt: skip
+
+
+@pytest.mark.thorough
+def test_the_bounds_of_all_formulas_are_solved_for_their_signals(tmp_path):
+    specs = {
+        "near": "always abs(2 * y - 40) <= 39",  # y from 0.5 to 39.5, the far end is not drawn
+        "angle": "always y <= pi / 4 + 0",
+        "two": "always y + 0.1 <= z",
+        "round": "always norm(pos) <= 9",
+        "never": "always hit < 0.5",
+        "fine": "always fine",
+        "late": "always (gear == 2 -> y > -1)",
+        "big": "eventually a_signal.with_a.long_name >= 1",
+    }
+    problem = vj.Problem("p", {"a": vj.Box(2, 3)}, ramp, specs)
+    replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
+    figure = replay.plot()
+    panels = dict(zip([a.get_ylabel() for a in figure.axes], figure.axes, strict=True))
+    assert list(panels) == [
+        "y", "z", "pos", "hit", "fine", "gear", "a_signal.with_a.\nlong_name",
+    ]  # fmt: skip
+
+    def bounds(name):
+        dashed = [line for line in panels[name].lines if line.get_linestyle() == "--"]
+        return [jnp.asarray(line.get_ydata()) for line in dashed]
+
+    def named(name):
+        return {t.get_text(): t.get_color() for t in panels[name].texts if "=" in t.get_text()}
+
+    y, clock = replay.trace["y"], replay.trace.clock()
+    levels = sorted(float(each[0]) for each in bounds("y") if len(each) == 2)
+    assert levels == pytest.approx([-1, 0.5, jnp.pi / 4])
+    assert any(len(each) == 9 and jnp.allclose(each, clock) for each in bounds("y"))
+    assert jnp.allclose(bounds("z")[0], y + 0.1)
+    assert [float(each[0]) for each in bounds("hit")] == [0.5]  # far from 0, but hit is flat anyway
+    assert named("pos") == {"norm(pos) <= 9": SAFE}
+    assert not bounds("pos")
+    assert [float(each[0]) for each in bounds("gear")] == [2.0]
+    # What may be false without a failure is neither red nor shaded: conditions, eventualities.
+    assert named("gear") == {"gear == 2": BOUND}
+    assert not panels["gear"].collections
+    assert not panels["a_signal.with_a.\nlong_name"].collections
+    assert panels["fine"].collections
+    assert panels["z"].collections
+    # No two texts overlap, at either size; above the axis there is no power of ten.
+    for size in ((8, 11), (5, 7)):
+        figure.set_size_inches(*size)
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            assert not axes.yaxis.get_offset_text().get_text()
+        names = [axes.yaxis.label.get_window_extent() for axes in figure.axes]
+        assert not any(a.overlaps(b) for a, b in combinations(names, 2))
+    with pytest.raises(TypeError, match=r"signals is a list of names, such as \['y'\]; got 'y'"):
+        replay.plot(signals="y")
+
+
+def test_many_monitored_signals_leave_room_for_the_inputs():
+    space = {"air": vj.Struct({"wind": vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)})}
+    spec = "always (s0 + s1 + s2 + s3 + s4 + s5 + s6 < 900)"
+    replay = vj.falsify(vj.Problem("p", space, pushed, spec), "uniform", 4, batch=4).replay(0)
+    figure = replay.plot()
+    assert figure.axes[-1].get_ylabel() == "air.wind (input)"
+    assert "and 2 more, not drawn: x, y" in figure.axes[-1].get_xlabel()
+
+
+def test_a_simulation_without_a_verdict_has_no_robustness_in_its_title():
+    def explodes(features, key):
+        return vj.Trace({"x": jnp.array([1.0, 2e6, jnp.inf]) * features["a"]}, dt=1.0)
+
+    problem = vj.Problem("p", {"a": vj.Box(2, 3)}, explodes, "always x < 1")
+    replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
+    assert "no verdict (nonfinite) at a=" in replay.plot().get_suptitle()
+
+
+def test_draw_is_looked_at_before_anything_is_simulated():
+    with pytest.raises(ValueError, match=r"draw is called with \(axes, trace, sample, fe"):
+        vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1", draw=lambda axes, trace: None)
+
+
 @pytest.mark.thorough
 def test_animation(tmp_path):
     drawn = []
@@ -112,6 +201,9 @@ def test_animation(tmp_path):
     assert len(shown) == 4
     seconds = float(replay.trace.clock()[-1])
     assert sum(shown) == 40 * (round(25 * seconds) - 1) + 1500
+    with pytest.raises(ValueError, match=r"an animation is a GIF.*; got .*it\.mp4"):
+        replay.animate(tmp_path / "it.mp4")
+    assert not (tmp_path / "it.mp4").exists()
     silent = vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1")
     with pytest.raises(ValueError, match="cannot be animated"):
         vj.falsify(silent, "uniform", 4, batch=4).replay(0).animate()

@@ -415,7 +415,9 @@ def _bound_only(
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = _monte_carlo_answer(counts, plan)
     answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}
-    if limit_state.failures == 0:
+    if not np.isfinite(limit_state.least):
+        pass  # No simulation had a verdict, of which there is a note.
+    elif limit_state.failures == 0:
         answer.notes.insert(0, why)
     elif answer.probability is None:
         answer.notes.insert(

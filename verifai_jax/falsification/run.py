@@ -133,8 +133,8 @@ class Run:
         number = self.table.counts.best
         if number is None:
             raise ValueError(
-                f"run of {self.name!r} has no simulation with a verdict: {self.simulations} "
-                f"simulated, {self.table.counts.without_verdict} of them failed"
+                f"run of {self.name!r} has no simulation with a verdict: "
+                f"none of {self.simulations} ended properly"
             )
         return self.table.row(number)
 

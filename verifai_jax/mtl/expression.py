@@ -235,7 +235,7 @@ class Arithmetic(Expression):
         if least is not None and (n != 1 if least == 1 else n < least):
             wanted = "one argument" if least == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
-        values = [_constant_value(argument) for argument in self.arguments]
+        values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:
             raise ValueError(f"a division by zero: {self}")
         if None not in values and self.name in _CONSTANT:
@@ -275,7 +275,7 @@ class Arithmetic(Expression):
         return f"({text})" if level < outer else text
 
 
-def _constant_value(e: Expression) -> float | None:
+def constant_value(e: Expression) -> float | None:
     """Return the value of an expression without signals; None for one with signals."""
     return e.value if isinstance(e, Number) else e.__dict__.get("_constant")
 

@@ -27,7 +27,11 @@ class Animation:
     gif: bytes = field(repr=False)
 
     def save(self, path: str | Path) -> Path:
-        """Write the file, and the folders that it needs; returns the path."""
+        """Write the file, and the folders that it needs; returns the path.
+
+        **Raises:** `ValueError` for a path that does not end in `.gif`.
+        """
+        _check_gif(path)
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(self.gif)
@@ -48,9 +52,10 @@ def animate(replay: Replay, path: str | Path | None = None) -> Animation:
     - `replay`: what `run.replay` returned.
     - `path`: of a file to write too; folders are made.
 
-    **Raises:** `ValueError` for any other problem without `draw`; `mujoco_scene.NoRenderer` where
-    MuJoCo cannot draw.
+    **Raises:** `ValueError` for any other problem without `draw`, and for a path that does not end
+    in `.gif`; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.
     """
+    _check_gif(path)
     draw = replay.problem.draw
     if draw is not None:
         animation = Animation(_drawn(replay, draw))
@@ -66,6 +71,11 @@ def animate(replay: Replay, path: str | Path | None = None) -> Animation:
     if path is not None:
         animation.save(path)
     return animation
+
+
+def _check_gif(path: str | Path | None) -> None:
+    if path is not None and Path(path).suffix.lower() != ".gif":
+        raise ValueError(f"an animation is a GIF, a file with the ending .gif; got {str(path)!r}")
 
 
 def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:

@@ -1,28 +1,48 @@
 """One simulation: its signals, the bounds they must keep, and the instant that decided."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Shaped
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.trace import Trace
+from verifai_jax.core.text import shorten
+from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.mtl import Formula, explain, robustness_signal
+from verifai_jax.mtl import Expression, Formula, explain, nnf, robustness_signal
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
-from verifai_jax.mtl.formula import Predicate
+from verifai_jax.mtl.expression import (
+    Arithmetic,
+    Component,
+    Number,
+    Signal,
+    constant_value,
+    expression,
+)
+from verifai_jax.mtl.formula import Atom, Predicate
 from verifai_jax.mtl.setting import seconds
 from verifai_jax.plotting.style import BOUND, FAILING, INPUT, SAFE, new_figure, show_or_save, tidy
 
 MOST_PANELS = 6
 """Signals drawn at most, unless more are monitored."""
+MOST_INPUTS = 3
+"""Features that are functions of time drawn at least, however many signals are monitored."""
 MOST_BOUNDS = 4
 """Predicates named above a panel at most."""
+WIDEST_NAME = 18
+"""Characters of a signal's name in one line."""
+LONGEST_PREDICATE = 100
+"""Characters of a predicate above a panel."""
+LONGEST_FORMULA = 240
+"""Characters of the formula in the title."""
+LONGEST_TITLE = 500
+"""Characters of the title."""
 
 
 def plot_replay(
@@ -44,6 +64,8 @@ def plot_replay(
     **Raises:** `UnknownNameError` for a signal that there is not; `ValueError` for none.
     """
     trace, formulas = replay.trace, replay.problem.formulas
+    if isinstance(signals, str):
+        raise TypeError(f"signals is a list of names, such as [{signals!r}]; got {signals!r}")
     curves = {name: np.asarray(values) for name, values in trace.signals.items()}
     inputs = {n: values for n, values in _input_signals(replay).items() if n not in curves}
     monitored = list(dict.fromkeys(s for f in formulas.values() for s in f.signals()))
@@ -55,10 +77,12 @@ def plot_replay(
         check_names("signal", signals, ordered)
         if not signals:
             raise ValueError("signals names what is drawn; got none")
-    shown = list(signals or ordered[: max(MOST_PANELS, len(monitored))])
+    needed = len(monitored) + min(len(inputs), MOST_INPUTS)
+    shown = list(signals or ordered[: max(MOST_PANELS, needed)])
     name = replay.worst
     clock = seconds(trace)
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
+    to_blame = _predicates_to_blame(replay)
 
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
@@ -68,21 +92,37 @@ def plot_replay(
         if signal in monitored or signal in inputs:
             color, width = (BOUND if signal in monitored else INPUT), 1.6
         axes.plot(clock, values, color=color, linewidth=width)
-        axes.set_ylabel(f"{signal} (input)" if signal in inputs else signal)
+        _name_signal(axes, f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
-        bounds = dict(pair for f in formulas.values() for pair in signal_bounds(f, signal))
-        for predicate, limits in bounds.items():
-            _draw_bounds(axes, clock, values, limits, _margin(replay, predicate))
-        _name_bounds(axes, {str(b): float(_margin(replay, b).min()) for b in bounds})
+        # A power of ten above the axis, as matplotlib writes it, would cover the predicates there.
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.10g}".replace("-", "\u2212"))
+        named = {}
+        for predicate, limits in _bounds(replay, signal, shown).items():
+            margin = np.asarray(robustness_signal(predicate, trace, end=replay.problem.end))
+            fails = margin < 0
+            blamed = predicate in to_blame
+            _draw_limits(axes, trace, values, limits)
+            if blamed:
+                _shade(axes, clock, fails)
+            color = (FAILING if blamed else BOUND) if fails.any() else SAFE
+            named[str(predicate)] = (color, float(margin.min()))
+        _name_bounds(axes, named)
         if decisive is not None:
             axes.axvline(clock[decisive[1]], color=FAILING, linewidth=1, linestyle=":")
     if decisive is not None and decisive[0] in shown:
         _mark(panels[shown.index(decisive[0])], trace, *decisive)
-    panels[-1].set_xlabel("time [s]" + _left_out([s for s in ordered if s not in shown]))
-    verdict = "violated" if replay.violated else replay.status.name.lower()
+    left_out = _left_out([signal for signal in ordered if signal not in shown])
+    panels[-1].set_xlabel("time [s]" + left_out, wrap=True)
+    worst = f"robustness {replay.rho[name]:.4g}"
+    verdict = f"{worst} ({'violated' if replay.violated else 'ok'})"
+    if replay.status != Status.OK:
+        verdict = f"no verdict ({replay.status.name.lower()})"
     where = replay.describe_features()
     figure.suptitle(
-        f"{formulas[name]}\nrobustness {replay.rho[name]:.4g} ({verdict}) at {where}"[:400],
+        shorten(
+            f"{shorten(str(formulas[name]), LONGEST_FORMULA)}\n{verdict} at {where}",
+            LONGEST_TITLE,
+        ),
         fontsize=9,
         color=FAILING if replay.violated else BOUND,
         wrap=True,
@@ -131,48 +171,125 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
-def signal_bounds(formula: Formula, signal: str) -> list[tuple[Predicate, list[float]]]:
-    """Return predicates that compare this signal, or its absolute value, with a number."""
+def signal_bounds(formula: Formula, signal: str) -> list[tuple[Formula, list[Expression]]]:
+    """Return what predicates compare this signal with, as far as they can be solved for it.
+
+    `abs(x - 1) <= 0.2` bounds x by 1.2 and 0.8, `y >= 2 * x` bounds y by 2 * x.
+    """
     bounds = []
-    for part in dict.fromkeys(formula.subformulas()):
-        if not isinstance(part, Predicate):
-            continue
-        for inner, limit in ((part.left, part.right), (part.right, part.left)):
-            if not isinstance(limit, Number):
-                continue
-            limits = [limit.value]
-            if isinstance(inner, Arithmetic) and inner.name == "abs":
-                inner, limits = inner.arguments[0], [limit.value, -limit.value]
-            if isinstance(inner, Component):
-                inner = inner.vector
-            if inner == Signal(signal):
-                bounds.append((part, limits))
+    for part in _comparisons(formula):
+        sides = (part.expression, Number(0)) if isinstance(part, Atom) else part.terms()
+        left, right = map(expression, sides)
+        for inner, limit in ((left, right), (right, left)):
+            if signal in inner.signals() and signal not in limit.signals():
+                limits = _solved(inner, signal, limit)
+                if limits:
+                    bounds.append((part, limits))
     return bounds
 
 
-def _margin(replay: Replay, predicate: Predicate) -> Float[np.ndarray, " time"]:
-    """Return the robustness of a predicate at each sample."""
-    return np.asarray(robustness_signal(predicate, replay.trace, end=replay.problem.end))
+def _comparisons(formula: Formula) -> list[Predicate | Atom]:
+    """Return the predicates of a formula, each once."""
+    parts = dict.fromkeys(formula.subformulas())
+    return [part for part in parts if isinstance(part, Predicate | Atom)]
 
 
-def _draw_bounds(
-    axes: Axes,
-    clock: Float[np.ndarray, " t"],
-    values: Float[np.ndarray, "t *vector"],
-    limits: list[float],
-    margin: Float[np.ndarray, " t"],
+def _solved(inner: Expression, signal: str, limit: Expression) -> list[Expression]:
+    """Return the values of the signal at which `inner` is `limit`; none where it is not linear.
+
+    An absolute value has two.
+    """
+    limits = [limit]
+    try:
+        while isinstance(inner, Arithmetic):
+            if inner.name == "abs":
+                inner, limits = inner.arguments[0], [*limits, *(-each for each in limits)]
+                continue
+            if inner.name == "neg":
+                inner, limits = inner.arguments[0], [-each for each in limits]
+                continue
+            if inner.name not in ("+", "-", "*", "/"):
+                return []
+            left, right = inner.arguments
+            first = signal in left.signals()
+            if first and signal in right.signals():
+                return []
+            other = right if first else left
+            if inner.name in ("*", "/") and constant_value(other) is None:
+                return []
+            if inner.name == "+":
+                limits = [each - other for each in limits]
+            elif inner.name == "-":
+                limits = [each + other if first else other - each for each in limits]
+            elif inner.name == "*":
+                limits = [each / other for each in limits]
+            else:
+                limits = [each * other if first else other / each for each in limits]
+            inner = left if first else right
+    except ValueError:  # a division by zero
+        return []
+    if isinstance(inner, Component):
+        inner = inner.vector
+    return limits if inner == Signal(signal) else []
+
+
+def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, list[Expression]]:
+    """Return the predicates of all formulas that belong to a panel, with their limits in it.
+
+    One that cannot be solved for a signal is named above the first of its signals that is shown.
+    """
+    bounds: dict[Formula, list[Expression]] = {}
+    for formula in replay.problem.formulas.values():
+        for part in _comparisons(formula):
+            drawn = [name for name in shown if name in part.signals()]
+            if any(signal_bounds(part, name) for name in drawn):
+                bounds |= dict(signal_bounds(part, signal))
+            elif drawn and drawn[0] == signal:
+                bounds[part] = []
+    return bounds
+
+
+def _predicates_to_blame(replay: Replay) -> set[Formula]:
+    """Return the predicates of violated formulas that should have held.
+
+    Not those of an implication's condition, nor of formulas that are kept without them.
+    """
+    blamed = set()
+    for name, formula in replay.problem.formulas.items():
+        rho = replay.rho[name]
+        if rho < 0 or (rho == 0 and replay.violated):
+            blamed |= set(_comparisons(nnf(formula)))
+    return blamed
+
+
+def _draw_limits(
+    axes: Axes, trace: Trace, values: Shaped[np.ndarray, "t *vector"], limits: list[Expression]
 ) -> None:
-    """Draw the bounds of a predicate, and shade where it fails."""
-    reach = max(float(np.nanmax(np.abs(values), initial=0.0)), 1e-9)
+    """Draw what a predicate compares a signal with, where that is not far from it."""
+    finite = values[np.isfinite(values)].astype(float)
+    if not finite.size or values.dtype == bool:
+        return
+    reach = max(float(np.abs(finite).max()), 1e-9)
+    style: dict[str, Any] = {"color": BOUND, "linewidth": 0.9, "linestyle": "--", "alpha": 0.8}
     for limit in limits:
-        # A bound far away would squeeze the signal into a flat line.
-        if abs(limit) <= 4 * reach:
-            axes.axhline(limit, color=BOUND, linewidth=0.9, linestyle="--", alpha=0.8)
+        constant = constant_value(limit)
+        course = constant if constant is not None else robustness_signal(limit >= 0, trace)
+        # A bound far away would squeeze the signal into a flat line, unless it is one.
+        if np.min(np.abs(course)) > 4 * reach and np.ptp(finite) > 0:
+            continue
+        if constant is None:
+            axes.plot(seconds(trace), np.asarray(course), **style)
+        else:
+            axes.axhline(constant, **style)
+
+
+def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, " t"]) -> None:
+    """Shade the instants at which a predicate fails."""
     axes.fill_between(
         clock,
         0,
         1,
-        where=margin < 0,
+        where=fails,
         transform=axes.get_xaxis_transform(),
         color=FAILING,
         alpha=0.13,
@@ -181,17 +298,32 @@ def _draw_bounds(
     )
 
 
-def _name_bounds(axes: Axes, margins: dict[str, float]) -> None:
-    """Write the predicates of a panel above it, one a line, by their least margin."""
-    worst_first = sorted(margins, key=margins.__getitem__)
-    named, others = worst_first[:MOST_BOUNDS], worst_first[MOST_BOUNDS:]
-    lines = [(text, FAILING if margins[text] < 0 else SAFE) for text in named]
+def _name_signal(axes: Axes, name: str) -> None:
+    """Write a name beside its panel, across: panels are less high than names are long."""
+    lines = [""]
+    for part in re.findall(r"[^_. ]*[_. ]|[^_. ]+", name):
+        fits = not lines[-1] or len((lines[-1] + part).rstrip()) <= WIDEST_NAME
+        lines = [*lines[:-1], lines[-1] + part] if fits else [*lines, part]
+    axes.set_ylabel(
+        "\n".join(map(str.rstrip, lines)), rotation=0, ha="right", va="center", fontsize=9
+    )
+
+
+def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]]) -> None:
+    """Write the predicates of a panel above it, one a line, first those that break a formula.
+
+    - `predicates`: by their text, each with its colour and its least margin.
+    """
+    ranks = [FAILING, BOUND, SAFE]
+    place = {text: (ranks.index(color), least) for text, (color, least) in predicates.items()}
+    ranked = sorted(predicates, key=place.__getitem__)
+    named, others = ranked[:MOST_BOUNDS], ranked[MOST_BOUNDS:]
+    lines = [(text, predicates[text][0]) for text in named]
     if others:
-        failing = any(margins[text] < 0 for text in others)
-        lines.append((f"and {len(others)} more", FAILING if failing else SAFE))
+        lines.append((f"and {len(others)} more", predicates[others[0]][0]))
     for number, (text, color) in enumerate(reversed(lines)):
         axes.annotate(
-            text,
+            shorten(text, LONGEST_PREDICATE),
             (0.0, 1.0),
             xycoords="axes fraction",
             xytext=(0, 9 * number),
@@ -208,7 +340,7 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
     value = np.asarray(trace.signals[signal])[sample]
     if np.ndim(value):
         value = value[int(np.argmax(np.abs(value)))]
-    axes.plot([time], [value], "o", color=FAILING, markersize=6)
+    axes.plot([time], [value], "o", color=FAILING, markersize=6, clip_on=False)
     right = sample > trace.length / 2
     low, high = axes.get_ylim()
     axes.annotate(

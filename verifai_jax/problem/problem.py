@@ -18,7 +18,12 @@ from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.trace import Trace
-from verifai_jax.core.user_errors import defined_at, explain_user_error, user_line
+from verifai_jax.core.user_errors import (
+    check_called_with,
+    defined_at,
+    explain_user_error,
+    user_line,
+)
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.evaluate import End
@@ -127,6 +132,7 @@ class Problem:
         }
         for attribute, value in values.items():
             object.__setattr__(self, attribute, value)
+        check_called_with("draw", draw, ("axes", "trace", "sample", "features"))
         if nominal is not None:
             space.check(nominal)
 
