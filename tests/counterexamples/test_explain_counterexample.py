@@ -6,6 +6,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from click.testing import CliRunner
 
@@ -179,3 +180,27 @@ def test_sentences_tell_control_points_by_their_time(driven):
     text = str(vj.shrink(driven, budget=300))
     assert re.search(r"throttle from \d+ s to \d+ s +30 -> ", text)
     assert "throttle[" not in text
+
+
+@pytest.mark.thorough
+def test_times_of_signals_are_those_of_the_whole_simulation_where_it_ends_early():
+    # Over at 2.1 s of 8 s, so that of the points at 0, 2, 4, 6 and 8 s the first three matter.
+    system = vj.ode(
+        lambda t, s, c, f: {"x": f["w"](t)}, lambda f, key: {"x": 0.0}, dt=0.1, duration=8.0,
+        terminate=lambda s, f: s["x"] > 1.0,
+        signals=lambda t, s, c, f: {"x": s["x"], "seen": f["w"](t)},
+    )  # fmt: skip
+    space = {"w": vj.Signal(vj.Box(0.0, 1.0), knots=5)}
+    problem = vj.Problem("early", space, system, "always x < 1.02", nominal={"w": 0.0})
+    rows = vj.FeatureSpace(space).rows({"w": vj.Waveform(np.array([[0.0, 1.0, 1.0, 1.0, 1.0]]))})
+    run = vj.simulate(problem, pd.DataFrame(rows), progress=False)
+    replay = run.replay(0)
+    assert float(replay.trace.clock()[-1]) == pytest.approx(2.1)
+    assert replay.duration == pytest.approx(8.0)
+    panels = {axes.get_ylabel(): axes for axes in replay.plot().axes}
+    drawn = panels["w (input)"].lines[0].get_ydata()
+    np.testing.assert_allclose(drawn, replay.trace["seen"], atol=1e-6)
+    explained = vj.explain(run)
+    assert explained.influences[0].spans[1] == pytest.approx((0, 4))
+    shrunk = vj.shrink(run, seed=0)
+    assert "w at 4 s " in str(shrunk)

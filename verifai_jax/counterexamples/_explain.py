@@ -142,7 +142,7 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     gradient = np.full(len(u), np.nan) if tangent is None else tangent.gradient
     if candidates.note:
         notes.append(candidates.note)
-    duration = float(np.asarray(replayed.trace.clock())[-1])
+    duration = replayed.duration or 0.0
     influences = []
     for n, (name, places) in enumerate(groups, start=1):
         one = 1 + len(groups) + places

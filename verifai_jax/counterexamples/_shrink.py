@@ -245,7 +245,7 @@ def shrink(
         history=tuple(search.history),
         notes=tuple(notes),
         key=key,
-        duration=float(np.asarray(original.trace.clock())[-1]) or None,
+        duration=original.duration,
     )
 
 

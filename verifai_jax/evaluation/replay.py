@@ -32,7 +32,8 @@ class Replay:
     """One simulation, looked at again.
 
     `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
-    random key of the simulation.
+    random key of the simulation. `duration` are the seconds that it would have lasted without an
+    early end, over which Signals lie; None for a single sample.
     """
 
     problem: Problem
@@ -42,6 +43,7 @@ class Replay:
     rho: dict[str, float]
     status: Status
     key: Key[Array, ""] | None = None
+    duration: float | None = None
 
     @property
     def violated(self) -> bool:
@@ -73,8 +75,7 @@ class Replay:
 
     def describe_features(self) -> str:
         """Write the features in one line, control points of signals by their time."""
-        clock = np.asarray(self.trace.clock())
-        labels = self.problem.space.labels(float(clock[-1]) if len(clock) > 1 else None)
+        labels = self.problem.space.labels(self.duration)
         return format_features(self.columns(), labels)
 
     def __repr__(self) -> str:
@@ -149,6 +150,8 @@ def replay(
             rho=dict(zip(problem.formulas, np.asarray(rho).tolist(), strict=True)),
             status=Status(int(status)),
             key=key,
+            # Of the whole trace: what an early end leaves of it is shorter.
+            duration=float(np.asarray(read.clock())[-1]) or None,
         )
 
 

@@ -124,8 +124,7 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
 def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
     """Draw an input signal, its nominal value, and the parts of it that matter."""
     wave = explained.replay.features[influence.name]
-    clock = np.asarray(explained.replay.trace.clock())
-    length = wave.duration or float(clock[-1])
+    length = wave.duration or explained.replay.duration or 0.0
     knots = np.asarray(wave.knots, np.float64)
     knots = knots.reshape(len(knots), -1)
     wave = wave if wave.duration is not None else wave.over(length)

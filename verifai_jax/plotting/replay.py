@@ -139,7 +139,7 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
         if is_waveform(value):
             known = value.duration is not None
             name = jax.tree_util.keystr(keys, simple=True, separator=".")
-            waveforms[name] = value if known else value.over(max(float(clock[-1]), 1e-9))
+            waveforms[name] = value if known else value.over(replay.duration or 1e-9)
     if not waveforms:
         return {}
     # In one program: each operation alone would compile one.
