@@ -14,6 +14,7 @@ from typing import Any
 import jax
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.core.errors import missing_name
 from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
@@ -241,6 +242,10 @@ class Problem:
             raise self._wrong_system(error, features) from error
         trace = self.form()
         if trace is None:
+            known = self.system.known_signals
+            for signal in self.monitored if known is not None else ():
+                if signal not in known:
+                    raise missing_name("the trace", "signal", signal, known)
             return
         for formula in self.formulas.values():
             jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)

@@ -93,6 +93,11 @@ class System:
         return jax.eval_shape(self, features, jax.eval_shape(lambda: jax.random.key(0)))
 
     @property
+    def known_signals(self) -> tuple[str, ...] | None:
+        """Names of the signals of a trace, of a system without `abstract`; None where unknown."""
+        return None
+
+    @property
     def can_fold(self) -> bool:
         """True for a system that can simulate without storing its samples."""
         return type(self).fold is not System.fold

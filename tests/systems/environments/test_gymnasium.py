@@ -225,14 +225,70 @@ def test_an_attribute_that_is_not_there_is_named_before_anything_runs():
         problem.check()
     system = gymnasium("CartPole-v1", balancing, steps=5, features=("masspole",))
     problem = vj.Problem("pole", {"maspole": vj.Box(0.1, 0.2)}, system, "always action <= 1")
-    with pytest.raises(ValueError, match="unknown feature that sets CartPole-v1 'masspole'"):
+    with pytest.raises(ValueError, match="unknown feature 'masspole'; did you mean 'maspole'"):
         problem.check()
+
+
+RISING = {"signals": {"height": "height"}, "features": {"fast": "speed"}}
+FAST = {"fast": vj.Box(0.5, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("space", "options", "spec", "match"),
+    [
+        (
+            FAST | {"more": vj.Box(0, 1)},
+            {},
+            "height < 9",
+            "feature 'more' changes nothing in Rising",
+        ),
+        (FAST, {}, "heigth < 9", "the trace has no signal 'heigth'; did you mean 'height'"),
+        (FAST, {"signals": None}, "hight < 9", "the trace has no signal 'hight'; did you mean"),
+        (FAST, {"signals": {"h": "hight"}}, "h < 9", "entry of Rising's observation 'hight'; did"),
+        (
+            FAST | {"late": vj.Box(0, 3)},
+            {"action_delay": {"late": 3}},
+            "height < 9",
+            r"'late' is a delay in whole steps: make it a DiscreteBox, as in DiscreteBox\(0, 3\)",
+        ),
+    ],
+)
+def test_a_problem_that_does_not_fit_is_refused_before_anything_runs(space, options, spec, match):
+    system = gymnasium(Rising, lambda o: [1.0], steps=5, **{**RISING, **options})
+    with pytest.raises(ValueError, match=match):
+        vj.Problem("rising", space, system, spec).check()
+
+
+def test_an_attribute_of_the_class_is_set_too():
+    problem = vj.Problem(
+        "rising", FAST, gymnasium(Rising, lambda o: [1.0], steps=5, **RISING), "height < 9"
+    )
+    problem.check()
+    assert problem.system({"fast": 0.5}, 0)["height"][-1] == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"policy": lambda a, b: 1}, r"policy is called with \(observation\); got a function of"),
+        (
+            {"configure": lambda env: 1},
+            r"configure is called with \(env, features\); got a function",
+        ),
+        ({"reset": lambda env: 1}, r"reset is called with \(env, features, seed\); got a function"),
+    ],
+)
+def test_functions_of_other_arguments_are_refused_at_once(options, match):
+    options = {"policy": balancing, "steps": 5} | options
+    with pytest.raises(ValueError, match=match):
+        gymnasium("CartPole-v1", **options)
 
 
 @pytest.mark.parametrize(
     ("policy", "options", "match"),
     [
         (lambda o: 0.5, {}, "policy must return one of the 2 actions of CartPole-v1; got 0.5"),
+        (lambda o: 2, {}, "policy must return one of the 2 actions of CartPole-v1; got 2"),
         (
             balancing,
             {"signals": ("x", "v")},

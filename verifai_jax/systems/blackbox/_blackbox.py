@@ -133,6 +133,13 @@ class Simulation:
             self.function(features, seed) if self.seeded else self.function(features)
         )
 
+    @property
+    def known_signals(self) -> tuple[str, ...] | None:
+        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+        if self.declared.signals is not None:
+            return tuple(self.declared.widths)
+        return getattr(self.function, "known_signals", None)
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         # After `simulate = blackbox(simulate, workers=2)` a worker finds the system by this name.
         function = state["function"]
@@ -160,6 +167,11 @@ class BlackBox(System):
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the traces, if it is given."""
         return self.simulation.declared.abstract()
+
+    @property
+    def known_signals(self) -> tuple[str, ...] | None:
+        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+        return self.simulation.known_signals
 
     def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
@@ -204,6 +216,11 @@ class PooledBlackBox(System):
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of the traces, if it is given."""
         return self.simulation.declared.abstract()
+
+    @property
+    def known_signals(self) -> tuple[str, ...] | None:
+        """Names of the signals of a trace; None where nothing but a simulation can tell."""
+        return self.simulation.known_signals
 
     def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""

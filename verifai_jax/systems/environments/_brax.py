@@ -268,6 +268,8 @@ class Brax(System):
             self.name,
             "features={feature: part of the system} or initial={feature: 'q[0]'}",
         )
+        self.observation_delay.check(features)
+        self.action_delay.check(features)
 
 
 @suggests_options

@@ -9,6 +9,7 @@ One trace is one episode: it is never reset within.
 """
 
 import copy
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +19,15 @@ import jax
 import numpy as np
 
 from verifai_jax.core.checks import check_count
-from verifai_jax.core.errors import check_names, require, suggests_options, unknown_name
+from verifai_jax.core.errors import require, suggests_options, unknown_name
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
     Moment,
+    check_features,
     check_signals_option,
     features_at,
     policy_that_sees,
@@ -117,14 +120,40 @@ class EpisodeFunction:
         )
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Refuse features that the environment does not have.
+        """Refuse features that the environment does not have, or that nothing would read.
 
-        **Raises:** `UnknownNameError`.
+        **Raises:** `UnknownNameError`, `ValueError`.
         """
         delays = (*self.observation_delay.features, *self.action_delay.features)
-        check_names(f"feature that sets {self.name}", (*self.features, *delays), features)
-        known = [name for name in vars(self.environment.unwrapped) if not name.startswith("_")]
-        check_names(f"attribute of {self.name}", self.features.values(), known)
+        check_features(
+            features,
+            [*self.features, *delays],
+            (self.configure, self.reset, self.signals, policy_that_sees(self.policy)),
+            self.name,
+            "features={feature: attribute}",
+        )
+        self.observation_delay.check(features)
+        self.action_delay.check(features)
+        env = self.environment.unwrapped
+        for attribute in self.features.values():
+            # An attribute of the class is one of the environment's as well.
+            if not hasattr(env, attribute):
+                known = [name for name in vars(env) if not name.startswith("_")]
+                raise unknown_name(f"attribute of {self.name}", attribute, known)
+        # Also refuses entries that the observation does not have.
+        _ = self.known_signals
+
+    @property
+    def known_signals(self) -> tuple[str, ...] | None:
+        """Names of the signals of a trace; None where nothing but a simulation can tell.
+
+        **Raises:** `UnknownNameError`, `ValueError` for entries that the observation does not have.
+        """
+        draw = getattr(self.environment.observation_space, "sample", None)
+        if callable(self.signals) or not callable(draw):
+            return None
+        moment = Moment(self.environment, _arrays(draw()), np.zeros(()), np.array(False))
+        return tuple(read_signals(self.signals, moment, np.zeros(()), {}, {}, self.name))
 
     @property
     def environment(self) -> Any:
@@ -199,7 +228,9 @@ class EpisodeFunction:
         action, space = self._decide(observation, **options), env.action_space
         array = np.asarray(action)
         if hasattr(space, "n"):
-            if array.shape != () or array != np.floor(array):
+            first = int(getattr(space, "start", 0))
+            inside = array.shape == () and first <= array < first + space.n
+            if not inside or array != np.floor(array):
                 raise ValueError(
                     f"policy must return one of the {space.n} actions of {self.name}; "
                     f"got {action!r}"
@@ -285,7 +316,12 @@ def gymnasium(
             raise unknown_name("environment of Gymnasium", env, package.registry)
     elif not callable(env):
         raise ValueError(f"env must be an id or a function that makes one; got {env!r}")
-    _policy_function(policy, compiled=False)
+    decide = _policy_function(policy, compiled=False)
+    if policy_that_sees(policy) is not None:
+        decide = functools.partial(decide, features=None)
+    check_called_with("policy", decide, ("observation",))
+    check_called_with("configure", configure, ("env", "features"))
+    check_called_with("reset", reset, ("env", "features", "seed"))
     check_count("steps", steps)
     check_signals_option(signals)
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}

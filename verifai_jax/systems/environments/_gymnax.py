@@ -207,6 +207,8 @@ class Gymnax(System):
             self.env.name,
             "features={feature: parameter} or initial={feature: part of the state}",
         )
+        self.observation_delay.check(features)
+        self.action_delay.check(features)
 
 
 @suggests_options

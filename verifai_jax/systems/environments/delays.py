@@ -41,6 +41,22 @@ class Delay(NamedTuple):
         steps = self.steps(features)
         return (steps >= 0) & (steps <= self.most) & (steps % 1 == 0)
 
+    def check(self, features: Features) -> None:
+        """Refuse a feature that draws real numbers, before anything compiles.
+
+        - `features`: `jax.ShapeDtypeStruct`s; of a feature that has a value, `valid` decides.
+
+        **Raises:** `ValueError`.
+        """
+        feature = None if self.feature is None else features[self.feature]
+        if isinstance(feature, jax.ShapeDtypeStruct) and jnp.issubdtype(
+            feature.dtype, jnp.floating
+        ):
+            raise ValueError(
+                f"feature {self.feature!r} is a delay in whole steps: make it a DiscreteBox, as in "
+                f"DiscreteBox(0, {self.most}); it draws real numbers"
+            )
+
 
 NO_DELAY = Delay()
 """An observation that is seen at once, an action that takes effect at once."""
