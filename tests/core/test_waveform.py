@@ -94,6 +94,10 @@ def test_a_duration_is_needed_and_can_be_given():
         (lambda: Waveform(KNOTS, width=1.0), "only pulses have a width; got width=1.0"),
         (lambda: Waveform(KNOTS, "pulse", width=-1.0), "positive number of seconds; got -1.0"),
         (lambda: Waveform(KNOTS, "linaer"), "unknown hold 'linaer'; did you mean 'linear'"),
+        (
+            lambda: Waveform(np.zeros(3), times=(0, 1, 5)).over(4.0),
+            "the times of a Signal must lie in its duration of 4 s; got 5",
+        ),
         (lambda: LINEAR.over(0), "duration must be a positive number of seconds; got 0"),
         (lambda: LINEAR.over(float("nan")), "positive number of seconds; got nan"),
         (lambda: LINEAR.over("4"), "positive number of seconds; got '4'"),

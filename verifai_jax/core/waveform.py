@@ -68,9 +68,16 @@ class Waveform:
     def over(self, duration: float) -> "Waveform":
         """Return the same control points over so many seconds.
 
-        **Raises:** `ValueError` for a duration that is not positive.
+        **Raises:** `ValueError` for a duration that is not positive, or ends before a control point
+        whose time is given.
         """
-        return replace(self, duration=check_duration(duration))
+        duration = check_duration(duration)
+        if self.times is not None and self.times[-1] > duration * (1 + 1e-6):
+            raise ValueError(
+                f"the times of a Signal must lie in its duration of {duration:g} s; "
+                f"got {self.times[-1]:g}"
+            )
+        return replace(self, duration=duration)
 
     def __call__(
         self, time: Real[Array | np.ndarray, "*times"] | np.number | float

@@ -127,7 +127,8 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
     length = wave.duration or explained.replay.duration or 0.0
     knots = np.asarray(wave.knots, np.float64)
     knots = knots.reshape(len(knots), -1)
-    wave = wave if wave.duration is not None else wave.over(length)
+    known = wave.duration is not None or wave.times is not None
+    wave = wave if known else wave.over(length)
     axes.plot(*_course(wave, knots[:, 0], length), color=BOUND, linewidth=1.5)
     if wave.hold not in HELD:
         times = control_times(len(knots), wave.hold, wave.times, length)

@@ -137,7 +137,7 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     leaves = jax.tree_util.tree_flatten_with_path(replay.features, is_leaf=is_waveform)[0]
     for keys, value in leaves:
         if is_waveform(value):
-            known = value.duration is not None
+            known = value.duration is not None or value.times is not None
             name = jax.tree_util.keystr(keys, simple=True, separator=".")
             waveforms[name] = value if known else value.over(replay.duration or 1e-9)
     if not waveforms:

@@ -243,8 +243,8 @@ class Problem:
         trace = self.form()
         if trace is None:
             known = self.system.known_signals
-            for signal in self.monitored if known is not None else ():
-                if signal not in known:
+            for signal in self.monitored:
+                if known is not None and signal not in known:
                     raise missing_name("the trace", "signal", signal, known)
             return
         for formula in self.formulas.values():

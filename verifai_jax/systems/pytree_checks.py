@@ -98,7 +98,8 @@ def check_signals(signals: object) -> None:
     for name, value in signals.items():
         if not hasattr(value, "shape") or len(value.shape) > 1:
             raise ValueError(
-                f"signal {name!r} must be a scalar or a vector at each sample; got {outline(value)}"
+                f"signal {name!r} must be a scalar or a vector at each sample; got "
+                f"{outline(value)}; the option signals= says what the trace has"
             )
 
 

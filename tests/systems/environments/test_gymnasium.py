@@ -275,6 +275,7 @@ def test_an_attribute_of_the_class_is_set_too():
             {"configure": lambda env: 1},
             r"configure is called with \(env, features\); got a function",
         ),
+        ({"signals": lambda o: o}, r"signals is called with \(env, observation, action, reward, f"),
         ({"reset": lambda env: 1}, r"reset is called with \(env, features, seed\); got a function"),
     ],
 )

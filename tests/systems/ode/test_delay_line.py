@@ -64,3 +64,40 @@ def test_refused(seconds):
         delay_line(0.0, longest=seconds, period=0.1)
     with pytest.raises(ValueError, match="period must be a positive number of seconds"):
         delay_line(0.0, longest=1.0, period=seconds)
+
+
+@pytest.mark.parametrize("value", [float("nan"), "5"])
+def test_refuses_what_is_no_number(value):
+    with pytest.raises(ValueError, match="value must be a finite number or an array; got "):
+        delay_line(value, longest=1.0, period=0.1)
+
+
+@pytest.mark.parametrize("period", [0.05, 0.15])
+def test_a_line_that_is_fed_at_another_period_is_refused(period):
+    # Read 0.2 s ago, it would have said what was 0.4 s ago.
+    line = delay_line(0.0, longest=0.5, period=period)
+    plant = ode(
+        lambda t, s, c, f: {"x": 1.0 - s["line"].at(t - 0.2), "line": s["line"].still},
+        lambda f, key: {"x": 0.0, "line": line},
+        update=lambda t, s, f: {**s, "line": s["line"].push(t, s["x"])},
+        signals=lambda t, s, c, f: {"x": s["x"]}, dt=0.1, duration=1.0,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=rf"must be dt.* \(0.1 s\), or .*; got period={period}"):
+        plant({})
+    sampled = ode(
+        lambda t, s, c, f: {"x": c}, lambda f, key: {"x": 0.0}, dt=0.02, duration=1.0,
+        controller=lambda t, s, m, f: (m.at(t - 0.2), m.push(t, s["x"])),
+        controller_memory=line, control_period=0.1,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=rf"the control period.*0.1 s.*; got period={period}"):
+        sampled({})
+
+
+def test_a_line_that_nothing_feeds_is_refused():
+    plant = ode(
+        lambda t, s, c, f: {"x": 1.0 - s["line"].at(t - 0.2), "line": s["line"].still},
+        lambda f, key: {"x": 0.0, "line": delay_line(0.0, longest=0.5, period=0.1)},
+        signals=lambda t, s, c, f: {"x": s["x"]}, dt=0.1, duration=1.0,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="a delay_line in the state needs update="):
+        plant({})

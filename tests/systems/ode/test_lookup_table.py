@@ -66,6 +66,9 @@ def test_tables_of_vectors():
             lambda: LookupTable([1, 2], [0, 1, 2]),
             r"breakpoints \[2\] must have this shape; got \[3",
         ),
+        (lambda: LookupTable([1, 2], [0, float("nan")]), "values .* must be finite; got nan"),
+        (lambda: LookupTable(["a", "b"], [0, 1]), r"argument 0 must be real numbers; got \['a'"),
+        (lambda: LookupTable([1, 2], [0, "x"]), r"values of a LookupTable must be real numbers"),
         (lambda: LookupTable([1, 2], [0, 1], beyond="clap"), "unknown beyond 'clap'; did you mean"),
     ],
 )

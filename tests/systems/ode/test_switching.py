@@ -164,9 +164,32 @@ def test_latches_and_hysteresis():
             {"switches": [Switch(FLOOR.guard, lambda t, s, f: s["height"])]},
             "reset of a Switch must return a state, in the form of the state",
         ),
+        ({"switches": FLOOR}, r"must be a list of vj.blocks.Switch; got one: write \[switch\]"),
+        ({"method": lambda d, t, s: s}, r"method is called with \(derivative, time, state, dt\)"),
         ({"update": lambda t, s, f: 0.0}, "update must return a state, in the form of the state"),
     ],
 )
 def test_refused(options, message):
     with unchecked(), pytest.raises(ValueError, match=message):
         ball(**options)({"height": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Switch(1, FLOOR.reset), r"guard must be a function \(time, state, f.*; got 1"),
+        (lambda: Switch(FLOOR.guard, None), "reset must be a function .*; got None"),
+        (
+            lambda: Switch(lambda s: s, FLOOR.reset),
+            r"guard is called with \(time, state, features\)",
+        ),
+        (
+            lambda: Switch(FLOOR.guard, lambda s: s),
+            r"reset is called with \(time, state, features\)",
+        ),
+        (lambda: hysteresis(0, 1, 3, 2), r"hysteresis needs low <= high; got \(low=3, high=2\)"),
+    ],
+)
+def test_what_is_refused_at_once(make, message):
+    with unchecked(), pytest.raises(ValueError, match=message):
+        make()

@@ -26,6 +26,7 @@ from verifai_jax.core.errors import (
     unknown_name,
 )
 from verifai_jax.core.trace import Trace
+from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.environments.brax_joined import Joined, join
@@ -359,6 +360,9 @@ def brax(
             raise ValueError(f"{name} has no dt: give dt=..., seconds of a step") from error
     seconds = sampling_period(dt)
     check_signals_option(signals)
+    check_called_with("configure", configure, ("sys", "features"))
+    if not isinstance(initial, Mapping):
+        check_called_with("initial", initial, ("env", "features", "key"))
     policy_function(policy, policy_memory)
     bindings = features if isinstance(features, Mapping) else {path: path for path in features}
     places = {feature: system_place(env, path, name) for feature, path in bindings.items()}

@@ -323,7 +323,7 @@ def gymnasium(
     check_called_with("configure", configure, ("env", "features"))
     check_called_with("reset", reset, ("env", "features", "seed"))
     check_count("steps", steps)
-    check_signals_option(signals)
+    check_signals_option(signals, "env")
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
     seconds = None if dt is None else sampling_period(dt)
     episode = EpisodeFunction(

@@ -25,6 +25,7 @@ from verifai_jax.core.errors import (
     unknown_name,
 )
 from verifai_jax.core.trace import Trace
+from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay
@@ -303,6 +304,9 @@ def gymnax(
         dt = fields[clocks[0]] if clocks else 1.0
     seconds = sampling_period(dt)
     check_signals_option(signals)
+    check_called_with("configure", configure, ("params", "features"))
+    if not isinstance(initial, Mapping):
+        check_called_with("initial", initial, ("state", "features", "key"))
     policy_function(policy, policy_memory)
     _check_choices(policy, env.action_space(params), env.name)
     if isinstance(initial, Mapping):

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.checkpointing import checkpointed_scan
@@ -381,18 +382,24 @@ def read_signals(
     return {entry: moment.observation[i] for i, entry in enumerate(signals)} | loop
 
 
-def check_signals_option(signals: object) -> None:
+def check_signals_option(signals: object, state: str = "state") -> None:
     """Refuse a `signals=` option that `read_signals` could not use.
+
+    - `state`: what a function gets first, in words.
 
     **Raises:** `ValueError`.
     """
-    if signals is None or callable(signals):
+    if signals is None:
+        return
+    if callable(signals):
+        arguments = (state, "observation", "action", "reward", "features")
+        check_called_with("signals", signals, arguments)
         return
     names = list(signals) if isinstance(signals, Mapping | Sequence) else []
     if not names or isinstance(signals, str) or not all(isinstance(n, str) for n in names):
         raise ValueError(
             "signals must be names of the observation's entries, {name: index or key}, or a "
-            f"function (state, observation, action, reward, features) -> dict; got {signals!r}"
+            f"function ({state}, observation, action, reward, features) -> dict; got {signals!r}"
         )
     if len(set(names)) < len(names) or {"action", "reward"} & set(names):
         raise ValueError(

@@ -25,6 +25,7 @@ from verifai_jax.core.waveform import set_durations, within_step
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
+from verifai_jax.systems.ode.delay_line import DelayLine
 from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_factor, integrator
 from verifai_jax.systems.ode.switching import Switch, switched_step
 from verifai_jax.systems.pytree_checks import (
@@ -279,6 +280,14 @@ class _Rollout:
         role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
         check_like(derivative, state, "dynamics", role, note)
         role = "a state, in the form of the state"
+        self._check_lines(
+            state, loop.dt, "dt, at which update pushes it", fed=loop.update is not None
+        )
+        if memory is not None:
+            period = loop.dt * loop.steps_per_control
+            self._check_lines(
+                memory, period, "the control period, at which the controller pushes it"
+            )
         if loop.update is not None:
             after = jax.eval_shape(loop.update, time, state, self.features)
             check_like(after, state, "update", role, defined_at(loop.update))
@@ -308,6 +317,22 @@ class _Rollout:
                     f"{defined_at(loop.terminate)}"
                 )
         return tuple(finite)
+
+    def _check_lines(self, tree: PyTree, beat: float, what: str, fed: bool = True) -> None:
+        """Refuse delay lines that are not fed once a period: they would be late by another time."""
+        is_line = lambda leaf: isinstance(leaf, DelayLine)  # noqa: E731
+        for line in filter(is_line, jax.tree.leaves(tree, is_leaf=is_line)):
+            if not fed:
+                raise ValueError(
+                    "a delay_line in the state needs update=, which pushes it at each sample; "
+                    "got none"
+                )
+            count = round(line.period / beat)
+            if count < 1 or abs(count * beat - line.period) > 1e-6 * beat:
+                raise ValueError(
+                    f"the period of a delay_line must be {what} ({beat:g} s), or a multiple of it "
+                    f"where it is not pushed each time; got period={line.period:g}"
+                )
 
 
 def substep(
@@ -427,6 +452,8 @@ def ode(
     if controller is None and (control_period is not None or controller_memory is not None):
         raise ValueError("control_period and controller_memory need a controller; got none")
     check_count("unroll", unroll)
+    if isinstance(switches, Switch):
+        raise ValueError("switches must be a list of vj.blocks.Switch; got one: write [switch]")
     for switch in switches:
         if not isinstance(switch, Switch):
             raise ValueError(f"switches must be a list of vj.blocks.Switch; got {switch!r}")
@@ -437,6 +464,8 @@ def ode(
     check_called_with("signals", signals, ("time", "state", "control", "features"))
     check_called_with("terminate", terminate, ("state", "features"))
     check_called_with("update", update, ("time", "state", "features"))
+    if callable(method):
+        check_called_with("method", method, ("derivative", "time", "state", "dt"))
     return Ode(
         dynamics=dynamics,
         initial=initial,

@@ -67,13 +67,15 @@ def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
       period for one in a controller's memory. A delay shorter than it reads the newest sample.
 
-    **Raises:** `ValueError` for seconds that are not positive.
+    **Raises:** `ValueError` for seconds that are not positive, and a value that is no number.
     """
     for name, seconds in (("longest", longest), ("period", period)):
         if not is_number(seconds) or not 0 < seconds < math.inf:
             raise ValueError(f"{name} must be a positive number of seconds; got {seconds!r}")
     # One sample more than the delay is long: a stage of a step asks up to a period earlier.
     count = math.ceil(longest / period - 1e-6) + 2
+    if isinstance(value, str | None) or (is_number(value) and not math.isfinite(value)):
+        raise ValueError(f"value must be a finite number or an array; got {value!r}")
     value = jnp.asarray(value)
     real = value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)
     values = jnp.broadcast_to(real, (count, *np.shape(real)))

@@ -40,8 +40,8 @@ class LookupTable:
     - `beyond`: `"clip"` has the value at the end of an axis beyond it, `"extrapolate"` goes on
       along the last line.
 
-    **Raises:** `ValueError` for breakpoints that do not increase, values of another shape, and an
-    unknown `beyond`.
+    **Raises:** `ValueError` for breakpoints that do not increase, values that are not finite or of
+    another shape, and an unknown `beyond`.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
@@ -66,7 +66,13 @@ class LookupTable:
                 )
             *given, values = axes_and_values
             axes = tuple(_breakpoints(axis, i) for i, axis in enumerate(given))
-            values = values if isinstance(values, jax.Array) else np.asarray(values, float)
+            if not isinstance(values, jax.Array):
+                values = _real(values, "the values of a LookupTable")
+                if not np.all(np.isfinite(values)):
+                    raise ValueError(
+                        "the values of a LookupTable must be finite; "
+                        f"got {values[~np.isfinite(values)][0]}"
+                    )
             shape = tuple(len(axis) for axis in axes)
             if values.shape[: len(shape)] != shape:
                 raise ValueError(
@@ -121,8 +127,15 @@ class LookupTable:
         return left, (x - jnp.asarray(points, x.dtype)[left]) / gap
 
 
+def _real(values: Any, what: str) -> np.ndarray:
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what} must be real numbers; got {values!r}") from None
+
+
 def _breakpoints(axis: Any, i: int) -> tuple[float, ...]:
-    flat = np.asarray(axis, float)
+    flat = _real(axis, f"the breakpoints of argument {i}")
     points: Sequence[float] = flat.tolist() if flat.ndim == 1 else ()
     finite = all(math.isfinite(point) for point in points)
     if len(points) < 2 or not finite or any(b <= a for a, b in pairwise(points)):

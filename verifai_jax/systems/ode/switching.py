@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from verifai_jax.core.checks import is_number
+from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time
 
 BISECTIONS = 12
@@ -35,10 +37,20 @@ class Switch:
 
     The first switch of an integration step is located. What falls to zero in the rest of the same
     step jumps at its end. A guard that falls to zero and rises again within one step is not seen.
+
+    **Raises:** `ValueError` for functions of other arguments.
     """
 
     guard: Callable[..., Any]
     reset: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        for name, function in (("guard", self.guard), ("reset", self.reset)):
+            if not callable(function):
+                raise ValueError(
+                    f"{name} must be a function (time, state, features); got {function!r}"
+                )
+            check_called_with(name, function, ("time", "state", "features"))
 
 
 def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
@@ -47,7 +59,12 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
     **Arguments:**
 
     - `on`: the mode now, 0 or 1, which stays between the two.
+    - `low`, `high`: where the mode changes; numbers, or traced.
+
+    **Raises:** `ValueError` for numbers with `low` above `high`.
     """
+    if is_number(low) and is_number(high) and low > high:
+        raise ValueError(f"hysteresis needs low <= high; got (low={low}, high={high})")
     on = jnp.asarray(on, jnp.result_type(float, on))
     return jnp.where(value >= high, 1, jnp.where(value < low, 0, on)).astype(on.dtype)
 
