@@ -77,6 +77,10 @@ def test_gaps_and_uneven_times_end_it():
         follow("always dist > 0", ["dist", '""'], dt=0.5)
     with pytest.raises(ValueError, match=r"line 4 of the standard input is at 1\.2 s, where 1 s"):
         follow("always dist > 0", ["time,dist", "0,1", "0.5,1", "1.2,1"])
+    with pytest.raises(
+        ValueError, match=r"if its times are rounded, give the period, --dt SECONDS"
+    ):
+        follow("always dist > 0", ["time,dist", "0,1", "0.033,1", "0.067,1"])
 
 
 def test_options_that_need_the_whole_recording_are_refused():

@@ -57,7 +57,8 @@ def monitor_stream(
                 raise ValueError(
                     f"line {sample.line} of {SOURCE} is at {now:g} s, where "
                     f"{begin + (count - 1) * period:g} s is due: samples of a stream are evenly "
-                    "spaced; record it, and use --resample"
+                    "spaced; if its times are rounded, give the period, --dt SECONDS; otherwise "
+                    "record it, and use --resample"
                 )
             _refuse_nan(sample, now)
             state, bounds = step(state, sample.signals)

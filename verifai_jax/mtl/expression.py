@@ -12,7 +12,7 @@ from operator import methodcaller
 
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
 from verifai_jax.mtl.node import postorder
-from verifai_jax.mtl.words import FUNCTIONS, name_text, number_text
+from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
 _CONSTANT: dict[str, Callable[..., float]] = {
     "neg": lambda a: -a,
@@ -28,6 +28,8 @@ _CONSTANT: dict[str, Callable[..., float]] = {
     "min": min,
     "max": max,
 }
+_NAMED = {sign * v: f"{'-' * (sign < 0)}{word}" for word, v in NUMBERS.items() for sign in (1, -1)}
+"""Numbers that are printed by their name, and their opposites."""
 PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "neg": 3, "**": 4}
 """Binding strength of the operators."""
 
@@ -163,7 +165,7 @@ class Number(Expression):
 
     def text(self, outer: int = 0) -> str:
         """Return the number, in parentheses if it is negative within an operator."""
-        text = number_text(self.value)
+        text = _NAMED.get(self.value) or number_text(self.value)
         return f"({text})" if self.value < 0 and outer > 0 else text
 
 

@@ -1,9 +1,11 @@
 """The text grammar of formulas: its parser, and what its errors say."""
 
+import difflib
 import functools
+import re
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import ANGLES, NAME, WORDS
+from verifai_jax.mtl.words import ANGLES, NAME, RESERVED, WORDS
 
 UNARY = ("always", "eventually", "historically", "once", "next", "prev", "weak_prev")
 """Operators in front of one operand."""
@@ -187,4 +189,14 @@ def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
     expected |= set(getattr(error, "allowed", None) or ())
     words = [word for names, word in _GROUPS if names & expected]
     wanted = " or ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
-    return FormulaSyntaxError(f"expected {wanted}, but found {found}", text, position, width)
+    message = f"expected {wanted}, but found {found}{_misspelt_word(text[:position])}"
+    return FormulaSyntaxError(message, text, position, width)
+
+
+def _misspelt_word(before: str) -> str:
+    """Ask whether the name at the end of a text was to be an operator, with or without interval."""
+    name = re.search(r"([A-Za-z_]\w*)\s*(\[[^\]]*\]?)?\s*$", before)
+    if name is None or name[1] in RESERVED:
+        return ""
+    near = difflib.get_close_matches(name[1], [w for w in RESERVED if len(w) > 3], n=1, cutoff=0.75)
+    return f"; did you mean {near[0]!r} instead of {name[1]!r}?" if near else ""
