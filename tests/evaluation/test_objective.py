@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.keys import run_keys, simulation_key
@@ -127,11 +128,28 @@ def test_wrong_options_are_refused_at_once(options, words):
         ({"x0": 0.0, "v": 0.0}, "feature 'push' is missing; got x0, v"),
         ({"x0": 0.0, "w": 0.0}, "unknown feature 'w'"),
         (POINTS[0], r"is a function of='features' and got an array; objective\(..., of='unit'\)"),
+        (
+            {"x0": 0.0, "v": 0.1, "push": [0.5, 0.5]},
+            r"'push.knots' must have shape \[3\]; got \[2\]",
+        ),
+        ({"x0": [0.0, 0.0], "v": 0.1, "push": 0.5}, r"'x0' must have shape \[\]; got \[2\]"),
+        (
+            {"x0": 0.0, "v": 0.1, "push": vj.Waveform(np.zeros(3), hold="constant")},
+            "a Signal with hold='linear' and duration=None cannot be Waveform.*constant",
+        ),
     ],
 )
 def test_wrong_features_are_refused(features, words):
     with pytest.raises(ValueError, match=words):
         PROBLEM.objective(of="features")(features)
+
+
+def test_semantics_are_no_text():
+    with (
+        unchecked(),
+        pytest.raises(TypeError, match=r"mtl.hard or mtl.smooth\(0.1\); got 'smooth'"),
+    ):
+        PROBLEM.objective("smooth")  # pyright: ignore[reportArgumentType]
 
 
 def test_features_in_place_of_a_point_are_refused():

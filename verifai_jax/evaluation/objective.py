@@ -44,6 +44,8 @@ def objective(
     **Arguments**, **Returns**, **Raises:** those of `Problem.objective`.
     """
     check_names("argument of an objective", [of], ARGUMENTS)
+    if not isinstance(semantics, Semantics):
+        raise TypeError(f"semantics is mtl.hard or mtl.smooth(0.1); got {semantics!r}")
     names = list(problem.formulas)
     if formula is not None:
         check_names("formula", [formula], names)

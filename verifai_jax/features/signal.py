@@ -122,6 +122,9 @@ class Signal(Domain):
     def coerce(self, value: PyTree) -> Waveform:
         """Convert a `Waveform`, a list of control points, or one value for all times."""
         if is_waveform(value):
+            if (value.hold, value.times) != (self.hold, self._course[2]):
+                wanted = _format_course((self.hold, None, *self._course[2:]))
+                raise ValueError(f"a Signal with {wanted} cannot be {value!r}")
             return self.waveform(self.domain.coerce(value.knots))
         knots = self.domain.coerce(value)
         if knots.ndim == np.ndim(getattr(self.domain, "low", 0.0)):

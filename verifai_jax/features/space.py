@@ -240,7 +240,7 @@ class FeatureSpace:
     def convert(self, features: Mapping[str, Any]) -> dict[str, Any]:
         """Convert features that a person wrote to those that a system sees; pure JAX.
 
-        Their names are checked, and their values are not: JAX may trace them.
+        Their names and shapes are checked, and their values are not: JAX may trace them.
 
         **Arguments:**
 
@@ -248,14 +248,25 @@ class FeatureSpace:
 
         **Returns:** the features as `unflatten` gives them.
 
-        **Raises:** `ValueError` that names the first feature which is unknown or missing.
+        **Raises:** `ValueError` that names the first feature which is unknown, missing or of another
+        shape.
         """
         complete = self._completed(features)
         check_names("feature", complete, self.domains)
         missing = [name for name in self.domains if name not in complete]
         if missing:
             raise ValueError(f"feature {missing[0]!r} is missing; got {', '.join(features)}")
-        return self.root.coerce(complete)
+        converted = self.root.coerce(complete)
+        wanted = jax.eval_shape(self.unflatten, self.point_form)
+        places = jax.tree_util.tree_flatten_with_path(wanted)[0]
+        for (place, form), leaf in zip(places, jax.tree.leaves(converted), strict=True):
+            if form.shape != jnp.shape(leaf):
+                name = jax.tree_util.keystr(place, simple=True, separator=".")
+                raise ValueError(
+                    f"feature {name!r} must have shape {list(form.shape)}; "
+                    f"got {list(jnp.shape(leaf))}"
+                )
+        return converted
 
     def check(self, features: Mapping[str, Any]) -> None:
         """Check concrete features; constant, fixed ones and events may be left out.
