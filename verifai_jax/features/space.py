@@ -248,8 +248,8 @@ class FeatureSpace:
 
         **Returns:** the features as `unflatten` gives them.
 
-        **Raises:** `ValueError` that names the first feature which is unknown, missing or of another
-        shape.
+        **Raises:** `ValueError` that names the first feature which is unknown, is missing or has
+        another shape.
         """
         complete = self._completed(features)
         check_names("feature", complete, self.domains)
