@@ -204,3 +204,32 @@ def test_times_of_signals_are_those_of_the_whole_simulation_where_it_ends_early(
     assert explained.influences[0].spans[1] == pytest.approx((0, 4))
     shrunk = vj.shrink(run, seed=0)
     assert "w at 4 s " in str(shrunk)
+
+
+def test_a_batch_of_a_host_system_is_simulated_with_the_key_of_the_row():
+    def simulate(features, seeds):
+        x = features["x"] * 1.0 + (seeds % 7) * 0
+        return vj.Trace({"x": np.repeat(x[:, None], 2, axis=1)}, dt=1.0)
+
+    system = vj.blackbox(simulate, vectorised=True, seeded=True, signals=["x"], dt=1.0, length=2)
+    space = {"x": vj.Box(0.0, 2.0), "y": vj.Box(0.0, 1.0)}
+    problem = vj.Problem("rows", space, system, "x < 1", nominal={"x": 0.0, "y": 0.0})
+    run = vj.falsify(problem, "uniform", 32, progress=False)
+    explained = vj.explain(run)
+    assert [each.gone for each in explained.influences] == [True, False]
+    assert explained.influences[0].reverted == pytest.approx(1.0)
+    assert vj.shrink(run, seed=0).changed.keys() == {"x"}
+
+
+def test_it_is_said_that_changed_features_have_no_verdict():
+    @vj.blackbox
+    def fragile(features):
+        if features["x"] < 0.5:
+            raise RuntimeError("solver lost")
+        return vj.Trace({"x": np.full(2, features["x"])}, dt=1.0)
+
+    space = {"x": vj.Box(0.0, 2.0)}
+    problem = vj.Problem("fragile", space, fragile, "x < 1", nominal={"x": 0.0})
+    run = vj.falsify(problem, "uniform", 32, progress=False)
+    said = str(vj.explain(run))
+    assert "simulations had no verdict, the first because of RuntimeError: solver lost" in said

@@ -140,8 +140,7 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     candidates.temperature = max(0.002 * float(spread), 1e-6)
     tangent = candidates.tangents(u[None])[0]
     gradient = np.full(len(u), np.nan) if tangent is None else tangent.gradient
-    if candidates.note:
-        notes.append(candidates.note)
+    notes += candidates.notes
     duration = replayed.duration or 0.0
     influences = []
     for n, (name, places) in enumerate(groups, start=1):

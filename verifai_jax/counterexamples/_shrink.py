@@ -226,8 +226,7 @@ def shrink(
     verified = _verified(problem, search, key, number, run.precision)
     u = start[0] if verified is None else verified[0]
     replayed = original if verified is None else verified[1]
-    if candidates.note:
-        notes.append(candidates.note)
+    notes += candidates.notes
     return Shrunk(
         problem=problem,
         row=number,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.core.text import one_line
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.problem import Problem
@@ -43,7 +44,8 @@ class Candidates:
     `limit`: simulations after which no more are made for now; `most_items`: points with more items
     (such as events) are not simulated; `temperature` of the smooth
     robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
-    not, in words.
+    not, in words; `without_verdict`: simulations that had none, and `trouble`, what the first of
+    them raised.
     """
 
     def __init__(
@@ -62,6 +64,18 @@ class Candidates:
         self.temperature = 1.0
         self.differentiable = not problem.black_box
         self.note = ""
+        self.without_verdict, self.trouble = 0, ""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a person should know of the simulations: no gradients, none or few verdicts."""
+        notes = [self.note] if self.note else []
+        if self.without_verdict:
+            why = f", the first because of {one_line(self.trouble, 200)}" if self.trouble else ""
+            notes.append(
+                f"{self.without_verdict:,} of {len(self.rho):,} simulations had no verdict{why}"
+            )
+        return notes
 
     @property
     def simulations(self) -> int:
@@ -90,6 +104,8 @@ class Candidates:
         if order:
             verdicts = self._evaluate(points[order])
             rho = np.where(verdicts.proper, verdicts.least, np.inf).astype(np.float64)
+            self.without_verdict += int(np.sum(~verdicts.proper))
+            self.trouble = next(filter(None, [self.trouble, *(verdicts.messages or [])]), "")
             for i, value, fails in zip(order, rho, verdicts.violated, strict=True):
                 self._known[keys[i]] = (float(value), bool(fails))
             self.points = np.concatenate([self.points, points[order]])

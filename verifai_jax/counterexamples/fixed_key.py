@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key
 
@@ -55,7 +56,7 @@ class FixedKey(System):
         return self.system.can_simulate_batch
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        return self.system.simulate_batch(features, self.key[None].repeat(len(keys)))
+        return self.system.simulate_batch(features, jnp.broadcast_to(self.key, len(keys)))
 
     @property
     def can_simulate_each(self) -> bool:
