@@ -68,7 +68,7 @@ class Candidates:
 
     @property
     def notes(self) -> list[str]:
-        """What a person should know of the simulations: no gradients, none or few verdicts."""
+        """Sentences for people: on gradients that are missing, on simulations without a verdict."""
         notes = [self.note] if self.note else []
         if self.without_verdict:
             why = f", the first because of {one_line(self.trouble, 200)}" if self.trouble else ""

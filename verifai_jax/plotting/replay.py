@@ -113,6 +113,7 @@ def plot_replay(
         _mark(panels[shown.index(decisive[0])], trace, *decisive)
     left_out = _left_out([signal for signal in ordered if signal not in shown])
     panels[-1].set_xlabel("time [s]" + left_out, wrap=True)
+    figure.align_ylabels(panels)
     worst = f"robustness {replay.rho[name]:.4g}"
     verdict = f"{worst} ({'violated' if replay.violated else 'ok'})"
     if replay.status != Status.OK:
