@@ -12,7 +12,12 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.core.targets import definitions
 from verifai_jax.mtl import parse
-from verifai_jax.problem.silent_mistakes import first_look_ahead, silent_mistakes
+from verifai_jax.problem.silent_mistakes import (
+    _programs,
+    difference,
+    first_look_ahead,
+    silent_mistakes,
+)
 
 ROOT = Path(__file__).parents[2]
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(0, 1)}
@@ -206,3 +211,13 @@ class TestRuns:
         problem = vj.Problem("p", SPACE, steps, "always x < 4")
         notes = vj.falsify(problem, "gradient", 16, batch=16).notes
         assert any("follows gradients and there are none" in note for note in notes)
+
+
+def test_programs_inside_an_operation_may_take_constants_as_operands():
+    # As those of equinox and diffrax do.
+    table = jnp.arange(3.0)
+    one, other = (jax.make_jaxpr(lambda x, k=k: k * x + table)(table).jaxpr for k in (2.0, 3.0))
+    assert one.constvars
+    assert list(_programs({"jaxpr": one})) == [one]
+    assert difference(one, one) == (False, None)
+    assert difference(one, other)[0]

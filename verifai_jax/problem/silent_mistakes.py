@@ -10,7 +10,7 @@ fraction of a second. What is not surely a mistake is not told.
 import math
 import time
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -201,11 +201,17 @@ def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
     return below((), problem.space.root)
 
 
-def difference(one: ClosedJaxpr, other: ClosedJaxpr) -> tuple[bool, str | None]:
+Program: TypeAlias = ClosedJaxpr | Jaxpr
+"""A program with its constants, or one inside an operation, whose constants are operands of it."""
+
+
+def difference(one: Program, other: Program) -> tuple[bool, str | None]:
     """Return whether two programs compute with other numbers, and the line of it where known.
 
     Operations, the constants among their operands, and plain parameters are compared.
     """
+    if isinstance(one, Jaxpr) or isinstance(other, Jaxpr):
+        return _difference(getattr(one, "jaxpr", one), getattr(other, "jaxpr", other))
     for a, b in zip(one.consts, other.consts, strict=False):
         if not _same_value(a, b):
             return True, _line_of_constant(one, a)
@@ -240,14 +246,12 @@ def _same_operands(one: JaxprEqn, other: JaxprEqn) -> bool:
     return True
 
 
-def _programs(parameters: dict[str, Any]) -> Iterator[ClosedJaxpr]:
+def _programs(parameters: dict[str, Any]) -> Iterator[Program]:
     """Yield the programs inside an operation, such as the body of a loop."""
     for value in parameters.values():
         for part in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(part, ClosedJaxpr):
+            if isinstance(part, ClosedJaxpr | Jaxpr):
                 yield part
-            elif isinstance(part, Jaxpr):
-                yield ClosedJaxpr(part, ())
 
 
 def _is_plain(value: object) -> bool:

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import verifai_jax as vj
 from verifai_jax.blocks import adaptive
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.trace import Status
 from verifai_jax.systems.ode import ode
+from verifai_jax.systems.ode.adaptive import _solvers
 
 
 def test_without_diffrax_the_error_names_the_extra(monkeypatch):
@@ -71,6 +73,25 @@ def test_what_needs_too_many_steps_is_not_finite():
     pytest.importorskip("diffrax")
     system = van_der_pol(method=adaptive("Tsit5", most_steps=2))
     assert int(jax.jit(system)({"mu": 100.0}).status) == Status.NONFINITE
+
+
+@pytest.mark.slow
+def test_a_problem_with_it_is_falsified():
+    pytest.importorskip("diffrax")
+    system = van_der_pol(method=adaptive("Kvaerno3", rtol=1e-3, atol=1e-4))
+    problem = vj.Problem("pol", {"mu": vj.Box(5.0, 10.0)}, system, "always x > 1.5")
+    run = vj.falsify(problem, "uniform", 8, progress=False)
+    assert run.simulations == 8
+    assert len(run.table.failed) == 0
+
+
+@pytest.mark.thorough
+def test_each_solver_that_is_known_can_be_used():
+    diffrax = pytest.importorskip("diffrax")
+    solvers = _solvers(diffrax)
+    assert {"Tsit5", "Dopri8", "Kvaerno5"} <= set(solvers)
+    for name in solvers:
+        jax.eval_shape(van_der_pol(method=adaptive(name, rtol=1e-3)), {"mu": 1.0}, None)
 
 
 def test_refused():

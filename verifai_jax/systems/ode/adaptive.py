@@ -77,4 +77,6 @@ def _solvers(diffrax: Any) -> dict[str, Any]:
         if inspect.isclass(kind)
         and issubclass(kind, diffrax.AbstractAdaptiveSolver)
         and not name.startswith("Abstract")
+        # Others take equations in two parts, noise, or another solver.
+        and getattr(kind, "term_structure", None) is diffrax.AbstractTerm
     }
