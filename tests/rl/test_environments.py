@@ -351,7 +351,10 @@ def test_weights_of_a_reward_are_fields_that_a_sweep_may_vary():
     for name, message in (("loop", "cannot be a weight"), ("a b", "identifier of its own")):
         with pytest.raises(ValueError, match=message):
             make(**{name: 1.0})
-    with unchecked(), pytest.raises(ValueError, match="weight effort must be a number; got 'x'"):
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="weight effort must be a finite number; got 'x"),
+    ):
         make(effort="x")
 
 
@@ -362,7 +365,7 @@ def test_ode_task_of_choices_and_what_it_refuses():
     reward = lambda time, state, torque, after: jnp.cos(after["angle"])  # noqa: E731
     with pytest.raises(ValueError, match=r"Discrete\(n=3\) needs control=..., a function"):
         ode_task(loop, Discrete(3), reward=reward, features={"pull": 9.8})
-    with pytest.raises(KeyError, match="pull"):
+    with pytest.raises(ValueError, match="there is no feature .pull.. It has none"):
         ode_task(loop, Continuous(-1.0, 1.0), reward=reward)
     message = "action must be a Discrete or a Continuous; got 3"
     with unchecked(), pytest.raises(ValueError, match=message):
@@ -464,3 +467,34 @@ def test_mjx_task_refuses_what_does_not_fit():
         mjx_task(ARM, **given, initial=lambda key, qpos, qvel: (qpos[:1], qvel))
     with pytest.raises(ValueError, match="no actuator"):
         mjx_task("<mujoco><worldbody/></mujoco>", **given)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"weights": {"efort": 1.0}},
+            r"weights=\{efort\} by name; got a function of \(t, s, c, a, eff",
+        ),
+        ({"weights": {}}, r"\(time, state, control, after\) and no weights; got a function of"),
+        ({"weights": {"effort": float("nan")}}, "weight effort must be a finite number; got nan"),
+        (
+            {"reward": lambda t, s, c, a, effort: jnp.ones(2)},
+            r"reward must return one number; got f",
+        ),
+        ({"features": lambda key: {"gain": 1.0}}, "there is no feature 'p0'.*features are gain"),
+        ({"features": lambda: {}}, r"features is called with \(key\); got a function of \(\)"),
+        ({"observe": lambda a, b: a}, r"observe is called with \(state\); got a function of"),
+    ],
+)
+def test_parts_of_an_ode_task_that_do_not_fit_are_named(options, message):
+    loop = ode(
+        lambda t, s, c, f: {"p": c * f["gain"]}, lambda f, key: {"p": f["p0"]}, dt=0.1, duration=1.0
+    )
+    usual = {
+        "reward": lambda t, s, c, a, effort: -effort * c**2,
+        "weights": {"effort": 1.0},
+        "features": {"gain": 1.0, "p0": 0.0},
+    }
+    with pytest.raises(ValueError, match=message):
+        ode_task(loop, Continuous(-1.0, 1.0), **usual | options)

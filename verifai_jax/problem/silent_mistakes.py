@@ -211,7 +211,8 @@ def difference(one: Program, other: Program) -> tuple[bool, str | None]:
     Operations, the constants among their operands, and plain parameters are compared.
     """
     if isinstance(one, Jaxpr) or isinstance(other, Jaxpr):
-        return _difference(getattr(one, "jaxpr", one), getattr(other, "jaxpr", other))
+        pair = [each.jaxpr if isinstance(each, ClosedJaxpr) else each for each in (one, other)]
+        return _difference(*pair)
     for a, b in zip(one.consts, other.consts, strict=False):
         if not _same_value(a, b):
             return True, _line_of_constant(one, a)

@@ -9,7 +9,9 @@ tested = replace(loop, controller=lambda time, state, features: trained.policy.a
 
 import dataclasses
 import functools
+import inspect
 import keyword
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, TypeVar
@@ -20,6 +22,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.core.checks import check_count, is_number
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.user_errors import check_called_with, defined_at, explain_user_error
 from verifai_jax.rl.task.stepping import abstract_action
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.systems.ode._ode import Ode, substep, updated
@@ -97,6 +100,10 @@ class OdeTask:
         weights = {name: getattr(self, name) for name in self.weights}
         earned = self.reward(start.time, start.state, control, now, **weights)
         reward = jnp.asarray(earned, jnp.float32)
+        if reward.size != 1:
+            raise ValueError(
+                f"reward must return one number; got {outline(earned)}{defined_at(self.reward)}"
+            )
         return OdeState(time, now, start.features), reward.reshape(()), over
 
     def observe(self, state: OdeState) -> Float[Array, " k"]:
@@ -158,11 +165,23 @@ def ode_task(
     draw = features if callable(features) else _constant(dict(features or {}))
     weights = dict(weights or {})
     _check_weights(weights)
+    _check_reward(reward, weights)
+    check_called_with("control", control, ("action",))
+    check_called_with("observe", observe, ("state",))
+    check_called_with("features", draw, ("key",))
     kind = _with_weights(tuple(weights)) if weights else OdeTask
     task = kind(loop, action, limit, reward, control, observe or _all_numbers, draw, **weights)
     key = jax.eval_shape(lambda: jax.random.key(0))
-    start = jax.eval_shape(task.reset, key)
-    after, _, _ = jax.eval_shape(task.step, key, start, abstract_action(action))
+    drawn = None
+    try:
+        drawn = jax.eval_shape(draw, key)
+        start = jax.eval_shape(task.reset, key)
+        after, _, _ = jax.eval_shape(task.step, key, start, abstract_action(action))
+    except ValueError:
+        raise
+    except Exception as error:
+        why = explain_user_error(error, drawn, system=False)
+        raise ValueError(f"the parts of the task do not fit together: {why}") from error
     if jax.tree.structure(after) != jax.tree.structure(start):
         raise ValueError(f"dynamics must return the derivative of {outline(start)}")
     jax.eval_shape(task.observe, start)
@@ -176,8 +195,24 @@ def _check_weights(weights: Mapping[str, float]) -> None:
             raise ValueError(f"a weight's name must be an identifier of its own; got {name!r}")
         if name in taken:
             raise ValueError(f"{name!r} cannot be a weight; taken are {', '.join(taken)}")
-        if not is_number(value):
-            raise ValueError(f"weight {name} must be a number; got {value!r}")
+        if not is_number(value) or not math.isfinite(value):
+            raise ValueError(f"weight {name} must be a finite number; got {value!r}")
+
+
+def _check_reward(reward: Reward, weights: Mapping[str, float]) -> None:
+    try:
+        signature = inspect.signature(reward)
+    except (TypeError, ValueError):
+        return  # Such as a function written in C, which says nothing of its arguments.
+    arguments = ("time", "state", "control", "after")
+    try:
+        signature.bind(*arguments, **weights)
+    except TypeError:
+        named = f" and weights={{{', '.join(weights)}}} by name" if weights else " and no weights"
+        raise ValueError(
+            f"reward is called with ({', '.join(arguments)}){named}; got a function of "
+            f"({', '.join(signature.parameters)}){defined_at(reward)}"
+        ) from None
 
 
 @functools.cache
