@@ -139,3 +139,11 @@ def test_command(tmp_path):
     assert result.exit_code == 0
     assert re.search(r"easy: fails with probability 0\.(09|1)", result.output)
     assert "p < 0.5    shown, by samples of the prior alone" in result.output
+
+
+def test_without_any_verdict_no_robustness_is_claimed():
+    lost = lambda f, key: vj.Trace({"x": (f["x"] * jnp.inf)[None]}, dt=1.0)  # noqa: E731
+    problem = vj.Problem("lost", {"x": vj.Box(1.0, 2.0)}, lost, "x > 0")
+    said = str(estimate(problem, budget=500, progress=False))
+    assert "no simulation gave a verdict" in said
+    assert "inf" not in said
