@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -262,6 +263,23 @@ def test_precision_of_a_run(call, tmp_path):
     assert (record["precision"], record["backend"]) == ("float64", None)
     output = call("falsify", "specs/ramp.py:ramp", "--backend", "native", code=2)
     assert "has no backends to choose from; got backend 'native'" in output
+
+
+@pytest.mark.thorough
+def test_replay_compares_each_formula_with_its_own_column(call, tmp_path):
+    (tmp_path / "specs" / "two.py").write_text(
+        "import jax.numpy as jnp\nimport verifai_jax as vj\n"
+        "def system(features, key):\n"
+        "    return vj.Trace({'x': features['a'] + jnp.zeros(3)}, dt=1.0)\n"
+        "spec = {'low': 'always x < 2', 'high': 'always x < 10'}\n"
+        "p = vj.Problem('two', {'a': vj.Box(3, 4)}, system, spec)\n"
+    )
+    call("falsify", "specs/two.py:p", "--search", "uniform", "--budget", 8, "--no-pictures")
+    output = call("replay", "runs/two-1", 0, "--no-pictures")
+    found = re.findall(r"robustness (\S+) in float64, (\S+) in the table", output)
+    assert len(found) == 2
+    for again, stored in found:
+        assert float(again) == pytest.approx(float(stored), abs=1e-5)
 
 
 @pytest.mark.thorough

@@ -163,6 +163,16 @@ def test_many_monitored_signals_leave_room_for_the_inputs():
     assert "and 2 more, not drawn: x, y" in figure.axes[-1].get_xlabel()
 
 
+@pytest.mark.thorough
+@pytest.mark.filterwarnings("error")
+def test_a_replay_in_double_precision_is_drawn_without_a_warning():
+    space = {"air": vj.Struct({"wind": vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)})}
+    run = vj.falsify(vj.Problem("p", space, pushed, "always x < 9"), "uniform", 4, batch=4)
+    figure = run.replay(0, "float64").plot(signals=["air.wind", "x"])
+    wind, x = (axes.lines[0].get_ydata() for axes in figure.axes)
+    assert jnp.allclose(wind, x)
+
+
 def test_a_simulation_without_a_verdict_has_no_robustness_in_its_title():
     def explodes(features, key):
         return vj.Trace({"x": jnp.array([1.0, 2e6, jnp.inf]) * features["a"]}, dt=1.0)

@@ -365,7 +365,7 @@ def test_ode_task_of_choices_and_what_it_refuses():
     reward = lambda time, state, torque, after: jnp.cos(after["angle"])  # noqa: E731
     with pytest.raises(ValueError, match=r"Discrete\(n=3\) needs control=..., a function"):
         ode_task(loop, Discrete(3), reward=reward, features={"pull": 9.8})
-    with pytest.raises(ValueError, match="there is no feature .pull.. It has none"):
+    with pytest.raises(ValueError, match=r"there is no feature .pull.\. It has none"):
         ode_task(loop, Continuous(-1.0, 1.0), reward=reward)
     message = "action must be a Discrete or a Continuous; got 3"
     with unchecked(), pytest.raises(ValueError, match=message):

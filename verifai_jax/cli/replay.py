@@ -49,7 +49,9 @@ def replay(
         click.echo(f"  {printable(name):<12} {text}")
     for name, rho in again.rho.items():
         click.echo(f"  {printable(run.formulas[name])}")
-        click.echo(f"    robustness {rho:.6g} in {precision}, {stored['rho']:.6g} in the table")
+        # With several formulas `rho` is the least, and each has a column of its own.
+        before = stored.get(f"rho.{name}", stored["rho"])
+        click.echo(f"    robustness {rho:.6g} in {precision}, {before:.6g} in the table")
     verdict = "violated" if again.violated else "satisfied"
     click.echo(f"  status {again.status.name.lower()}; {verdict}")
     give_result(

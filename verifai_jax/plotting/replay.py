@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +141,9 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
         if is_waveform(value):
             known = value.duration is not None or value.times is not None
             name = jax.tree_util.keystr(keys, simple=True, separator=".")
-            waveforms[name] = value if known else value.over(replay.duration or 1e-9)
+            wave = value if known else value.over(replay.duration or 1e-9)
+            # Those of a replay in double precision are of another type than JAX has here.
+            waveforms[name] = replace(wave, knots=np.asarray(wave.knots, np.float32))
     if not waveforms:
         return {}
     # In one program: each operation alone would compile one.
