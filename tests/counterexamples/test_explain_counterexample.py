@@ -233,3 +233,11 @@ def test_it_is_said_that_changed_features_have_no_verdict():
     run = vj.falsify(problem, "uniform", 32, progress=False)
     said = str(vj.explain(run))
     assert "simulations had no verdict, the first because of RuntimeError: solver lost" in said
+
+
+def test_without_nominal_features_and_gradients_it_says_what_is_missing():
+    system = vj.blackbox(lambda features: vj.Trace({"x": np.full(2, features["x"])}, dt=1.0))
+    run = vj.falsify(
+        vj.Problem("host", {"x": vj.Box(0.0, 2.0)}, system, "x < 1"), "uniform", 16, progress=False
+    )
+    assert "nominal, and has no gradient here: give nominal= to learn what" in str(vj.explain(run))

@@ -113,7 +113,6 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
         if nominal:
             raise
         at, known = Nominal(problem.space, np.full(problem.space.dim, 0.5, np.float32)), False
-        notes.append("the problem does not say what is nominal: only gradients tell what matters")
     replayed = replay(problem, entry, run_keys(run.seed)[1], number, run.precision)
     if not replayed.violated:
         notes.append("simulated again alone the row does not fail; see what confirm says of it")
@@ -140,6 +139,11 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     candidates.temperature = max(0.002 * float(spread), 1e-6)
     tangent = candidates.tangents(u[None])[0]
     gradient = np.full(len(u), np.nan) if tangent is None else tangent.gradient
+    if not known:
+        only = "only gradients tell what matters"
+        if tangent is None:
+            only = "and has no gradient here: give nominal= to learn what matters"
+        notes.append(f"the problem does not say what is nominal{':' if tangent else ','} {only}")
     notes += candidates.notes
     duration = replayed.duration or 0.0
     influences = []
