@@ -9,7 +9,8 @@ import verifai_jax as vj
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import loop
-from verifai_jax.falsification.surrogates import Surrogate, TraceForm, _padded
+from verifai_jax.falsification.surrogates import Surrogate, TraceForm, _padded, _spread
+from verifai_jax.mtl import parse, robustness
 from verifai_jax.search import TraceSurrogate, TuRBO
 
 DIM = 6
@@ -211,6 +212,57 @@ def test_traces_in_the_form_of_the_model():
     again = form.trace(jnp.asarray(form.flat(vj.Trace({"x": smooth}, dt=0.1))))
     assert again.length == 1001
     np.testing.assert_allclose(again.signals["x"], smooth, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("formula", "stride"),
+    [
+        ("always[0, 50] x > -2", 25),
+        ("always[0, 72] eventually[0, 8] x > -2", 25),
+        ("always[0.04, 60] x > -2", 4),
+        ("always x > -2", 25),
+        ("always (x > -2 | next x > 0)", 1),
+    ],
+)
+def test_the_monitor_sees_of_a_long_trace_what_the_windows_need(formula, stride):
+    whole = parse(formula)
+    form = TraceForm.of((("x", 0),), 0.01, 10_001, [whole])
+    assert form.stride == stride
+    smooth = np.sin(np.arange(10_001) / 900) * np.linspace(1, 2, 10_001)
+    trace = vj.Trace({"x": smooth}, dt=0.01)
+    seen = form.trace(jnp.asarray(form.flat(trace)))
+    assert seen.length == 10_000 // stride + 1
+    np.testing.assert_allclose(seen.signals["x"], smooth[::stride], atol=2e-3)
+    np.testing.assert_allclose(robustness(whole, seen), robustness(whole, trace), atol=1e-2)
+
+
+def test_short_traces_are_monitored_at_every_sample():
+    for length in (1, 2, 25, 257, 401, 511):
+        form = TraceForm.of((("x", 0),), 0.1, length, [parse("always x > 0")])
+        assert form.stride == 1
+
+
+def test_a_model_without_progress_is_believed_less():
+    better = 0.8 ** np.arange(20)
+    assert {_spread(better, number) for number in range(8)} == {1.0}
+    idle = np.append(better, np.ones(64))
+    spreads = [_spread(idle, number) for number in range(8)]
+    np.testing.assert_allclose(spreads, 2 * [4 ** (i / 3) for i in range(4)])
+    # A little better is no progress, and the factor is bounded.
+    little = np.append(better, better[-1] * 0.999 ** np.arange(1, 33))
+    assert _spread(little, 3) == pytest.approx(2)
+    assert _spread(np.ones(1000), 3) == pytest.approx(5)
+    # Nobody has to leave a failure.
+    assert _spread(np.append(-1.0, np.ones(100)), 3) == 1
+
+
+def test_the_best_rows_from_which_points_are_drawn_are_no_neighbours():
+    surrogate = Surrogate(problem(), SMALL, jax.random.key(0))
+    hollow = 0.5 + 0.02 * np.random.default_rng(0).random((40, DIM))
+    others = np.linspace(0, 0.3, 3)[:, None] * np.ones(DIM)
+    surrogate.u = np.concatenate([hollow, others]).astype(np.float32)
+    surrogate.rho = np.arange(43, dtype=np.float32)
+    np.testing.assert_array_equal(surrogate._parents(), surrogate.u[[0, 40, 41, 42]])
 
 
 @pytest.mark.parametrize("capacity", [16, 512, 5000])

@@ -157,3 +157,20 @@ def test_components_give_back_the_traces():
     np.testing.assert_allclose(again, traces, atol=1e-4)
     # Fewer rows than components.
     assert models.principal_components(traces[:2])[1].shape == (models.COMPONENTS, 200)
+
+
+def test_a_wider_draw_is_as_much_farther_from_the_mean(data):
+    x, coefficients, mask = data
+    hyper = models.first_hyper(WIDTH)
+    zero, components = jnp.zeros(2), jnp.eye(2)
+    model = models.condition(hyper, x, mask, coefficients, zero, components)
+    points = jnp.concatenate([x[:ROWS], x[:ROWS] + 0.3])
+
+    def drawn(spread):
+        waves, weights = models.draw(model, jax.random.key(1), 2, True, spread)
+        return np.asarray(models.basis(model, waves, points) @ weights)
+
+    (mean, once), (same, wide) = drawn(1.0), drawn(3.0)
+    np.testing.assert_array_equal(mean, same)
+    np.testing.assert_allclose(wide - mean, 3 * (once - mean), atol=2e-3)
+    assert np.abs(once - mean)[ROWS:].max() > 0.05

@@ -10,7 +10,8 @@ one batch. Where the model is sure of a failure all of them go there; where it i
 much as it knows too little (Thompson sampling). The real system decides on each.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,7 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.mtl import hard, smooth
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.formula import Formula, Interval, Next, Prev
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import TraceSurrogate
@@ -39,6 +41,8 @@ POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
 PARENTS = 8
 """Best rows around which half of them are."""
+NEIGHBOUR = 0.1
+"""Distance, greatest over the coordinates, up to which one row is the neighbour of another."""
 LEAST_ROWS = 64
 """Least number of rows that programs are compiled for; fewer are padded, more to four times it."""
 RATE = (0.1, 0.01)
@@ -48,6 +52,14 @@ TEMPERATURES = (0.3, 0.02)
 MEANS = 6
 """Of so many proposals one is the model's own guess, the mean of its posterior; where all are, a
 model that is wrong is not left."""
+PATIENCE = 16
+"""Rows without progress, before any failure, from which on the model is believed less."""
+PROGRESS = 0.9
+"""Share of the least robustness below which a new one is progress."""
+MOST_SPREAD = 5.0
+"""Greatest factor on the standard deviations of a model that is believed less."""
+SPREADS = 4
+"""Factors from one to the greatest, in turn."""
 APART = 1e-3
 """Distance, greatest over the coordinates, below which two points are the same."""
 
@@ -59,11 +71,32 @@ class TraceForm:
     - `signals`: names and components (0 for a plain signal), in order.
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
+    - `stride`: samples from one that the monitor sees of a model's trace to the next.
     """
 
     signals: tuple[tuple[str, int], ...]
     dt: float
     length: int
+    stride: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        signals: tuple[tuple[str, int], ...],
+        dt: float,
+        length: int,
+        formulas: Iterable[Formula],
+    ) -> "TraceForm":
+        """Return the form with the longest stride that the formulas leave.
+
+        A model's trace has no more detail than its modelled samples. Monitored at every sample of
+        a simulator, tens of thousands where there are a few hundred, it is the same at many times
+        the cost. Windows keep their bounds, and the last sample is seen.
+        """
+        divided = math.gcd(length - 1, *(_bounds(formulas, dt)))
+        strides = range(1, max(length - 1, 1) // SAMPLES + 1)
+        stride = max((n for n in strides if divided % n == 0), default=1)
+        return cls(signals, dt, length, stride)
 
     @property
     def places(self) -> Float[np.ndarray, " samples"]:
@@ -91,13 +124,13 @@ class TraceForm:
         return np.concatenate(parts).astype(np.float32)
 
     def trace(self, flat: Float[Array, " values"]) -> Trace:
-        """Return the trace of modelled samples; traced by JAX."""
-        places = self.places
-        left = np.arange(self.length) * (len(places) - 1) // max(self.length - 1, 1)
+        """Return the trace of modelled samples, every so many of its own; traced by JAX."""
+        places, own = self.places, np.arange(0, self.length, self.stride)
+        left = own * (len(places) - 1) // max(self.length - 1, 1)
         left = np.minimum(left, max(len(places) - 2, 0))
         right = np.minimum(left + 1, len(places) - 1)
         gap = np.maximum(places[right] - places[left], 1e-9)
-        weight = ((np.arange(self.length) - places[left]) / gap).astype(np.float32)
+        weight = ((own - places[left]) / gap).astype(np.float32)
         columns = flat.reshape(-1, len(places))
         columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
         signals, first = {}, 0
@@ -105,7 +138,7 @@ class TraceForm:
             signal = columns[first : first + max(components, 1)]
             signals[name] = signal.T if components else signal[0]
             first += max(components, 1)
-        return Trace(signals, self.dt, finite=tuple(signals))
+        return Trace(signals, self.dt * self.stride, finite=tuple(signals))
 
 
 class Surrogate:
@@ -200,20 +233,23 @@ class Surrogate:
         names, widths = checkpoint["surrogate.signals"], checkpoint["surrogate.components"]
         if length:
             signals = tuple((str(n), int(w)) for n, w in zip(names, widths, strict=True))
-            self.form = TraceForm(signals, float(dt), int(length))
+            self.form = self._form(signals, float(dt), int(length))
         self.hyper = models.TraceHyper(
             *(jnp.asarray(checkpoint[f"surrogate.{n}"]) for n in self.hyper._fields)
         )
+
+    def _form(self, signals: tuple[tuple[str, int], ...], dt: float, length: int) -> TraceForm:
+        return TraceForm.of(signals, dt, length, self.problem.formulas.values())
 
     def _extend(self, trace: Trace) -> None:
         """Take the form of the first trace, and of a longer one that comes later."""
         if self.form is None:
             assert trace.dt is not None
             signals = _signals(trace, sorted(self.problem.monitored))
-            self.form = TraceForm(signals, float(trace.dt), trace.length)
+            self.form = self._form(signals, float(trace.dt), trace.length)
         elif trace.length > self.form.length and self.form.fits(trace):
             before = self.form
-            self.form = TraceForm(before.signals, before.dt, trace.length)
+            self.form = self._form(before.signals, before.dt, trace.length)
             whole = [np.asarray(_held(before, row)) for row in self.traces]
             here = np.minimum(self.form.places, before.length - 1)
             own = np.arange(before.length)
@@ -252,14 +288,23 @@ class Surrogate:
         if 4 * (len(self.rho) - self.fitted) >= self.fitted:
             self.hyper = self._programs.fit(self.hyper, x, mask, coefficients)
             self.fitted = len(self.rho)
-        parents = self.u[np.argsort(self.rho, kind="stable")[:PARENTS]]
-        parents = np.resize(parents, (PARENTS, self.cube.dim))
+        parents = np.resize(self._parents(), (PARENTS, self.cube.dim))
         key = jax.random.fold_in(self.key, np.uint32(self.round))
         u, value = self._programs.descend(
             form, count, self.hyper, x, mask, coefficients, mean * scale, components * scale,
-            parents, key, np.bool_(guess),
+            parents, key, np.bool_(guess), np.float32(_spread(self.rho, self.round)),
         )  # fmt: skip
         return self._distinct(np.asarray(u), np.asarray(value))
+
+    def _parents(self) -> Float[np.ndarray, "parents d"]:
+        """Return the best rows that are no close neighbours, or else all are of one hollow."""
+        chosen = np.zeros((0, self.cube.dim), np.float32)
+        for point in self.u[np.argsort(self.rho, kind="stable")]:
+            if np.all(np.max(np.abs(chosen - point), axis=1) > NEIGHBOUR):
+                chosen = np.concatenate([chosen, point[None]])
+                if len(chosen) == PARENTS:
+                    break
+        return chosen
 
     def _distinct(
         self, u: Float[np.ndarray, "draws starts d"], value: Float[np.ndarray, "draws starts"]
@@ -299,12 +344,13 @@ class Descents:
         parents: Float[Array, "parents d"],
         key: Key[Array, ""],
         guess: Bool[Array, ""],
+        spread: Float[Array, ""],
     ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
         """Return where the descents on `count` drawn simulators end, and the value there."""
         cube = self.cube
         model = models.condition(hyper, x, mask, coefficients, mean, components)
         drawing, placing = jax.random.split(key)
-        waves, weights = models.draw(model, drawing, count, guess)
+        waves, weights = models.draw(model, drawing, count, guess, spread)
         pool = _pool(placing, parents, cube)
 
         def values(
@@ -354,6 +400,42 @@ class Descents:
 
 DESCENTS: Slot[TraceSurrogate, Descents] = Slot("descents on a model of the traces")
 """The programs of a problem for its surrogates, by their search."""
+
+
+def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
+    """Return the finite bounds of all windows in samples; those of one sample for "next"."""
+    bounds = []
+    for formula in formulas:
+        for part in formula.subformulas():
+            if isinstance(part, Next | Prev):
+                bounds.append(1)
+            window = getattr(part, "interval", None)
+            for bound in (window.start, window.end) if isinstance(window, Interval) else ():
+                if math.isfinite(bound):
+                    bounds.append(round(bound / dt))
+    return bounds
+
+
+def _spread(rho: Float[np.ndarray, " n"], number: int) -> float:
+    """Return the factor on the model's standard deviations: it grows while no row is progress.
+
+    A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
+    more widely, its simulators have their minima elsewhere. Behind a failure there is no need.
+
+    **Arguments:**
+
+    - `rho`: robustness of the rows, in the order in which they were simulated.
+    """
+    least = np.minimum.accumulate(rho)
+    if least[-1] <= 0:
+        return 1.0
+    best, last = rho[0], 0
+    for i in np.flatnonzero(np.diff(least)) + 1:
+        if rho[i] < PROGRESS * best:
+            best, last = rho[i], i
+    idle = len(rho) - 1 - last
+    most = min(max(1.0, idle / PATIENCE), MOST_SPREAD)
+    return most ** (number % SPREADS / (SPREADS - 1))
 
 
 def _signals(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:

@@ -154,9 +154,20 @@ def condition(
 
 
 def draw(
-    model: TraceModel, key: Key[Array, ""], count: int, guess: Bool[Array, ""] | bool = True
+    model: TraceModel,
+    key: Key[Array, ""],
+    count: int,
+    guess: Bool[Array, ""] | bool = True,
+    spread: Float[Array, ""] | float = 1.0,
 ) -> tuple[Waves, Float[Array, "count terms c"]]:
-    """Draw simulators from the posterior; the first one is its mean where it is to be a `guess`.
+    """Draw simulators from the posterior.
+
+    **Arguments:**
+
+    - `count`: of simulators.
+    - `guess`: whether the first one is the posterior's mean.
+    - `spread`: factor on the posterior's standard deviations; more than 1 where the model has been
+      too sure of itself. The mean, and the rows that it goes through, stay.
 
     **Returns:** what `basis` needs, and the weights of its terms for each of them.
     """
@@ -178,7 +189,7 @@ def draw(
     )
     amplitudes = amplitudes.reshape(count, terms + n, components)
     # The mean is the function that the prior's mean, zero, is taken to.
-    amplitudes = amplitudes.at[0].multiply(jnp.where(guess, 0.0, 1.0)) * model.scale
+    amplitudes = amplitudes.at[0].multiply(jnp.where(guess, 0.0, 1.0)) * (spread * model.scale)
     prior, noise = amplitudes[:, :terms], amplitudes[:, terms:]
     drawn = jnp.einsum("nt,jtc->jnc", _prior_basis(model, waves, model.x), prior)
     left = model.coefficients - drawn - jnp.exp(model.hyper.noise / 2) * noise
