@@ -52,8 +52,9 @@ TEMPERATURES = (0.3, 0.02)
 MEANS = 6
 """Of so many proposals one is the model's own guess, the mean of its posterior; where all are, a
 model that is wrong is not left."""
-PATIENCE = 16
-"""Rows without progress, before any failure, from which on the model is believed less."""
+PATIENCE = 4
+"""Rows for each dimension without progress, before any failure, from which on the model is believed
+less."""
 PROGRESS = 0.9
 """Share of the least robustness below which a new one is progress."""
 MOST_SPREAD = 5.0
@@ -292,7 +293,7 @@ class Surrogate:
         key = jax.random.fold_in(self.key, np.uint32(self.round))
         u, value = self._programs.descend(
             form, count, self.hyper, x, mask, coefficients, mean * scale, components * scale,
-            parents, key, np.bool_(guess), np.float32(_spread(self.rho, self.round)),
+            parents, key, np.bool_(guess), np.float32(_spread(self.rho, self.round, self.cube.dim)),
         )  # fmt: skip
         return self._distinct(np.asarray(u), np.asarray(value))
 
@@ -416,7 +417,7 @@ def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
     return bounds
 
 
-def _spread(rho: Float[np.ndarray, " n"], number: int) -> float:
+def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     """Return the factor on the model's standard deviations: it grows while no row is progress.
 
     A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
@@ -425,6 +426,8 @@ def _spread(rho: Float[np.ndarray, " n"], number: int) -> float:
     **Arguments:**
 
     - `rho`: robustness of the rows, in the order in which they were simulated.
+    - `number`: of the round.
+    - `dim`: of the cube.
     """
     least = np.minimum.accumulate(rho)
     if least[-1] <= 0:
@@ -434,7 +437,7 @@ def _spread(rho: Float[np.ndarray, " n"], number: int) -> float:
         if rho[i] < PROGRESS * best:
             best, last = rho[i], i
     idle = len(rho) - 1 - last
-    most = min(max(1.0, idle / PATIENCE), MOST_SPREAD)
+    most = min(max(1.0, idle / (PATIENCE * dim)), MOST_SPREAD)
     return most ** (number % SPREADS / (SPREADS - 1))
 
 
