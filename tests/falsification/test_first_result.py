@@ -6,6 +6,8 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.core import compilation
 from verifai_jax.evaluation.confirmation import Confirmer
+from verifai_jax.falsification import loop
+from verifai_jax.falsification.loop import Rounds
 
 
 def problem(bound=1.0):
@@ -77,3 +79,19 @@ def test_what_a_run_did_not_wait_for_is_no_work_of_the_next_one():
     run = vj.falsify(problem(), "uniform", budget=8, batch=8, progress=False)
     assert len(run.table) == 8
     assert not [work for work in compilation._meanwhile if hasattr(work, "__self__")]
+
+
+def test_replays_begun_in_a_wait_change_no_row(monkeypatch):
+    options = {"budget": 64, "batch": 32, "seed": 1, "progress": False}
+    monkeypatch.setattr(loop, "has_idle_core", lambda: False)
+    plain = vj.falsify(problem(), "uniform", **options)
+    begun = []
+    begin = Rounds._begin_replays
+    monkeypatch.setattr(Rounds, "_begin_replays", lambda self: [begun.append(1), begin(self)])
+    monkeypatch.setattr(loop, "has_idle_core", lambda: True)
+    # As if the first wait were long.
+    monkeypatch.setattr(loop, "while_compiling", lambda work, after=1.0: work())
+    ahead = vj.falsify(problem(), "uniform", **options)
+    assert begun == [1]
+    assert len(ahead.table.counterexamples)
+    assert ahead.table.all.equals(plain.table.all)

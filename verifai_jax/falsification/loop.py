@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.compilation import forget_work, while_compiling
-from verifai_jax.core.cores import available_cores
+from verifai_jax.core.cores import has_idle_core
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
@@ -152,8 +152,8 @@ class Rounds:
         if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
             self._confirmer.prepare()
-            if available_cores() > 1:
-                # Where the first round waits for long, a core has nothing else to do.
+            if has_idle_core():
+                # It has nothing else to do where the first round waits for long.
                 while_compiling(self._begin_replays)
         self.evaluate.compile()
         self._propose()
