@@ -244,18 +244,18 @@ def test_short_traces_are_monitored_at_every_sample():
 
 def test_a_model_without_progress_is_believed_less():
     better = 0.8 ** np.arange(20)
-    assert {_spread(better, number, 4) for number in range(8)} == {1.0}
+    assert {_spread(better, number, 2) for number in range(8)} == {1.0}
     idle = np.append(better, np.ones(64))
-    spreads = [_spread(idle, number, 4) for number in range(8)]
+    spreads = [_spread(idle, number, 2) for number in range(8)]
     np.testing.assert_allclose(spreads, 2 * [4 ** (i / 3) for i in range(4)])
     # A little better is no progress, and the factor is bounded.
     little = np.append(better, better[-1] * 0.999 ** np.arange(1, 33))
-    assert _spread(little, 3, 4) == pytest.approx(2)
-    assert _spread(np.ones(1000), 3, 4) == pytest.approx(5)
+    assert _spread(little, 3, 2) == pytest.approx(2)
+    assert _spread(np.ones(1000), 3, 2) == pytest.approx(5)
     # In more dimensions progress takes longer.
-    assert _spread(idle, 3, 8) == pytest.approx(2)
+    assert _spread(idle, 3, 4) == pytest.approx(2)
     # Nobody has to leave a failure.
-    assert _spread(np.append(-1.0, np.ones(100)), 3, 4) == 1
+    assert _spread(np.append(-1.0, np.ones(100)), 3, 2) == 1
 
 
 def test_the_best_rows_from_which_points_are_drawn_are_no_neighbours():

@@ -52,7 +52,7 @@ TEMPERATURES = (0.3, 0.02)
 MEANS = 6
 """Of so many proposals one is the model's own guess, the mean of its posterior; where all are, a
 model that is wrong is not left."""
-PATIENCE = 4
+PATIENCE = 8
 """Rows for each dimension without progress, before any failure, from which on the model is believed
 less."""
 PROGRESS = 0.9
