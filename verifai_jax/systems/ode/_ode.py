@@ -27,7 +27,7 @@ from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.ode.delay_line import DelayLine
 from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_factor, integrator
-from verifai_jax.systems.ode.switching import Switch, switched_step
+from verifai_jax.systems.ode.switching import Inputs, Switch, switched_step
 from verifai_jax.systems.pytree_checks import (
     as_floating,
     check_like,
@@ -340,11 +340,13 @@ def substep(
 ) -> Any:
     """Take one integration step of a loop from `begin` on, with its switches."""
 
-    def derivative(now: Time, state: PyTree) -> Any:
+    def dynamics(now: Time, state: PyTree, inputs: Inputs) -> Any:
+        control, features = inputs
         return loop.dynamics(now, state, control, within_step(features, begin, now))
 
     advance = integrator(loop.method)
-    return switched_step(advance, derivative, begin, state, dt, loop.switches, features)
+    inputs = (control, features)
+    return switched_step(advance, dynamics, begin, state, dt, loop.switches, inputs)
 
 
 def updated(loop: Ode, time: Time, state: PyTree, features: Features) -> Any:

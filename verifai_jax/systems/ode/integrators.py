@@ -7,9 +7,10 @@ The state is any pytree of floating-point arrays.
 """
 
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.core.errors import unknown_name
@@ -55,6 +56,29 @@ def rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
     return jax.tree.map(
         lambda s, a, b, c, d: s + dt / 6 * (a + 2 * (b + c) + d), state, k1, k2, k3, k4
     )
+
+
+def looped_rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
+    """Take a step of `rk4` by a loop over its stages, equal but for rounding.
+
+    The derivative is traced once instead of four times.
+    """
+
+    def stage(carry: tuple[PyTree, PyTree], parts: Float[Array, "2"]) -> Any:
+        slope, total = carry
+        share, weight = parts
+        begin = _advance(state, share * dt, slope)
+        slope = derivative(time + share * dt, begin)
+        return (slope, _advance(total, weight * dt, slope)), None
+
+    tableau = [[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]]
+    parts = jnp.array(tableau, jax.tree.leaves(state)[0].dtype)
+    return jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, state), state), parts)[0][1]
+
+
+def looped(advance: Integrator) -> Integrator:
+    """Return an integrator that compiles to less for the same step; itself where none does."""
+    return looped_rk4 if advance is rk4 else advance
 
 
 METHODS: dict[str, Integrator] = {

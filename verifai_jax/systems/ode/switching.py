@@ -7,8 +7,8 @@ A mode is a number in the state whose derivative is 0.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time
+from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time, looped
 
+Inputs: TypeAlias = tuple[PyTree, PyTree]
+"""The control and the features of a step."""
 BISECTIONS = 12
 """Halvings of the step on a cubic through its ends; one of Newton's steps follows."""
 
@@ -77,82 +79,141 @@ def latch(on: Any, condition: Any) -> Any:
 
 def switched_step(
     advance: Integrator,
-    derivative: Derivative,
+    dynamics: Callable[[Time, PyTree, Inputs], PyTree],
     time: Time,
     state: PyTree,
     dt: Step,
     switches: Sequence[Switch],
-    features: PyTree,
+    inputs: Inputs,
 ) -> Any:
     """Take one step, with the first switch in it located and the others at its end.
+
+    A step in which nothing happens, in no lane of a batch, costs what one without switches does.
+    JAX traces the dynamics as often for many switches as for one.
+
+    **Arguments:**
+
+    - `dynamics(time, state, inputs) -> derivative`.
+    - `inputs`: the control and the features, which guards and resets are given.
 
     Source of the derivative: the implicit function theorem at the instant, as in J. Hiskens and
     M. Pai, Trajectory sensitivity analysis of hybrid systems, IEEE Trans. Circuits Syst. I 47
     (2000), section III.
     """
-    end = advance(derivative, time, state, dt)
+    end = advance(lambda now, state: dynamics(now, state, inputs), time, state, dt)
     if not switches:
         return end
-
-    def guards(now: Any, state: PyTree) -> Float[Array, " switches"]:
-        return jnp.stack([jnp.asarray(s.guard(now, state, features)) for s in switches])
-
-    def reached(share: Any) -> PyTree:
-        return advance(derivative, time, state, share * dt)
-
+    state = jax.tree.map(jnp.asarray, state)
+    dtype = jax.tree.leaves(state)[0].dtype
+    time, dt = jnp.asarray(time, dtype), jnp.asarray(dt, dtype)
+    step = _Step(looped(advance), dynamics, time, state, dt, switches, inputs)
+    end = _as(end, state)
+    guards = step.guards
     # What is not finite stays so: no jump may hide it.
     happens = (guards(time, state) > 0) & (guards(time + dt, end) <= 0) & _finite(end)
-    cubic = _cubic(derivative, time, state, end, dt)
-    shares = _located(switches, features, cubic, time, dt, happens)
-    first, any_happens = jnp.argmin(shares), jnp.any(happens)
-    share = jax.lax.stop_gradient(jnp.min(shares))
-
-    def margin(share: Any) -> Any:
-        return guards(time + share * dt, reached(share))[first]
-
-    value, slope = jax.jvp(margin, (share,), (jnp.ones_like(share),))
-    slope = jax.lax.stop_gradient(slope)
-    # A guard that touches zero without crossing it leaves the instant where it is.
-    crosses = any_happens & (slope < 0)
-    share = jnp.clip(share - jnp.where(crosses, value / jnp.where(crosses, slope, 1), 0), 0, 1)
-    instant = time + share * dt
-    jumped = _reset(switches, jnp.arange(len(switches)) == first, instant, reached(share), features)
-    rest = advance(derivative, instant, jumped, (1 - share) * dt)
-
-    # The switch that has just happened is at zero. It happens again where it moved away and came
-    # back, not where it goes on falling.
-    slopes = derivative(instant, jumped)
-    _, rates = jax.jvp(guards, (instant, jumped), (jnp.ones_like(instant), slopes))
-    armed = jnp.where(jnp.arange(len(switches)) == first, rates > 0, guards(instant, jumped) > 0)
-    again = armed & (guards(time + dt, rest) <= 0)
-    rest = _reset(switches, again, time + dt, rest, features)
-    return _where(any_happens, rest, end)
+    # Under `vmap` this stays a branch, since the condition is common to all lanes.
+    return jax.lax.cond(
+        _in_any_lane(jnp.any(happens)), step.with_events, lambda end, _: end, end, happens
+    )
 
 
-def _located(
-    switches: Sequence[Switch],
-    features: PyTree,
-    cubic: Callable[[Any], PyTree],
-    time: Any,
-    dt: Any,
-    happens: Bool[Array, " switches"],
-) -> Float[Array, " switches"]:
-    """Return the share of the step at which each guard falls to zero; 1 where it does not."""
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """A step from `state` at `time` in which something may happen."""
 
-    def halve(_: Any, ends: tuple[Any, Any]) -> tuple[Any, Any]:
-        low, high = ends
-        middle = (low + high) / 2
-        guards = [
-            s.guard(time + middle[i] * dt, cubic(middle[i]), features)
-            for i, s in enumerate(switches)
-        ]
-        over = jnp.stack([jnp.asarray(guard) <= 0 for guard in guards])
-        return jnp.where(over, low, middle), jnp.where(over, middle, high)
+    advance: Integrator
+    dynamics: Callable[[Time, PyTree, Inputs], PyTree]
+    time: Any
+    state: Any
+    dt: Any
+    switches: Sequence[Switch]
+    inputs: Inputs
 
-    dtype = jnp.result_type(float, jax.tree.leaves(cubic(0.0))[0])
-    ends = (jnp.zeros(len(switches), dtype), jnp.ones(len(switches), dtype))
-    low, high = jax.lax.fori_loop(0, BISECTIONS, halve, jax.lax.stop_gradient(ends))
-    return jax.lax.stop_gradient(jnp.where(happens, (low + high) / 2, 1))
+    def guards(self, now: Any, state: PyTree) -> Float[Array, " switches"]:
+        features = self.inputs[1]
+        return jnp.stack([jnp.asarray(s.guard(now, state, features)) for s in self.switches])
+
+    def derivative(self, now: Time, state: PyTree) -> Any:
+        return _as(self.dynamics(now, state, self.inputs), state)
+
+    def with_events(self, end: PyTree, happens: Bool[Array, " switches"]) -> Any:
+        """Return the state at the end of the step, which is `end` where nothing happens."""
+        time, dt = self.time, self.dt
+        still = replace(self, state=_still(self.state), inputs=_still(self.inputs))
+        still = replace(still, time=_still(time), dt=_still(dt))
+        share, first, slope, course = still.located(_still(end), happens)
+        reached = self.advance(self.derivative, time, self.state, share * dt)
+
+        # The instant moves with all that the guard there depends on, and the state with it.
+        value = _chosen(first, self.guards(time + share * dt, reached))
+        moves = (value - _still(value)) / slope
+        share = share - moves
+        reached = jax.tree.map(lambda leaf, rate: leaf - rate * moves, reached, course)
+
+        instant = time + share * dt
+        jumped = self.reset(first, instant, reached)
+        rest = self.advance(self.derivative, instant, jumped, (1 - share) * dt)
+        again = still.armed(first, _still(instant), _still(jumped))
+        again &= self.guards(time + dt, rest) <= 0
+        return _where(jnp.any(happens), self.reset(again, time + dt, rest), end)
+
+    def located(
+        self, end: PyTree, happens: Bool[Array, " switches"]
+    ) -> tuple[Float[Array, ""], Bool[Array, " switches"], Float[Array, ""], PyTree]:
+        """Find the first switch in the step.
+
+        **Returns:** the share of the step at which it happens, 1 where nothing does; which it is;
+        and what the guard and the state gain there per share of the step: an infinite rate of the
+        guard where the instant stays, whatever the guard depends on.
+        """
+        share, first = self.bisected(end, happens)
+
+        def course(share: Any) -> tuple[Any, Any]:
+            reached = self.advance(self.derivative, self.time, self.state, share * self.dt)
+            return _chosen(first, self.guards(self.time + share * self.dt, reached)), reached
+
+        (value, _), (slope, rates) = jax.jvp(course, (share,), (jnp.ones_like(share),))
+        # A guard that touches zero without crossing it leaves the instant where it is.
+        crosses = jnp.any(happens) & (slope < 0)
+        newton = share - jnp.where(crosses, value / jnp.where(crosses, slope, 1), 0)
+        moves = crosses & (newton >= 0) & (newton <= 1)
+        return jnp.clip(newton, 0, 1), first, jnp.where(moves, slope, jnp.inf), rates
+
+    def bisected(
+        self, end: PyTree, happens: Bool[Array, " switches"]
+    ) -> tuple[Float[Array, ""], Bool[Array, " switches"]]:
+        """Return where on a cubic through the step the first guard falls, and which it is."""
+        course = _cubic(self.derivative, self.time, self.state, end, self.dt)
+
+        def halve(_: Any, found: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+            low, high, fallen = found
+            middle = (low + high) / 2
+            below = self.guards(self.time + middle * self.dt, course(middle)) <= 0
+            over = jnp.any(below & happens)
+            fallen = jnp.where(over, below & happens, fallen)
+            return jnp.where(over, low, middle), jnp.where(over, middle, high), fallen
+
+        one = jnp.ones_like(self.dt)
+        low, high, fallen = jax.lax.fori_loop(0, BISECTIONS, halve, (0 * one, one, happens))
+        # Of those that fall together, the first in the list.
+        first = fallen & (jnp.cumsum(fallen) == 1)
+        return jnp.where(jnp.any(happens), (low + high) / 2, 1), first
+
+    def armed(
+        self, first: Bool[Array, " switches"], instant: Any, jumped: PyTree
+    ) -> Bool[Array, " switches"]:
+        """Return which switches may happen in the rest of the step, behind the first."""
+        ahead = (jnp.ones_like(instant), self.derivative(instant, jumped))
+        guards, rates = jax.jvp(self.guards, (instant, jumped), ahead)
+        # The switch that has just happened is at zero. It happens again where it moved away and
+        # came back, not where it goes on falling.
+        return jnp.where(first, rates > 0, guards > 0)
+
+    def reset(self, chosen: Bool[Array, " switches"], now: Any, state: PyTree) -> Any:
+        for i, switch in enumerate(self.switches):
+            after = switch.reset(now, state, self.inputs[1])
+            state = _where(chosen[i], _as(after, state), state)
+        return state
 
 
 def _cubic(
@@ -160,7 +221,7 @@ def _cubic(
 ) -> Callable[[Any], PyTree]:
     """Return Hermite's cubic through a step, as a function of the share of it."""
     begins, ends = derivative(time, state), derivative(time + dt, end)
-    parts = jax.lax.stop_gradient((state, end, begins, ends))
+    parts = (state, end, begins, ends)
 
     def course(share: Any) -> PyTree:
         def leaf(y0: Any, y1: Any, f0: Any, f1: Any) -> Any:
@@ -173,16 +234,30 @@ def _cubic(
     return course
 
 
-def _reset(
-    switches: Sequence[Switch],
-    chosen: Bool[Array, " switches"],
-    time: Any,
-    state: PyTree,
-    features: PyTree,
-) -> Any:
-    for i, switch in enumerate(switches):
-        state = _where(chosen[i], switch.reset(time, state, features), state)
-    return state
+@jax.custom_batching.custom_vmap
+def _in_any_lane(condition: Any) -> Any:
+    """Return the condition, and in a batch whether it holds in any lane."""
+    return condition
+
+
+@_in_any_lane.def_vmap
+def _in_any_lane_of_batch(_: int, batched: Any, conditions: Any) -> tuple[Any, bool]:
+    whole = jnp.any(conditions, axis=0) if batched[0] else conditions
+    return _in_any_lane(whole), False
+
+
+def _chosen(first: Bool[Array, " switches"], guards: Float[Array, " switches"]) -> Any:
+    return jnp.sum(jnp.where(first, guards, 0))
+
+
+def _still(tree: PyTree) -> Any:
+    """Return the same, as what has no derivative."""
+    is_number = lambda leaf: isinstance(leaf, jax.Array)  # noqa: E731
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if is_number(x) else x, tree)
+
+
+def _as(values: PyTree, like: PyTree) -> Any:
+    return jax.tree.map(lambda value, leaf: jnp.asarray(value, leaf.dtype), values, like)
 
 
 def _finite(state: PyTree) -> Bool[Array, ""]:
