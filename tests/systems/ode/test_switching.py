@@ -130,6 +130,68 @@ def test_two_switches_in_one_step_both_happen():
     np.testing.assert_allclose(trace["x"], [0, 0, 0.075, 0.175, 0.275], atol=1e-6)
 
 
+def gears(count):
+    """A car that shifts up `count` times; its dynamics are the only ones that take a sine."""
+    calls = []
+
+    def dynamics(t, s, c, f):
+        calls.append(t)
+        return {"speed": f["push"] * (2 + jnp.sin(s["speed"])) / (1 + s["gear"]), "gear": 0.0 * t}
+
+    def shift(gear):
+        return Switch(
+            lambda t, s, f: jnp.where(s["gear"] == gear, 3.0 * gear + 2 - s["speed"], 1.0),
+            lambda t, s, f: {**s, "gear": s["gear"] + 1},
+        )
+
+    switches = [shift(gear) for gear in range(count)]
+    system = ode(
+        dynamics,
+        lambda f, key: {"speed": 0.0, "gear": 0.0},
+        dt=0.05,
+        duration=2.0,
+        switches=switches,
+    )
+    return system, calls
+
+
+def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one():
+    times, sines = [], []
+    for count in (1, 5):
+        system, calls = gears(count)
+        run = lambda push, system=system: system({"push": push})["speed"][-1]  # noqa: E731
+        one = str(jax.make_jaxpr(run)(ONE)).count("= sin ")
+        batch = str(jax.make_jaxpr(jax.vmap(run))(np.ones(3, np.float32))).count("= sin ")
+        slopes = str(jax.make_jaxpr(jax.grad(run))(ONE)).count("= sin ")
+        times.append(len(calls))
+        sines.append((one, batch, slopes))
+    assert times[0] == times[1]
+    assert sines[0] == sines[1]
+    # Four stages to the end of the step; where something happens, two for the cubic, one for each
+    # of three more integrations, and one for what the guards do behind the instant.
+    assert sines[0][:2] == (10, 10)
+
+
+@pytest.mark.thorough
+def test_a_batch_in_which_little_happens_is_what_its_simulations_are_alone():
+    """The branch of the events is taken by lanes in which nothing happens, too."""
+    system, _ = gears(3)
+
+    def last(push):
+        return system({"push": push})["speed"][-1]
+
+    both = jax.jit(jax.value_and_grad(last))
+    pushes = np.float32([0.1, 3.0, 8.0])
+    speeds, slopes = np.transpose([both(push) for push in pushes])
+    batch = jax.jit(jax.vmap(jax.value_and_grad(last)))(pushes)
+    np.testing.assert_allclose(batch, (speeds, slopes), rtol=2e-5)
+    # The derivative of a batch, of batches.
+    total = jax.grad(lambda pushes: jnp.sum(jax.vmap(jax.vmap(last))(pushes)))
+    np.testing.assert_allclose(jax.jit(total)(pushes[:, None])[:, 0], slopes, rtol=2e-5)
+    change = (both(3.01)[0] - both(2.99)[0]) / 0.02
+    assert slopes[1] == pytest.approx(float(change), rel=5e-3)
+
+
 @pytest.mark.thorough
 def test_no_jump_hides_what_is_not_finite():
     system = ode(

@@ -196,7 +196,9 @@ class _Step:
         one = jnp.ones_like(self.dt)
         low, high, fallen = jax.lax.fori_loop(0, BISECTIONS, halve, (0 * one, one, happens))
         # Of those that fall together, the first in the list.
-        first = fallen & (jnp.cumsum(fallen) == 1)
+        count = len(self.switches)
+        earlier = jnp.any(jnp.tri(count, k=-1, dtype=bool) & fallen, axis=1)
+        first = fallen & ~earlier
         return jnp.where(jnp.any(happens), (low + high) / 2, 1), first
 
     def armed(
