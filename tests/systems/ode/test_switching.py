@@ -130,13 +130,19 @@ def test_two_switches_in_one_step_both_happen():
     np.testing.assert_allclose(trace["x"], [0, 0, 0.075, 0.175, 0.275], atol=1e-6)
 
 
-def gears(count):
-    """A car that shifts up `count` times; its dynamics are the only ones that take a sine."""
+def gears(count, extra=0):
+    """A car that shifts up `count` times; nothing but its dynamics takes a sine.
+
+    They have so many `extra` operations.
+    """
     calls = []
 
     def dynamics(t, s, c, f):
         calls.append(t)
-        return {"speed": f["push"] * (2 + jnp.sin(s["speed"])) / (1 + s["gear"]), "gear": 0.0 * t}
+        force = f["push"] * (2 + jnp.sin(s["speed"]))
+        for _ in range(extra):
+            force = force * 1.0
+        return {"speed": force / (1 + s["gear"]), "gear": 0.0 * t}
 
     def shift(gear):
         return Switch(
@@ -155,10 +161,11 @@ def gears(count):
     return system, calls
 
 
-def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one():
+@pytest.mark.parametrize(("extra", "copies"), [(0, 19), (30, 10)])
+def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one(extra, copies):
     times, sines = [], []
     for count in (1, 5):
-        system, calls = gears(count)
+        system, calls = gears(count, extra)
         run = lambda push, system=system: system({"push": push})["speed"][-1]  # noqa: E731
         one = str(jax.make_jaxpr(run)(ONE)).count("= sin ")
         batch = str(jax.make_jaxpr(jax.vmap(run))(np.ones(3, np.float32))).count("= sin ")
@@ -167,15 +174,15 @@ def test_the_dynamics_are_traced_as_often_for_many_switches_as_for_one():
         sines.append((one, batch, slopes))
     assert times[0] == times[1]
     assert sines[0] == sines[1]
-    # Four stages to the end of the step; where something happens, two for the cubic, one for each
-    # of three more integrations, and one for what the guards do behind the instant.
-    assert sines[0][:2] == (10, 10)
+    # Four stages to the end of the step; where something happens, two for the cubic, four or a loop
+    # for each of three more integrations, and one for what the guards do behind the instant.
+    assert sines[0][:2] == (copies, copies)
 
 
 @pytest.mark.thorough
 def test_a_batch_in_which_little_happens_is_what_its_simulations_are_alone():
     """The branch of the events is taken by lanes in which nothing happens, too."""
-    system, _ = gears(3)
+    system, _ = gears(3, 30)
 
     def last(push):
         return system({"push": push})["speed"][-1]

@@ -76,11 +76,6 @@ def looped_rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> P
     return jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, state), state), parts)[0][1]
 
 
-def looped(advance: Integrator) -> Integrator:
-    """Return an integrator that compiles to less for the same step; itself where none does."""
-    return looped_rk4 if advance is rk4 else advance
-
-
 METHODS: dict[str, Integrator] = {
     "rk4": rk4,
     "euler": euler,

@@ -16,12 +16,16 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.user_errors import check_called_with
-from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time, looped
+from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Time, looped_rk4, rk4
 
 Inputs: TypeAlias = tuple[PyTree, PyTree]
 """The control and the features of a step."""
 BISECTIONS = 12
 """Halvings of the step on a cubic through its ends; one of Newton's steps follows."""
+
+SHORT = 20
+"""Operations of the dynamics up to which XLA compiles the stages of `rk4` written out; where there
+are more, a loop over the stages compiles faster."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,9 @@ def switched_step(
     state = jax.tree.map(jnp.asarray, state)
     dtype = jax.tree.leaves(state)[0].dtype
     time, dt = jnp.asarray(time, dtype), jnp.asarray(dt, dtype)
-    step = _Step(looped(advance), dynamics, time, state, dt, switches, inputs)
+    if advance is rk4 and _length(dynamics, time, state, inputs) > SHORT:
+        advance = looped_rk4
+    step = _Step(advance, dynamics, time, state, dt, switches, inputs)
     end = _as(end, state)
     guards = step.guards
     # What is not finite stays so: no jump may hide it.
@@ -246,6 +252,15 @@ def _in_any_lane(condition: Any) -> Any:
 def _in_any_lane_of_batch(_: int, batched: Any, conditions: Any) -> tuple[Any, bool]:
     whole = jnp.any(conditions, axis=0) if batched[0] else conditions
     return _in_any_lane(whole), False
+
+
+def _length(
+    dynamics: Callable[[Time, PyTree, Inputs], PyTree], time: Any, state: PyTree, inputs: Inputs
+) -> int:
+    """Count the operations of the dynamics."""
+    traced = jax.make_jaxpr(lambda now, state: dynamics(now, state, inputs))(time, state)
+    inner = [step.params.get("jaxpr") for step in traced.jaxpr.eqns]
+    return sum(len(program.eqns) if hasattr(program, "eqns") else 1 for program in inner)
 
 
 def _chosen(first: Bool[Array, " switches"], guards: Float[Array, " switches"]) -> Any:
