@@ -73,7 +73,7 @@ def test_rare_failures_are_compared_by_estimates():
     system = lambda f, key: vj.Trace({"x": jnp.full(2, f["x"] - f["k"])}, dt=1.0)  # noqa: E731
     problem = vj.Problem("tail", space, system, "always x < 3", nominal={"k": 1.0, "x": 0.0})
     result = repair(problem, "k", 4000)
-    estimates = result.estimate(4000, seed=2)
+    estimates = result.estimate("monte_carlo", 4000, seed=2)
     for estimate, k in ((estimates.before, 1.0), (estimates.after, result.parameters["k"])):
         share = norm.sf(3 + k)
         if estimate.probability is None:

@@ -76,7 +76,7 @@ def repair(
         seed=result.seed,
     )
     if estimate is not None:
-        estimates = result.estimate(estimate, seed=result.seed)
+        estimates = result.estimate(budget=estimate, seed=result.seed)
         click.echo(printable(str(estimates)))
         give_result(estimate_before=estimates.before, estimate_after=estimates.after)
     if plot is not None:

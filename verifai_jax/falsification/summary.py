@@ -39,8 +39,8 @@ def summarize(run: Run) -> str:
     if failed:
         statuses = ", ".join(f"{n} {status}" for status, n in counts.failed.items())
         lines.append(f"  no verdict   {statuses}")
-        if counts.first_message is not None:
-            number, message = counts.first_message
+        if (first := first_message(run)) is not None:
+            number, message = first
             lines.append(f"               first in row {number}: {one_line(message)}")
     if lost := counts.not_differentiated:
         lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
@@ -68,6 +68,20 @@ def summarize(run: Run) -> str:
     lines.append(f"  search       {run.search}, seed {run.seed}")
     # Names, values and notes come from files and systems, which a terminal must not obey.
     return printable("\n".join(lines))
+
+
+def first_message(run: Run) -> tuple[int, str] | None:
+    """Return number and text of the first row that has one, of those without a verdict.
+
+    Rows of a traced system have none; what it knows of its first error stands for them.
+    """
+    counts = run.table.counts
+    if counts.first_message is not None or run.problem is None or "error" not in counts.failed:
+        return counts.first_message
+    rows = run.table.failed
+    row = rows[rows["status"] == "error"].iloc[0]
+    reason = run.problem.system.why_error({name: row[name] for name in run.table.features})
+    return None if reason is None else (int(row.name), reason)  # pyright: ignore[reportArgumentType]
 
 
 def _headline(run: Run, violating: int) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.confirmation_verdicts import MEANING, NOT_CLAIMED, VERDICTS
 from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.summary import first_message
 from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
@@ -262,8 +263,8 @@ def _without_verdict(run: Run) -> list[Markup]:
             "its lower end and for failing at its upper end."
         )
     ]
-    if counts.first_message is not None:
-        row_number, message = counts.first_message
+    if (first := first_message(run)) is not None:
+        row_number, message = first
         content.append(paragraph(f"The first message, of row {row_number}:"))
         content.append(preformatted(message[:2000]))
     return content

@@ -229,7 +229,9 @@ class Repair:
         assert self.make_nominal is not None
         return self.make_nominal()
 
-    def estimate(self, budget: int = 50_000, **options: Any) -> RepairEstimates:
+    def estimate(
+        self, method: str | None = None, budget: int = 50_000, **options: Any
+    ) -> RepairEstimates:
         """Estimate the failure probabilities before and after, where failures are rare.
 
         The check counts failures in samples of the prior, among which rare ones are none. This
@@ -237,15 +239,15 @@ class Repair:
 
         **Arguments:**
 
+        - `method`, `options`: of `vj.estimate`.
         - `budget`: simulations at most for each of the two.
-        - `options`: of `vj.estimate`.
 
         **Raises:** as `vj.estimate`.
         """
         estimate = late("verifai_jax.estimation", "estimate")
         problems = (self.nominal_problem, self.problem)
         return RepairEstimates(
-            self.name, *(estimate(problem, budget=budget, **options) for problem in problems)
+            self.name, *(estimate(problem, method, budget, **options) for problem in problems)
         )
 
     def __str__(self) -> str:

@@ -144,6 +144,15 @@ class System:
         """Return the reason why an engine cannot simulate this system, None where it can."""
         return None if backend in self.backends else "the system has no such backend"
 
+    def why_error(self, features: Features) -> str | None:
+        """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.
+
+        **Arguments:**
+
+        - `features`: numbers by the names of the table's columns.
+        """
+        return None
+
     @property
     def can_simulate_batch(self) -> bool:
         """True for a host system that simulates many rows in lock-step."""

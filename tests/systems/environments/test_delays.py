@@ -113,6 +113,19 @@ def test_a_delay_is_searched_as_any_feature():
         vj.Problem("late", {"x": vj.Box(0, 1)}, system, "always theta < 1").check()
 
 
+@pytest.mark.thorough
+def test_a_run_says_which_delay_is_too_long():
+    pytest.importorskip("gymnax")
+    from verifai_jax.systems.environments._gymnax import gymnax
+
+    system = gymnax("CartPole-v1", lean_jax, steps=STEPS, action_delay={"lag": 2})
+    problem = vj.Problem("late", {"lag": vj.DiscreteBox(0, 5)}, system, "always abs(theta) < 12deg")
+    run = vj.falsify(problem, "uniform", 64, batch=64, confirm=False)
+    first = run.table.failed.iloc[0]
+    said = "feature 'lag' of CartPole-v1 must be a whole number of steps from 0 to 2; got "
+    assert f"first in row {first.name}: {said}{int(first['lag'])}" in str(run)
+
+
 def test_lines():
     line = Line.of({"a": jnp.zeros(2)}, 2)
     got = []

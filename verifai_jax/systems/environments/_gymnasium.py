@@ -212,13 +212,9 @@ class EpisodeFunction:
 
         **Raises:** `ValueError` for a feature that says none.
         """
-        steps = np.asarray(delay.steps(features))
-        if steps.shape != () or not bool(delay.valid(features)):
-            raise ValueError(
-                f"feature {delay.feature!r} of {self.name} must be a whole number of steps from 0 "
-                f"to {delay.most}; got {steps}"
-            )
-        return int(steps)
+        if (refusal := delay.refusal(features, self.name)) is not None:
+            raise ValueError(refusal)
+        return int(delay.steps(features))
 
     def _act(self, env: Env, observation: object, features: Mapping[str, Any], time: float) -> Any:
         if self._decide is None:

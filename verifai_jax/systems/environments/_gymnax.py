@@ -211,6 +211,11 @@ class Gymnax(System):
         self.observation_delay.check(features)
         self.action_delay.check(features)
 
+    def why_error(self, features: Features) -> str | None:
+        """Say which delay is none that the environment was made for."""
+        delays = (self.observation_delay, self.action_delay)
+        return next(filter(None, (d.refusal(features, self.env.name) for d in delays)), None)
+
 
 @suggests_options
 def gymnax(

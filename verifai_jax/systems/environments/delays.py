@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from verifai_jax.systems.base import Features
@@ -40,6 +41,16 @@ class Delay(NamedTuple):
         """Return whether the feature's value is a whole number from 0 to the greatest."""
         steps = self.steps(features)
         return (steps >= 0) & (steps <= self.most) & (steps % 1 == 0)
+
+    def refusal(self, features: Features, owner: str) -> str | None:
+        """Return what is wrong with the feature's value; None for a delay that `owner` can have."""
+        steps = np.asarray(self.steps(features))
+        if steps.shape == () and bool(self.valid(features)):
+            return None
+        return (
+            f"feature {self.feature!r} of {owner} must be a whole number of steps from 0 to "
+            f"{self.most}; got {steps}"
+        )
 
     def check(self, features: Features) -> None:
         """Refuse a feature that draws real numbers, before anything compiles.
