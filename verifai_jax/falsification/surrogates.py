@@ -284,18 +284,18 @@ class Surrogate:
         size = _padded(len(self.rho), self.search.capacity)
         missing = size - len(self.rho)
         coefficients = np.pad(coefficients, ((0, missing), (0, 0)))
-        x = np.pad(np.asarray(_embed(self.u, self.cube)), ((0, missing), (0, 0)))
+        u = np.pad(self.u, ((0, missing), (0, 0)), constant_values=0.5)
         mask = np.arange(size) < len(self.rho)
         if 4 * (len(self.rho) - self.fitted) >= self.fitted:
-            self.hyper = self._programs.fit(self.hyper, x, mask, coefficients)
+            self.hyper = self._programs.fit(self.hyper, u, mask, coefficients)
             self.fitted = len(self.rho)
         parents = np.resize(self._parents(), (PARENTS, self.cube.dim))
         key = jax.random.fold_in(self.key, np.uint32(self.round))
-        u, value = self._programs.descend(
-            form, count, self.hyper, x, mask, coefficients, mean * scale, components * scale,
+        ends, value = self._programs.descend(
+            form, count, self.hyper, u, mask, coefficients, mean * scale, components * scale,
             parents, key, np.bool_(guess), np.float32(_spread(self.rho, self.round, self.cube.dim)),
         )  # fmt: skip
-        return self._distinct(np.asarray(u), np.asarray(value))
+        return self._distinct(np.asarray(ends), np.asarray(value))
 
     def _parents(self) -> Float[np.ndarray, "parents d"]:
         """Return the best rows that are no close neighbours, or else all are of one hollow."""
@@ -329,7 +329,12 @@ class Descents:
         self.end: End = problem.end
         self.search, self.cube = search, problem.space.cube
         self.goals = goals_of(problem.formulas.values())
-        self.fit = jax.jit(models.fit)
+        # Rows become what the model takes inside of the programs: outside each operation would
+        # compile a program for each number of rows.
+        cube = self.cube
+        self.fit = jax.jit(
+            lambda hyper, u, *rest: models.fit(hyper, _embed(u, cube), *rest),
+        )
         self.descend: Any = jax.jit(self._descend, static_argnums=(0, 1))
 
     def _descend(
@@ -337,7 +342,7 @@ class Descents:
         form: TraceForm,
         count: int,
         hyper: models.TraceHyper,
-        x: Float[Array, "n x"],
+        u: Float[Array, "n d"],
         mask: Array,
         coefficients: Float[Array, "n c"],
         mean: Float[Array, " values"],
@@ -349,6 +354,7 @@ class Descents:
     ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
         """Return where the descents on `count` drawn simulators end, and the value there."""
         cube = self.cube
+        x = _embed(u, cube)
         model = models.condition(hyper, x, mask, coefficients, mean, components)
         drawing, placing = jax.random.split(key)
         waves, weights = models.draw(model, drawing, count, guess, spread)
