@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-from verifai_jax.core import cores as devices
-
 
 def run(code, **environment):
     return subprocess.run(
@@ -66,17 +64,3 @@ def test_compiled_programs_outlive_the_process(tmp_path):
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "home").exists()
     assert devices.cache_folder() is None  # as tests/conftest.py sets it
-
-
-@pytest.mark.parametrize(
-    ("cores", "load", "idle"), [(2, 0.7, True), (2, 2.5, False), (1, 0.0, False), (4, None, True)]
-)
-def test_a_core_is_idle_where_the_machine_has_had_less_work(monkeypatch, cores, load, idle):
-    def average():
-        if load is None:
-            raise OSError
-        return load, 0.0, 0.0
-
-    monkeypatch.setattr(devices, "available_cores", lambda: cores)
-    monkeypatch.setattr(os, "getloadavg", average)
-    assert devices.has_idle_core() == idle

@@ -114,11 +114,6 @@ def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
     _meanwhile[work] = after
 
 
-def forget_work(work: Callable[[], object]) -> None:
-    """Do no longer what was to be done at the next wait; nothing where it is done already."""
-    _meanwhile.pop(work, None)
-
-
 @contextmanager
 def tracing(name: str = "") -> Iterator[None]:
     """Return a context, or a decorator, for tracing programs: the garbage collector waits.

@@ -22,19 +22,6 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def has_idle_core() -> bool:
-    """Return whether this process may use several cores and the machine has been less busy lately.
-
-    Where the machine does not say how busy it is, it is taken for idle.
-    """
-    cores = available_cores()
-    try:
-        load = os.getloadavg()[0]
-    except (AttributeError, OSError):
-        load = 0.0
-    return cores > 1 and load < cores
-
-
 def claim_cores() -> None:
     """Give JAX one host device per core, unless its backend runs or the user chose a number.
 

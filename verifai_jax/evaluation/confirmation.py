@@ -112,17 +112,6 @@ class Confirmer:
         with suppress(Exception):
             self._plan = _make_plan(self, space.rows(features))
 
-    def begin_compiling(self, count: int) -> None:
-        """Compile what replays so many rows in the background, where it could be traced.
-
-        **Arguments:**
-
-        - `count`: rows that are replayed together; of what is compiled already nothing is again.
-        """
-        checks = {} if self._plan is None else self._plan.checks
-        for check in checks.values():
-            check.replays.begin_compiling(check.factor, count)
-
     def __call__(
         self,
         rows: Mapping[str, Any],

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.compilation import forget_work, while_compiling
-from verifai_jax.core.cores import has_idle_core
+from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Status
@@ -22,7 +21,6 @@ from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
-from verifai_jax.evaluation.replays import ONE_BY_ONE
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.ahead import Ahead
@@ -152,18 +150,8 @@ class Rounds:
         if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
             self._confirmer.prepare()
-            if has_idle_core():
-                # It has nothing else to do where the first round waits for long.
-                while_compiling(self._begin_replays)
         self.evaluate.compile()
         self._propose()
-
-    def _begin_replays(self) -> None:
-        """Compile what replays a few rows, and many where a round may have as many failures."""
-        assert self._confirmer is not None
-        self._confirmer.begin_compiling(1)
-        if self.batch > ONE_BY_ONE:
-            self._confirmer.begin_compiling(ONE_BY_ONE + 1)
 
     def _propose(self) -> None:
         """Begin the proposals of the search."""
@@ -312,7 +300,6 @@ class Rounds:
             return
         if verdicts is None:
             verdicts = self._verdicts(points, first, given=len(given) > 0)
-        forget_work(self._begin_replays)
         columns = self._columns(verdicts)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(points), suggested)
