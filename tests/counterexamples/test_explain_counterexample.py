@@ -187,7 +187,7 @@ def test_times_of_signals_are_those_of_the_whole_simulation_where_it_ends_early(
     # Over at 2.1 s of 8 s, so that of the points at 0, 2, 4, 6 and 8 s the first three matter.
     system = vj.ode(
         lambda t, s, c, f: {"x": f["w"](t)}, lambda f, key: {"x": 0.0}, dt=0.1, duration=8.0,
-        terminate=lambda s, f: s["x"] > 1.0,
+        terminate=lambda s, f: s["x"] > 1.05,
         signals=lambda t, s, c, f: {"x": s["x"], "seen": f["w"](t)},
     )  # fmt: skip
     space = {"w": vj.Signal(vj.Box(0.0, 1.0), knots=5)}
