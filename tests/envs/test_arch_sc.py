@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 from envs.arch import steam_condenser as model
 from specs.arch import steam_condenser as specs
+from verifai_jax.core.precision import in_precision
 from verifai_jax.core.waveform import Waveform
 
 REFERENCE = {0: 90, 1: 89.967437, 2: 89.888320, 3: 88.703232, 5: 86.490329, 10: 87.304953,
@@ -53,7 +54,7 @@ def test_values_of_the_sheet(simulate):
 @pytest.mark.thorough
 def test_a_program_with_an_adaptive_solver():
     knots, dt = np.random.default_rng(3).choice([3.99, 4.01], 6), 6.0 / 6
-    with jax.enable_x64(True):
+    with in_precision("float64"):
         system = model.steam_condenser(duration=6.0)
         trace = jax.jit(lambda k: system({"steam": Waveform(k, "constant")}))(jnp.asarray(knots))
         trace = {name: np.asarray(value) for name, value in trace.signals.items()}
@@ -71,7 +72,7 @@ def test_many_pieces_break_it_and_twenty_do_not():
     """The steepest input of n pieces at the best instant, by linear responses, then simulated."""
     system = model.steam_condenser()
     published = {20: 0.0203, 35: 0.0029, 70: -0.00033}
-    with jax.enable_x64(True):
+    with in_precision("float64"):
         run = jax.jit(jax.vmap(lambda k: system({"steam": Waveform(k, "constant")})["P"][3000:]))
         usual = np.full((141, 140), 4.0)
         pushed = np.asarray(run(usual + 1e-3 * np.eye(141, 140)))
