@@ -9,7 +9,8 @@ import verifai_jax as vj
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import loop
-from verifai_jax.falsification.surrogates import Surrogate, TraceForm, _padded, _spread
+from verifai_jax.falsification.surrogates import Surrogate, _padded, _spread
+from verifai_jax.falsification.trace_form import TraceForm
 from verifai_jax.mtl import parse, robustness
 from verifai_jax.search import TraceSurrogate, TuRBO
 

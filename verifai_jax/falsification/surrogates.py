@@ -10,9 +10,7 @@ one batch. Where the model is sure of a failure all of them go there; where it i
 much as it knows too little (Thompson sampling). The real system decides on each.
 """
 
-import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -24,10 +22,10 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.trace_form import TraceForm, signals_of
 from verifai_jax.mtl import hard, smooth
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.formula import Formula, Interval, Next, Prev
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import TraceSurrogate
@@ -35,8 +33,6 @@ from verifai_jax.search import trace_model as models
 from verifai_jax.search.base import draw_uniform, standard_normal
 from verifai_jax.search.process_data import snap
 
-SAMPLES = 256
-"""Samples of a signal that are modelled; those between are interpolated."""
 POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
 PARENTS = 8
@@ -63,83 +59,6 @@ SPREADS = 4
 """Factors from one to the greatest, in turn."""
 APART = 1e-3
 """Distance, greatest over the coordinates, below which two points are the same."""
-
-
-@dataclass(frozen=True)
-class TraceForm:
-    """The form of the modelled traces.
-
-    - `signals`: names and components (0 for a plain signal), in order.
-    - `dt`: sampling period in seconds.
-    - `length`: number of samples.
-    - `stride`: samples from one that the monitor sees of a model's trace to the next.
-    """
-
-    signals: tuple[tuple[str, int], ...]
-    dt: float
-    length: int
-    stride: int = 1
-
-    @classmethod
-    def of(
-        cls,
-        signals: tuple[tuple[str, int], ...],
-        dt: float,
-        length: int,
-        formulas: Iterable[Formula],
-    ) -> "TraceForm":
-        """Return the form with the longest stride that the formulas leave.
-
-        A model's trace has no more detail than its modelled samples. Monitored at every sample of
-        a simulator, tens of thousands where there are a few hundred, it is the same at many times
-        the cost. Windows keep their bounds, and the last sample is seen.
-        """
-        divided = math.gcd(length - 1, *(_bounds(formulas, dt)))
-        strides = range(1, max(length - 1, 1) // SAMPLES + 1)
-        stride = max((n for n in strides if divided % n == 0), default=1)
-        return cls(signals, dt, length, stride)
-
-    @property
-    def places(self) -> Float[np.ndarray, " samples"]:
-        """Places of the modelled samples among all."""
-        return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
-
-    def fits(self, trace: Trace) -> bool:
-        """Return whether a trace has these signals and this clock, whatever its length is."""
-        names = [name for name, _ in self.signals]
-        same = all(name in trace.signals for name in names)
-        same = same and _signals(trace, names) == self.signals
-        return same and bool(np.isclose(trace.dt or 0.0, self.dt))
-
-    def flat(self, trace: Trace) -> Float[np.ndarray, " values"]:
-        """Return the modelled samples of a trace, signal after signal."""
-        own, parts = np.arange(self.length), []
-        for name, _ in self.signals:
-            signal = np.asarray(trace.signals[name])
-            # Truth values are +1 and -1 in formulas.
-            signal = np.where(signal, 1.0, -1.0) if signal.dtype == bool else signal
-            signal = signal.reshape(len(signal), -1)
-            # A shorter one stays as it ended.
-            signal = signal[np.minimum(own, len(signal) - 1)]
-            parts += [np.interp(self.places, own, column) for column in signal.T]
-        return np.concatenate(parts).astype(np.float32)
-
-    def trace(self, flat: Float[Array, " values"]) -> Trace:
-        """Return the trace of modelled samples, every so many of its own; traced by JAX."""
-        places, own = self.places, np.arange(0, self.length, self.stride)
-        left = own * (len(places) - 1) // max(self.length - 1, 1)
-        left = np.minimum(left, max(len(places) - 2, 0))
-        right = np.minimum(left + 1, len(places) - 1)
-        gap = np.maximum(places[right] - places[left], 1e-9)
-        weight = ((own - places[left]) / gap).astype(np.float32)
-        columns = flat.reshape(-1, len(places))
-        columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
-        signals, first = {}, 0
-        for name, components in self.signals:
-            signal = columns[first : first + max(components, 1)]
-            signals[name] = signal.T if components else signal[0]
-            first += max(components, 1)
-        return Trace(signals, self.dt * self.stride, finite=tuple(signals))
 
 
 class Surrogate:
@@ -246,12 +165,12 @@ class Surrogate:
         """Take the form of the first trace, and of a longer one that comes later."""
         if self.form is None:
             assert trace.dt is not None
-            signals = _signals(trace, sorted(self.problem.monitored))
+            signals = signals_of(trace, sorted(self.problem.monitored))
             self.form = self._form(signals, float(trace.dt), trace.length)
         elif trace.length > self.form.length and self.form.fits(trace):
             before = self.form
             self.form = self._form(before.signals, before.dt, trace.length)
-            whole = [np.asarray(_held(before, row)) for row in self.traces]
+            whole = [np.asarray(before.held(row)) for row in self.traces]
             here = np.minimum(self.form.places, before.length - 1)
             own = np.arange(before.length)
             each = [np.concatenate([np.interp(here, own, c) for c in row]) for row in whole]
@@ -409,20 +328,6 @@ DESCENTS: Slot[TraceSurrogate, Descents] = Slot("descents on a model of the trac
 """The programs of a problem for its surrogates, by their search."""
 
 
-def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
-    """Return the finite bounds of all windows in samples; those of one sample for "next"."""
-    bounds = []
-    for formula in formulas:
-        for part in formula.subformulas():
-            if isinstance(part, Next | Prev):
-                bounds.append(1)
-            window = getattr(part, "interval", None)
-            for bound in (window.start, window.end) if isinstance(window, Interval) else ():
-                if math.isfinite(bound):
-                    bounds.append(round(bound / dt))
-    return bounds
-
-
 def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     """Return the factor on the model's standard deviations: it grows while no row is progress.
 
@@ -445,17 +350,6 @@ def _spread(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
     idle = len(rho) - 1 - last
     most = min(max(1.0, idle / (PATIENCE * dim)), MOST_SPREAD)
     return most ** (number % SPREADS / (SPREADS - 1))
-
-
-def _signals(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
-    """Return these signals of a trace, each with its components, 0 for a plain one."""
-    shapes = [(name, np.shape(trace.signals[name])) for name in names]
-    return tuple((name, int(np.prod(s[1:])) if len(s) > 1 else 0) for name, s in shapes)
-
-
-def _held(form: TraceForm, row: Float[np.ndarray, " values"]) -> Float[np.ndarray, "signals time"]:
-    own = np.arange(form.length)
-    return np.stack([np.interp(own, form.places, c) for c in row.reshape(-1, len(form.places))])
 
 
 def _number(value: Float[Array, " m"]) -> Float[Array, " m"]:

@@ -1,0 +1,124 @@
+"""The form of the traces that a model of them gives: its signals, its clock, what the monitor sees.
+
+    form = TraceForm.of(signals, dt, length, formulas)
+    form.flat(trace)                                    # the modelled samples of a real trace
+    form.trace(flat)                                    # and back, for the monitor
+
+A few hundred samples of a signal are modelled, however short the step of the simulator is.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl.formula import Formula, Interval, Next, Prev
+
+SAMPLES = 256
+"""Samples of a signal that are modelled; those between are interpolated."""
+
+
+@dataclass(frozen=True)
+class TraceForm:
+    """The form of the modelled traces.
+
+    - `signals`: names and components (0 for a plain signal), in order.
+    - `dt`: sampling period in seconds.
+    - `length`: number of samples.
+    - `stride`: samples from one that the monitor sees of a model's trace to the next.
+    """
+
+    signals: tuple[tuple[str, int], ...]
+    dt: float
+    length: int
+    stride: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        signals: tuple[tuple[str, int], ...],
+        dt: float,
+        length: int,
+        formulas: Iterable[Formula],
+    ) -> "TraceForm":
+        """Return the form with the longest stride that the formulas leave.
+
+        A model's trace has no more detail than its modelled samples. Monitored at every sample of
+        a simulator, tens of thousands where there are a few hundred, it is the same at many times
+        the cost. Windows keep their bounds, and the last sample is seen.
+        """
+        divided = math.gcd(length - 1, *(_bounds(formulas, dt)))
+        strides = range(1, max(length - 1, 1) // SAMPLES + 1)
+        stride = max((n for n in strides if divided % n == 0), default=1)
+        return cls(signals, dt, length, stride)
+
+    @property
+    def places(self) -> Float[np.ndarray, " samples"]:
+        """Places of the modelled samples among all."""
+        return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
+
+    def fits(self, trace: Trace) -> bool:
+        """Return whether a trace has these signals and this clock, whatever its length is."""
+        names = [name for name, _ in self.signals]
+        same = all(name in trace.signals for name in names)
+        same = same and signals_of(trace, names) == self.signals
+        return same and bool(np.isclose(trace.dt or 0.0, self.dt))
+
+    def flat(self, trace: Trace) -> Float[np.ndarray, " values"]:
+        """Return the modelled samples of a trace, signal after signal."""
+        own, parts = np.arange(self.length), []
+        for name, _ in self.signals:
+            signal = np.asarray(trace.signals[name])
+            # Truth values are +1 and -1 in formulas.
+            signal = np.where(signal, 1.0, -1.0) if signal.dtype == bool else signal
+            signal = signal.reshape(len(signal), -1)
+            # A shorter one stays as it ended.
+            signal = signal[np.minimum(own, len(signal) - 1)]
+            parts += [np.interp(self.places, own, column) for column in signal.T]
+        return np.concatenate(parts).astype(np.float32)
+
+    def held(self, row: Float[np.ndarray, " values"]) -> Float[np.ndarray, "signals time"]:
+        """Return modelled samples at every sample, those between on straight lines."""
+        own = np.arange(self.length)
+        columns = row.reshape(-1, len(self.places))
+        return np.stack([np.interp(own, self.places, column) for column in columns])
+
+    def trace(self, flat: Float[Array, " values"]) -> Trace:
+        """Return the trace of modelled samples, every so many of its own; traced by JAX."""
+        places, own = self.places, np.arange(0, self.length, self.stride)
+        left = own * (len(places) - 1) // max(self.length - 1, 1)
+        left = np.minimum(left, max(len(places) - 2, 0))
+        right = np.minimum(left + 1, len(places) - 1)
+        gap = np.maximum(places[right] - places[left], 1e-9)
+        weight = ((own - places[left]) / gap).astype(np.float32)
+        columns = flat.reshape(-1, len(places))
+        columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
+        signals, first = {}, 0
+        for name, components in self.signals:
+            signal = columns[first : first + max(components, 1)]
+            signals[name] = signal.T if components else signal[0]
+            first += max(components, 1)
+        return Trace(signals, self.dt * self.stride, finite=tuple(signals))
+
+
+def signals_of(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
+    """Return these signals of a trace, each with its components, 0 for a plain one."""
+    shapes = [(name, np.shape(trace.signals[name])) for name in names]
+    return tuple((name, int(np.prod(s[1:])) if len(s) > 1 else 0) for name, s in shapes)
+
+
+def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
+    """Return the finite bounds of all windows in samples; those of one sample for "next"."""
+    bounds = []
+    for formula in formulas:
+        for part in formula.subformulas():
+            if isinstance(part, Next | Prev):
+                bounds.append(1)
+            window = getattr(part, "interval", None)
+            for bound in (window.start, window.end) if isinstance(window, Interval) else ():
+                if math.isfinite(bound):
+                    bounds.append(round(bound / dt))
+    return bounds
