@@ -107,8 +107,9 @@ class Confirmer:
         if self._plan is not None or self.problem.black_box or self.other is not None:
             return
         space = self.problem.space
-        forms = jax.eval_shape(space.unflatten, space.point_form)
-        features = jax.tree.map(lambda form: np.zeros((1, *form.shape), form.dtype), forms)
+        features = jax.tree.map(
+            lambda form: np.zeros((1, *form.shape), form.dtype), space.feature_form
+        )
         with suppress(Exception):
             self._plan = _make_plan(self, space.rows(features))
 

@@ -90,7 +90,7 @@ class ExecutorEngine:
             (type(executor).__module__ + type(executor).__name__, target),
             lambda: ship(problem, executor, target, identity),
         )
-        form = jax.eval_shape(problem.space.unflatten, problem.space.point_form)
+        form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
         least = 1 << (batch - 1).bit_length()

@@ -127,6 +127,11 @@ class FeatureSpace:
         """Shape and type of a point of the unit cube, for abstract evaluation."""
         return jax.ShapeDtypeStruct((self.dim,), jnp.result_type(float))
 
+    @property
+    def feature_form(self) -> dict[str, Any]:
+        """Shapes and types of the features of a point, for abstract evaluation."""
+        return jax.eval_shape(self.unflatten, self.point_form)
+
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """Names of the feature columns of a table, such as `x0`, `cars[0].x`, `point[1]`."""
@@ -257,8 +262,7 @@ class FeatureSpace:
         if missing:
             raise ValueError(f"feature {missing[0]!r} is missing; got {', '.join(features)}")
         converted = self.root.coerce(complete)
-        wanted = jax.eval_shape(self.unflatten, self.point_form)
-        places = jax.tree_util.tree_flatten_with_path(wanted)[0]
+        places = jax.tree_util.tree_flatten_with_path(self.feature_form)[0]
         for (place, form), leaf in zip(places, jax.tree.leaves(converted), strict=True):
             if form.shape != jnp.shape(leaf):
                 name = jax.tree_util.keystr(place, simple=True, separator=".")

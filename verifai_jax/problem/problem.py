@@ -156,7 +156,7 @@ class Problem:
         """
         if self.black_box:
             return False
-        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
+        features = self.space.feature_form
         key = jax.eval_shape(lambda: jax.random.key(0))
         program = jax.make_jaxpr(lambda key, features: self.system(features, key))(key, features)
         drawn = program.jaxpr.invars[0]
@@ -233,7 +233,7 @@ class Problem:
         returns no `Trace`; what the monitor says for a formula over a signal that the system does
         not produce.
         """
-        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
+        features = self.space.feature_form
         try:
             self.system.check(features)
         except ValueError:
@@ -269,7 +269,7 @@ class Problem:
 
     @truncate_silently()
     def _form(self) -> Trace | None:
-        features = jax.eval_shape(self.space.unflatten, self.space.point_form)
+        features = self.space.feature_form
         try:
             trace = self.system.abstract(features)
         except Exception as error:

@@ -103,7 +103,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
     """Yield what two tracings of the system show; nothing for one that is not quick to trace."""
     if problem.black_box or not traced_by_default(problem.system):
         return
-    features = jax.eval_shape(problem.space.unflatten, problem.space.point_form)
+    features = problem.space.feature_form
     key = jax.eval_shape(lambda: jax.random.key(0))
     started = time.perf_counter()
     program = _program(problem, features, key)

@@ -43,7 +43,14 @@ from verifai_jax.systems.environments.brax_model import (
     with_system,
     with_value,
 )
-from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay
+from verifai_jax.systems.environments.delays import (
+    NO_DELAY,
+    Delay,
+    DelayOption,
+    Delays,
+    as_delay,
+    first_refusal,
+)
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -275,7 +282,7 @@ class Brax(System):
     def why_error(self, features: Features) -> str | None:
         """Say which delay is none that the environment was made for."""
         delays = (self.observation_delay, self.action_delay)
-        return next(filter(None, (d.refusal(features, self.name) for d in delays)), None)
+        return first_refusal(delays, features, self.name)
 
 
 @suggests_options

@@ -28,7 +28,14 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
-from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, Delays, as_delay
+from verifai_jax.systems.environments.delays import (
+    NO_DELAY,
+    Delay,
+    DelayOption,
+    Delays,
+    as_delay,
+    first_refusal,
+)
 from verifai_jax.systems.environments.episode import (
     Episode,
     Moment,
@@ -214,7 +221,7 @@ class Gymnax(System):
     def why_error(self, features: Features) -> str | None:
         """Say which delay is none that the environment was made for."""
         delays = (self.observation_delay, self.action_delay)
-        return next(filter(None, (d.refusal(features, self.env.name) for d in delays)), None)
+        return first_refusal(delays, features, self.env.name)
 
 
 @suggests_options

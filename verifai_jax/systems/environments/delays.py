@@ -8,7 +8,7 @@ an action takes effect so many steps after its decision, and until the first one
 environment gets zeros (the first of its choices).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -67,6 +67,16 @@ class Delay(NamedTuple):
                 f"feature {self.feature!r} is a delay in whole steps: make it a DiscreteBox, as in "
                 f"DiscreteBox(0, {self.most}); it draws real numbers"
             )
+
+
+def first_refusal(delays: Iterable[Delay], features: Features, owner: str) -> str | None:
+    """Return what is wrong with the first delay that `owner` cannot have; None where all are right.
+
+    **Arguments:**
+
+    - `features`: numbers by name.
+    """
+    return next(filter(None, (delay.refusal(features, owner) for delay in delays)), None)
 
 
 NO_DELAY = Delay()
