@@ -32,6 +32,7 @@ from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.surrogates import Surrogate
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import SLOW
+from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Diverse, Search, TraceSurrogate
@@ -89,7 +90,8 @@ class Rounds:
             problem,
             batch,
             gradient=search.wants_gradient,
-            clauses=search.wants_clauses,
+            # Of goals that have one each, that is the robustness, which costs less.
+            clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
             precision=precision,
             seed=seed,
             journal=self._journal,
@@ -136,16 +138,18 @@ class Rounds:
         """Compile the engine and the search, side by side.
 
         - `resumed`: whether the first round is one of any kind; a new run begins with gradients
-          where the search wants those of clauses.
+          where the first stage of the search wants those of clauses.
         """
         space, marks = self.problem.space, 0 if self._marks is None else self._marks.width
         while_compiling(import_tables, after=0.0)
-        if self._differentiate is not None and not resumed:
+        stage = self.search.stage(None, space.cube, self.batch)
+        differentiates = stage.differentiates and not resumed
+        if self._differentiate is not None and differentiates:
             # They take longest to load: first, where nothing of them is to be traced.
             self._differentiate.begin_if_recalled()
-        compiled_search(self.search, space.cube, self.batch, marks)
+        compiled_search(stage, space.cube, self.batch, marks)
         self.evaluate.begin_compiling()
-        if self._differentiate is not None and not resumed:
+        if self._differentiate is not None and differentiates:
             self._differentiate.begin_compiling()
         if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
@@ -293,6 +297,7 @@ class Rounds:
         else:
             points, self._pending = self._pending, None
             if points is None:
+                self._prepare_derivatives()
                 points = self._proposals.next(most)
         if not len(points):
             self._proposals.tell_refused()
@@ -341,6 +346,14 @@ class Rounds:
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
+
+    def _prepare_derivatives(self) -> None:
+        """Compile derivatives once a stage of the search may want them, beside its programs."""
+        if self._differentiate is None or not self._proposals.stage.differentiates:
+            return
+        before = self._differentiate.compile_seconds
+        self._differentiate.begin_compiling()
+        self.compile_seconds += self._differentiate.compile_seconds - before
 
     def _suggested(self, suggestions: Suggestions, rows: int) -> Float[np.ndarray, "n d"]:
         """Return the suggested points that come next, after a question where it is time for one."""

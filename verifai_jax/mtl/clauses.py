@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import robustness
@@ -28,10 +29,6 @@ from verifai_jax.mtl.rewriting import nnf, rebuild
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.setting import prepare
 
-CLAUSES = 4
-"""Clauses told apart at most; what a disjunction has beyond is the last one."""
-ABSENT = -1e9
-"""The value of a clause that a goal does not have: broken, whatever happens."""
 GOALS = 16
 """Goals told apart at most; what a conjunction has beyond is the last one."""
 

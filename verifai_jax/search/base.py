@@ -138,6 +138,23 @@ class Search(abc.ABC, Generic[State]):
         """Learn from points that somebody suggested between two rounds, and start from them."""
         return self.warm_start(state, cube, observations)
 
+    @property
+    def differentiates(self) -> bool:
+        """Whether a plan of this search may ask for derivatives of clauses."""
+        return self.wants_clauses
+
+    def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":
+        """Return the search for the next round: this one, or only the parts of it that take part.
+
+        A stage has the states of the whole, and does what the whole does, by smaller programs: of
+        parts that may never take part nothing is compiled.
+
+        **Arguments:**
+
+        - `state`: before an `ask`; None for that of `init`.
+        """
+        return self
+
     def plan(self, state: State, cube: Cube, batch: int) -> Plan:
         """Return the simulations wanted of the last proposals; only where `wants_clauses`."""
         raise NotImplementedError(f"{type(self).__name__} has no plans")

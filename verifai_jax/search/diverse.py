@@ -20,7 +20,7 @@ objectives: evolution through the search for novelty alone, Evolutionary Computa
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
 
 import jax
@@ -140,6 +140,15 @@ class Diverse(Search[DiverseState]):
     def archive(state: DiverseState) -> Float[np.ndarray, "k d"]:
         """Return the distinct failures `[k, d]`, in the order of their discovery."""
         return np.asarray(state.archive)[: int(state.count)]
+
+    @property
+    def differentiates(self) -> bool:
+        return self.search.differentiates
+
+    def stage(self, state: DiverseState | None, cube: Cube, batch: int) -> Search[DiverseState]:
+        """Return it with the stage of the search inside."""
+        inner = self.search.stage(None if state is None else state.inner, cube, batch)
+        return self if inner is self.search else replace(self, search=inner)
 
     def check(self, cube: Cube) -> None:
         self.search.check(cube)

@@ -1,6 +1,7 @@
 """The account of a portfolio's descents into the interior: when they begin, what they may spend.
 
     state = begin(key, cube, batch)
+    state = wait(state, score, spent)                       # while waits(state)
     u, state = propose(state, cube, batch)                  # state.turn: whether u is to be used
     state = learn(state, cube, observations, score, spent)
 
@@ -86,7 +87,7 @@ def propose(
 ) -> tuple[Float[Array, "batch d"], InteriorState]:
     """Propose the next points of the descents, and decide whether it is their turn."""
     points, descent = _search(batch).ask(state.descent, cube, batch)
-    turn = state.credit >= 2.0 * len(state.descent.step)
+    turn = state.credit >= _most_credit(state) / 2
     descent = choose(turn, descent, state.descent)
     return points, state._replace(descent=descent, turn=turn)
 
@@ -113,24 +114,47 @@ def learn(
     - `spent`: simulations of the round, one with gradients counted as two.
     - `best`: the best points of all so far and their scores.
     """
-    least, turn = jnp.min(score, initial=jnp.inf), state.turn
+    turn = state.turn
     descent = _search(len(score)).tell(state.descent, cube, observations)
-    progress = (least < PROGRESS * state.theirs) & ~turn
     share = _share(state)
     earned = jnp.where(turn, -spent, spent * share / (1.0 - share))
     earned = jnp.where(state.cost < BEGINS, 0.0, earned)
-    most = 4.0 * len(state.descent.step)
+    most = _most_credit(state)
     descent, taken = _offer(choose(turn, descent, state.descent), state, *best)
-    return InteriorState(
+    return _counted(state, score, spent)._replace(
         descent=descent,
-        turn=turn,
         credit=jnp.clip(state.credit + earned, -most, most).astype(jnp.float32),
+        taken=taken,
+    )
+
+
+def wait(state: InteriorState, score: Float[Array, " n"], spent: Float[Array, ""]) -> InteriorState:
+    """Count a round of the others; `learn` does no more that matters while the descents wait."""
+    return _counted(state._replace(turn=jnp.array(False)), score, spent)
+
+
+def waits(state: InteriorState) -> bool:
+    """Return whether the next round, and what is learned from it, is none of the descents'."""
+    early, failing = state.cost < BEGINS, state.theirs <= 0
+    return bool(early | (failing & (state.credit < _most_credit(state) / 2)))
+
+
+def _most_credit(state: InteriorState) -> float:
+    return 4.0 * len(state.descent.step)
+
+
+def _counted(
+    state: InteriorState, score: Float[Array, " n"], spent: Float[Array, ""]
+) -> InteriorState:
+    """Count the simulations of a round, and note the least robustness."""
+    least, turn = jnp.min(score, initial=jnp.inf), state.turn
+    progress = (least < PROGRESS * state.theirs) & ~turn
+    return state._replace(
         cost=(state.cost + spent).astype(jnp.float32),
         spent=(state.spent + jnp.where(turn, spent, 0.0)).astype(jnp.float32),
         idle=jnp.where(progress, 0.0, state.idle + jnp.where(turn, 0.0, spent)).astype(jnp.float32),
         own=jnp.where(turn, jnp.minimum(state.own, least), state.own).astype(jnp.float32),
         theirs=jnp.where(turn, state.theirs, jnp.minimum(state.theirs, least)).astype(jnp.float32),
-        taken=taken,
     )
 
 

@@ -31,6 +31,8 @@ from verifai_jax.search.interior import (
     not_taken,
     plan,
     propose,
+    wait,
+    waits,
 )
 from verifai_jax.search.mutation import Mutation, MutationState
 
@@ -52,6 +54,15 @@ LEAST_SHARE = 0.05
 OPENING = 6
 """Descents before the budget is shared by evidence."""
 
+MANY = 32
+"""Simulations of a round beyond which descents wait until failures are rare."""
+
+PATIENT = 4
+"""Rounds in a row without a failure after which they are."""
+
+NEVER = 1 << 30
+"""Simulations since the last failure where none is waited for."""
+
 AMONG = 4
 """Number of best points among which a new one is a gain."""
 
@@ -72,6 +83,7 @@ class PortfolioState(NamedTuple):
     opening: Bool[Array, ""]  # the first descents are on their way, beyond their share
     taken: Float[Array, "taken d"]  # the latest points where descents began or ended
     interior: InteriorState | None
+    barren: Int[Array, ""]  # simulations since the last failure
 
 
 @dataclass(frozen=True)
@@ -119,7 +131,23 @@ class Portfolio(Search[PortfolioState]):
             opening=jnp.array(False),
             taken=jnp.full((TAKEN, cube.dim), jnp.inf, jnp.float32),
             interior=None if gradient is None else begin(jax.random.fold_in(key, 3), cube, batch),
+            barren=jnp.int32(0),
         )
+
+    def stage(self, state: PortfolioState | None, cube: Cube, batch: int) -> Search[PortfolioState]:
+        """Return the members that take part in the next round.
+
+        Gradients take seconds to compile, and a simulation of many at once next to none. So rounds
+        of many begin without them, and go on so while failures come.
+        """
+        if not self._differentiates(cube):
+            return self
+        rounds = PATIENT if batch > MANY else 0
+        if rounds and (state is None or int(state.barren) < rounds * batch):
+            return PortfolioStage(self, descends=False)
+        if state is None or (state.interior is not None and waits(state.interior)):
+            return PortfolioStage(self, descends=True)
+        return self
 
     def ask(
         self, state: PortfolioState, cube: Cube, batch: int
@@ -182,9 +210,12 @@ class Portfolio(Search[PortfolioState]):
         rows = self.plan(state, cube, batch).rows
         simulated = jnp.arange(batch) < rows
         observations = observations._replace(valid=observations.valid & simulated)
+        failed = jnp.any(observations.usable & (observations.rho < 0))
+        barren = jnp.where(failed, 0, state.barren + rows).astype(jnp.int32)
+        state = state._replace(barren=barren)
         if state.interior is None:
             return self._learn(state, cube, observations)
-        score, turn = self._common(observations).score, state.interior.turn
+        score, turn = _common(observations).score, state.interior.turn
         costs = jnp.where(turn | state.differentiates, 2.0, 1.0)
         interior = learn(
             state.interior,
@@ -207,7 +238,7 @@ class Portfolio(Search[PortfolioState]):
     ) -> PortfolioState:
         """Tell the three members, and count what the one that proposed a point has gained."""
         batch = len(observations.rho)
-        common = self._common(observations)
+        common = _common(observations)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them.
         limit = state.mutation.score[AMONG - 1]
@@ -290,6 +321,8 @@ class Portfolio(Search[PortfolioState]):
             return state
         common = observations._replace(gradient=None, clauses=None, clause_gradients=None)
         gradient = Gradient().start_from(state.gradient, cube, common)
+        # Whoever suggests a start wants a descent from it.
+        state = state._replace(barren=jnp.int32(NEVER))
         # The descents from there have their turn at once, whatever the shares are.
         least = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
         credit = state.credit.at[GRADIENT].max(least.astype(jnp.float32))
@@ -313,12 +346,75 @@ class Portfolio(Search[PortfolioState]):
         row = jnp.arange(batch)
         return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
 
-    def _common(self, observations: Observations) -> Observations:
-        """Return the observations for members that use no clauses."""
-        rho = observations.rho
-        if observations.clauses is not None:
-            # Where clauses of different units have to be broken together, without unit.
-            several = observations.clauses[:, 1] > NOTHING
-            greatest = jnp.max(observations.clauses, axis=1)
-            rho = jnp.where(several & jnp.isfinite(greatest), greatest, rho)
-        return Observations(observations.u, rho, observations.valid)
+
+@dataclass(frozen=True)
+class PortfolioStage(Search[PortfolioState]):
+    """Some members of a portfolio, with the states of all.
+
+    - `whole`: the portfolio.
+    - `descends`: whether short descents take part, or neither these nor those into the interior.
+    """
+
+    whole: Portfolio
+    descends: bool
+
+    @property
+    def wants_clauses(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.whole.wants_clauses
+
+    @property
+    def differentiates(self) -> bool:
+        return self.descends
+
+    def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
+        return self.whole.init(key, cube, batch)
+
+    def ask(
+        self, state: PortfolioState, cube: Cube, batch: int
+    ) -> tuple[Float[Array, "batch d"], PortfolioState]:
+        u, following = self.whole.ask(self._own(state), cube, batch)
+        return u, self._all(following, state)
+
+    def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
+        return self.whole.plan(self._own(state), cube, batch)
+
+    def tell(self, state: PortfolioState, cube: Cube, observations: Observations) -> PortfolioState:
+        learned = self._all(self.whole.tell(self._own(state), cube, observations), state)
+        if state.interior is None:
+            return learned
+        rows = jnp.sum(state.rows)
+        told = jnp.arange(len(observations.rho)) < rows
+        score = _common(observations).score
+        spent = rows * jnp.where(state.differentiates, 2.0, 1.0)
+        waiting = wait(state.interior, jnp.where(told, score, jnp.inf), spent)
+        return learned._replace(interior=waiting)
+
+    def warm_start(
+        self, state: PortfolioState, cube: Cube, observations: Observations
+    ) -> PortfolioState:
+        return self._all(self.whole.warm_start(self._own(state), cube, observations), state)
+
+    def start_from(
+        self, state: PortfolioState, cube: Cube, observations: Observations
+    ) -> PortfolioState:
+        return self.whole.start_from(state, cube, observations)
+
+    def _own(self, state: PortfolioState) -> PortfolioState:
+        """Return the state without the members that do not take part."""
+        return state._replace(interior=None, gradient=state.gradient if self.descends else None)
+
+    def _all(self, state: PortfolioState, before: PortfolioState) -> PortfolioState:
+        """Return it with these as they were before."""
+        gradient = state.gradient if self.descends else before.gradient
+        return state._replace(interior=before.interior, gradient=gradient)
+
+
+def _common(observations: Observations) -> Observations:
+    """Return the observations for members that use no clauses."""
+    rho = observations.rho
+    if observations.clauses is not None:
+        # Where clauses of different units have to be broken together, without unit.
+        several = observations.clauses[:, 1] > NOTHING
+        greatest = jnp.max(observations.clauses, axis=1)
+        rho = jnp.where(several & jnp.isfinite(greatest), greatest, rho)
+    return Observations(observations.u, rho, observations.valid)

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.clauses import CLAUSES
+from verifai_jax.core.clauses import ABSENT, CLAUSES
 from verifai_jax.core.compilation import Effort, compile_soon, tracing
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.fingerprint import identity
@@ -46,6 +46,7 @@ class Proposals:
 
     - `proposed`: number of points that the search proposed.
     - `accepted`: number of these that the constraint accepted.
+    - `stage`: the search, or its parts that take part in the next round.
 
     `improve` may replace points of a round by others, of which the search is told instead.
     """
@@ -65,13 +66,15 @@ class Proposals:
         self.proposed = self.accepted = 0
         self._marks = marks if search.wants_marks else 0
         self._improve = improve
-        self._program = compiled_search(search, self.cube, batch, self._marks)
+        self.stage = search.stage(None, self.cube, batch)
+        self._program = compiled_search(self.stage, self.cube, batch, self._marks)
         self._checked = is_own(search)
         self._accepts = accepts
         if self._accepts is not None:
             # Compiled now, in the shape that it will be asked in.
             self._accepts(np.zeros((batch, self.cube.dim), np.float32))
         self._verbs: dict[str, Callable[..., PyTree]] = {}
+        assert self._program.init is not None
         self._state = self._program.init(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
@@ -152,8 +155,12 @@ class Proposals:
         )
         if self.search.wants_clauses:
             none = np.zeros((len(rho), CLAUSES, self.cube.dim), np.float32)
+            if clauses is None:
+                # Every goal has one, whose value is the robustness.
+                clauses = np.full((len(rho), CLAUSES), ABSENT, np.float32)
+                clauses[:, 0] = rho
             observations = observations._replace(
-                clauses=self._spread(none[:, :, 0] if clauses is None else clauses, 0.0),
+                clauses=self._spread(clauses, 0.0),
                 clause_gradients=self._spread(
                     none if clause_gradients is None else clause_gradients, 0.0
                 ),
@@ -166,6 +173,7 @@ class Proposals:
             known = unknown if outcomes is None else outcomes
             observations = observations._replace(outcomes=self._spread(known, np.nan))
         self._state = self._program.tell(self._state, observations)
+        self._begin_stage()
 
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
@@ -217,6 +225,14 @@ class Proposals:
                     whole[: len(part)] = outcomes[start : start + self.batch]
                 observations = observations._replace(outcomes=whole)  # pyright: ignore[reportArgumentType]
             self._state = self._verbs[verb](self._state, observations)
+        self._begin_stage()
+
+    def _begin_stage(self) -> None:
+        """Compile the parts of the search that take part from now on, in the background."""
+        stage = self.search.stage(self._state, self.cube, self.batch)
+        if stage != self.stage:
+            self.stage = stage
+            self._program = compiled_search(stage, self.cube, self.batch, self._marks, begins=False)
 
     def checkpoint(self) -> dict[str, np.ndarray | Array]:
         """Return the state that decides the next points; its values are arrays and never change."""
@@ -245,6 +261,7 @@ class Proposals:
                 )
             restored.append(jnp.asarray(saved))
         self._state = jax.tree.unflatten(form, restored)
+        self._begin_stage()
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
 
@@ -346,9 +363,9 @@ def effort_of(search: Search, batch: int) -> Effort:
 
 
 class SearchProgram(NamedTuple):
-    """Compiled functions of a search."""
+    """Compiled functions of a search; `init` is None where they begin with the state of another."""
 
-    init: Callable[..., PyTree]
+    init: Callable[..., PyTree] | None
     ask: Callable[..., tuple[Array, PyTree]]
     tell: Callable[..., PyTree]
     temperature: Callable[..., Any]
@@ -357,8 +374,13 @@ class SearchProgram(NamedTuple):
 
 @lru_cache(maxsize=64)
 @tracing("the search")
-def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> SearchProgram:
-    """Compile `init / ask / tell` of one search on one cube, in the background, side by side."""
+def compiled_search(
+    search: Search, cube: Cube, batch: int, marks: int, begins: bool = True
+) -> SearchProgram:
+    """Compile `init / ask / tell` of one search on one cube, in the background, side by side.
+
+    - `begins`: whether `init` is wanted.
+    """
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
     state: Any = begun.out_info
@@ -375,7 +397,9 @@ def compiled_search(search: Search, cube: Cube, batch: int, marks: int) -> Searc
     points: Any = jax.ShapeDtypeStruct((batch, cube.dim), jnp.float32)
     asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
     ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
-    init = compile_soon("the search", begun.lower(), effort_of(search, batch))
+    init: Any = None
+    if begins:
+        init = compile_soon("the search", begun.lower(), effort_of(search, batch))
     rho: Any = jax.ShapeDtypeStruct((batch,), jnp.float32)
     valid: Any = jax.ShapeDtypeStruct((batch,), jnp.bool_)
     observations = Observations(points, rho, valid, points if search.wants_gradient else None)
