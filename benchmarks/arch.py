@@ -15,11 +15,19 @@ requirement could not (FReaK of 2024 reports fewer simulations than all particip
 of them). `trace_surrogate` runs one seed after the other, in batches of two, and only its claimed
 failures count. Other solvers, other seeds, partly freer inputs. SB's networks carry no licence:
 they are read from a folder (`specs/arch/lstm.py`).
+
+    python benchmarks/arch.py --searches portfolio --save FOLDER
+    python benchmarks/arch.py --searches portfolio --beside FOLDER
+
+`--save` writes what each seed took, gradients as two, infinite without a failure, and `--beside`
+compares: the ratio of the means over the same seeds to those of the folder, with its 95 % interval
+(bootstrap over seeds), where a seed without a failure counts as 1.2 times the budget.
 """
 
 import argparse
 import importlib
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -94,6 +102,15 @@ def falsified_one_by_one(problem: vj.Problem, search: str, budget: int, seeds: i
     return first
 
 
+def ratio(costs: np.ndarray, before: np.ndarray, budget: int) -> str:
+    """Return the ratio of the means over the same seeds and its 95 % interval, as text."""
+    pairs = [np.where(np.isfinite(each), each, 1.2 * budget) for each in (costs, before)]
+    rows = np.random.default_rng(0).integers(0, len(costs), (20_000, len(costs)))
+    means = [each[rows].mean(axis=1) for each in pairs]
+    low, high = np.quantile(means[0] / means[1], [0.025, 0.975])
+    return f"{pairs[0].mean() / pairs[1].mean():.2f} ({low:.2f} to {high:.2f})"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*")
@@ -102,6 +119,8 @@ def main() -> None:
     parser.add_argument("--budget", type=int)
     parser.add_argument("--instance", type=int, choices=[1, 2], default=2)
     parser.add_argument("--lstm", help="folder with the networks of SB1 to SB5")
+    parser.add_argument("--save", type=Path, help="folder for what each seed took")
+    parser.add_argument("--beside", type=Path, help="folder of an earlier --save")
     chosen = parser.parse_args()
     problems = requirements()
     if chosen.lstm:
@@ -130,6 +149,12 @@ def main() -> None:
                 continue
             trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds, confirm=False)
             cost = trials.cost()
+            file = f"{name}.{search}.npy"
+            if chosen.save:
+                chosen.save.mkdir(parents=True, exist_ok=True)
+                np.save(chosen.save / file, cost)
+            if chosen.beside:
+                print(f"<!-- ratio {ratio(cost, np.load(chosen.beside / file), budget)} -->")
             finite = cost[np.isfinite(cost)]
             counts = ["-"] * 3
             if len(finite):

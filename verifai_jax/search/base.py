@@ -140,7 +140,7 @@ class Search(abc.ABC, Generic[State]):
 
     @property
     def differentiates(self) -> bool:
-        """Whether a plan of this search may ask for derivatives of clauses."""
+        """True if a plan of this search may ask for derivatives of clauses."""
         return self.wants_clauses
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":

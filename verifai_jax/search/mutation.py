@@ -7,6 +7,9 @@ are. Some proposals explore: with coordinates drawn towards the ends of their ra
 that change seldom, coarse before fine (Fainekos et al., ARCH competition reports: tools that draw
 from the corners and with few control points need the fewest simulations).
 
+Among failures it goes on from any of the best known ones, and as often from the worst: these are
+deeper in the region of failures, so that more of what is next to them fails.
+
 Nothing is fitted, so that it works from the first few simulations on, where cross-entropy has yet
 to fill its elite.
 """
@@ -24,7 +27,7 @@ from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
 
 PARENTS = 4
-"""Best points that are mutated; each half as often as the one before."""
+"""Best points that are mutated; each half as often as the one before. Of failures all are."""
 
 LEAST_STEP = 0.02
 """Smallest standard deviation of steps, in unit coordinates; they are log-uniform."""
@@ -121,15 +124,15 @@ class Mutation(Search[MutationState]):
         return u, state._replace(round=state.round + 1)
 
     def tell(self, state: MutationState, cube: Cube, observations: Observations) -> MutationState:
-        score = observations.score
-        # New points come first: of equally good ones the newest are kept.
+        # Of failures, which are equally good, the worst are kept, and of equal ones the newest.
+        score = jnp.where(observations.usable, observations.rho, jnp.inf)
         points = jnp.concatenate(
             [jnp.where(observations.usable[:, None], observations.u, 0.5), state.points]
         )
         scores = jnp.concatenate([score, state.score])
         _, best = jax.lax.top_k(-scores, self.kept)
         usable = jnp.sum(observations.usable).astype(jnp.int32)
-        progress = scores[best[0]] < 0.999 * state.score[0]
+        progress = jnp.maximum(scores[best[0]], 0.0) < 0.999 * state.score[0]
         stale = jnp.where(progress, 0, state.stale + usable)
         again = stale >= self.patience
         return state._replace(
@@ -150,8 +153,13 @@ class Mutation(Search[MutationState]):
     ) -> Float[Array, "n d"]:
         d = cube.dim
         there = jnp.sum(jnp.isfinite(state.score)).astype(jnp.float32)
+        # Every second parent is any of several failures, so that not all come from the worst.
+        failures = jnp.sum(state.score < 0)
+        coin = jnp.where(failures > 1, 2 * coins[:, 0] % 1, coins[:, 0])
+        any_of_them = (failures > 1) & (coins[:, 0] >= 0.5)
         # Rank r with a probability of 2^-(r + 1), among those that there are.
-        rank = jnp.floor(-jnp.log2(jnp.maximum(coins[:, 0], 2.0**-PARENTS)))
+        rank = jnp.floor(-jnp.log2(jnp.maximum(coin, 2.0**-PARENTS)))
+        rank = jnp.where(any_of_them, jnp.floor(coin * failures), rank)
         parent = state.points[jnp.minimum(rank, jnp.maximum(there - 1, 0)).astype(jnp.int32)]
 
         good = jnp.minimum(there, jnp.maximum(6.0, there / 3))

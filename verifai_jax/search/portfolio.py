@@ -9,6 +9,9 @@ to all, and descents start from the best points of all as often as from new ones
 
 Where these have found no failure for long, a fourth member joins them, with an account of its own:
 descents into the interior of the space (`interior`, `descent`).
+
+Rounds of many simulations begin without gradients, which take longer to compile than these to run,
+until they have found no failure for a while (`PortfolioStage`).
 """
 
 from dataclasses import dataclass, replace
