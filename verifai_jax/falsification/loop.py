@@ -297,7 +297,7 @@ class Rounds:
         else:
             points, self._pending = self._pending, None
             if points is None:
-                self._prepare_derivatives()
+                self._begin_stage()
                 points = self._proposals.next(most)
         if not len(points):
             self._proposals.tell_refused()
@@ -347,13 +347,18 @@ class Rounds:
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
         self._keep()
 
-    def _prepare_derivatives(self) -> None:
-        """Compile derivatives once a stage of the search may want them, beside its programs."""
-        if self._differentiate is None or not self._proposals.stage.differentiates:
+    def _begin_stage(self) -> None:
+        """Compile what the next round needs for the first time, search and derivatives together."""
+        before = self._proposals.stage
+        started = time.perf_counter()
+        self._proposals.begin_stage()
+        stage = self._proposals.stage
+        if stage == before:
             return
-        before = self._differentiate.compile_seconds
-        self._differentiate.begin_compiling()
-        self.compile_seconds += self._differentiate.compile_seconds - before
+        if self._differentiate is not None and stage.differentiates:
+            self._differentiate.begin_compiling()
+        self._proposals.wait()
+        self.compile_seconds += time.perf_counter() - started
 
     def _suggested(self, suggestions: Suggestions, rows: int) -> Float[np.ndarray, "n d"]:
         """Return the suggested points that come next, after a question where it is time for one."""

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.clauses import ABSENT, CLAUSES
-from verifai_jax.core.compilation import Effort, compile_soon, tracing
+from verifai_jax.core.compilation import Compilation, Effort, compile_soon, tracing
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.fingerprint import identity
 from verifai_jax.core.outcomes import OUTCOME
@@ -118,6 +118,7 @@ class Proposals:
 
         **Raises:** `ConstraintError` when the constraint has refused everything for long.
         """
+        self.begin_stage()
         points = (
             self._next_to_learn_from(most) if self.search.learns else self._next_of_sequence(most)
         )
@@ -173,7 +174,6 @@ class Proposals:
             known = unknown if outcomes is None else outcomes
             observations = observations._replace(outcomes=self._spread(known, np.nan))
         self._state = self._program.tell(self._state, observations)
-        self._begin_stage()
 
     def tell_refused(self) -> None:
         """Let the search know that no row of the last round could be simulated."""
@@ -225,14 +225,22 @@ class Proposals:
                     whole[: len(part)] = outcomes[start : start + self.batch]
                 observations = observations._replace(outcomes=whole)  # pyright: ignore[reportArgumentType]
             self._state = self._verbs[verb](self._state, observations)
-        self._begin_stage()
 
-    def _begin_stage(self) -> None:
-        """Compile the parts of the search that take part from now on, in the background."""
+    def begin_stage(self) -> None:
+        """Compile the parts of the search that take part in the next round, in the background.
+
+        `next` does it by itself.
+        """
         stage = self.search.stage(self._state, self.cube, self.batch)
         if stage != self.stage:
             self.stage = stage
             self._program = compiled_search(stage, self.cube, self.batch, self._marks, begins=False)
+
+    def wait(self) -> None:
+        """Wait until what `begin_stage` began is compiled."""
+        for program in (self._program.ask, self._program.plan, self._program.tell):
+            if isinstance(program, Compilation):
+                program.result()
 
     def checkpoint(self) -> dict[str, np.ndarray | Array]:
         """Return the state that decides the next points; its values are arrays and never change."""
@@ -261,7 +269,6 @@ class Proposals:
                 )
             restored.append(jnp.asarray(saved))
         self._state = jax.tree.unflatten(form, restored)
-        self._begin_stage()
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
 
