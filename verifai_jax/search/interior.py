@@ -135,8 +135,9 @@ def wait(state: InteriorState, score: Float[Array, " n"], spent: Float[Array, ""
 
 def waits(state: InteriorState) -> bool:
     """Return whether the next round, and what is learned from it, is none of the descents'."""
-    early, failing = state.cost < BEGINS, state.theirs <= 0
-    return bool(early | (failing & (state.credit < _most_credit(state) / 2)))
+    # As numbers: each operation of JAX outside of a program would compile one.
+    cost, theirs, credit = (float(each) for each in (state.cost, state.theirs, state.credit))
+    return cost < BEGINS or (theirs <= 0 and credit < _most_credit(state) / 2)
 
 
 def _most_credit(state: InteriorState) -> float:
