@@ -19,6 +19,7 @@ from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmation import Confirmer
 from verifai_jax.evaluation.confirmation_verdicts import Checked
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.evaluation.replays import ONE_BY_ONE
 from verifai_jax.systems.base import System
 
 
@@ -422,6 +423,34 @@ def test_of_many_those_that_may_flip_are_examined(circles, monkeypatch):
     assert "unexamined" not in all_of_them.verdict
     with pytest.raises(ValueError, match="most must be a positive integer; got 0"):
         Confirmer(smooth, most=0)
+
+
+def test_a_row_worse_than_all_before_is_examined_whatever_the_limit():
+    smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
+    confirmer = Confirmer(smooth, most=4)
+
+    def verdicts(x, limit):
+        x = np.asarray(x)
+        rows = {"x": x, "rho": 0.2 - x}
+        return confirmer(rows, np.arange(len(x)), limit).verdict.tolist()
+
+    many = np.linspace(0.5, 0.6, 40)
+    assert verdicts(many, 4).count("confirmed") == 4
+    # No worse than the worst one so far: none.
+    assert set(verdicts(many, 4)) == {"unexamined"}
+    # A worse one, and some beside it, in the program that is compiled already.
+    found = verdicts(np.append(many, 0.9), 4)
+    assert found[-1] == "confirmed"
+    assert found.count("confirmed") == 1 + ONE_BY_ONE
+    assert verdicts([0.7, 0.8], None) == ["unexamined"] * 2
+    assert verdicts([0.7, 0.95], None) == ["confirmed"] * 2
+
+
+def test_the_worst_row_of_a_long_run_has_a_verdict():
+    smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
+    run = vj.falsify(smooth, budget=4096, batch=256, seed=1, progress=False)
+    assert run.verdict_counts["unexamined"] > 0
+    assert run.table.all["verdict"][run.table.all["rho"].idxmin()] == "confirmed"
 
 
 def test_what_is_finished_survives_ctrl_c(circles, monkeypatch):

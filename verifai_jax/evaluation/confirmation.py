@@ -34,7 +34,7 @@ from verifai_jax.evaluation.confirmation_verdicts import (
     describe_checks,
     describe_disagreement,
 )
-from verifai_jax.evaluation.replays import HostReplays, Replays
+from verifai_jax.evaluation.replays import ONE_BY_ONE, HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
@@ -55,6 +55,9 @@ SAFE = 10.0
 any row."""
 BLOCK = 512
 """Rows examined between two looks at whether the rest may stay unexamined."""
+BESIDE = ONE_BY_ONE
+"""Rows examined beside one that is worse than all examined before, so that no other program is
+compiled for it."""
 
 
 class Confirmer:
@@ -70,7 +73,8 @@ class Confirmer:
     - `most`: how many rows are examined whatever comes; by default 256, and more where a row takes
       few replays: 2048 where the step stays. Of more, those nearest to zero are, and
       further ones until the rest is ten times farther from zero than any replay has moved a row;
-      these stay `unexamined`. Only where rows have a column `rho`.
+      these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
+      examined before is examined whatever else was.
 
     Once rows were examined, `checked` says which checks a confirmed row has passed, and `raised`
     what a replay raised first, if any did.
@@ -94,7 +98,7 @@ class Confirmer:
         in_precision(precision)
         self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
         self.other = None if simulator is None else _other(problem, simulator)
-        self.examined, self.band = 0, 0.0
+        self.examined, self.band, self.worst = 0, 0.0, np.inf
         self.checked = ""
         self.raised: tuple[str, ...] = ()
         self._plan: _Plan | None = None
@@ -126,7 +130,8 @@ class Confirmer:
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
         - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
-          the worst row and those nearest to zero are.
+          the worst row and those nearest to zero are. A worse row than all before, with some
+          beside it, is examined beyond the limit.
 
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
@@ -146,18 +151,22 @@ class Confirmer:
             free = most - self.examined
             if run is None:
                 free = len(order)
-            elif free <= 0 and self.far(float(np.min(np.abs(run[order])))):
-                break
             size = free if free > 0 else BLOCK
+            if run is not None and free <= 0 and self.far(float(np.min(np.abs(run[order])))):
+                size = 0
             if limit is not None:
                 size = min(size, limit - self.examined)
-                if size <= 0:
+            if size <= 0:
+                if run is None or run[order[0]] >= self.worst:
                     break
+                size = 1 if self.problem.black_box else 1 + BESIDE
             block, order = np.split(order, [size])
             taken = {name: column[block] for name, column in rows.items()}
             found = self._examine(self._plan, taken, numbers[block], taken.get("rho"))
             parts.append((block, found))
             self.examined += len(block)
+            if run is not None:
+                self.worst = min(self.worst, float(np.min(run[block])))
             lost = np.flatnonzero(found.verdict == "raised")
             if len(lost) and not self.raised:
                 self.raised = (f"not confirmed: {found.why[lost[0]]}",)

@@ -508,8 +508,9 @@ class Rounds:
 
     def _restore_confirmer(self, checkpoint: Mapping[str, Any]) -> None:
         if self._confirmer is not None and "confirmer" in checkpoint:
-            examined, band = checkpoint["confirmer"]
-            self._confirmer.examined, self._confirmer.band = int(examined), float(band)
+            examined, band, worst = checkpoint["confirmer"]
+            self._confirmer.examined = int(examined)
+            self._confirmer.band, self._confirmer.worst = float(band), float(worst)
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on where `checkpoint` was taken; the table must hold its rows already.
@@ -550,7 +551,9 @@ class Rounds:
             self.checkpoint |= self.suggestions.checkpoint()
         if self._confirmer is not None:
             seen = self._confirmer
-            self.checkpoint["confirmer"] = np.array([seen.examined, seen.band], np.float64)
+            self.checkpoint["confirmer"] = np.array(
+                [seen.examined, seen.band, seen.worst], np.float64
+            )
 
     def _columns(self, verdicts: Verdicts) -> dict[str, np.ndarray]:
         """Return the columns of the table, as the rows are before they are confirmed."""
