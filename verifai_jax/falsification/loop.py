@@ -508,9 +508,10 @@ class Rounds:
 
     def _restore_confirmer(self, checkpoint: Mapping[str, Any]) -> None:
         if self._confirmer is not None and "confirmer" in checkpoint:
-            examined, band, worst = checkpoint["confirmer"]
-            self._confirmer.examined = int(examined)
-            self._confirmer.band, self._confirmer.worst = float(band), float(worst)
+            # Checkpoints of before the worst row was noted hold two numbers.
+            examined, band, *worst = checkpoint["confirmer"]
+            self._confirmer.examined, self._confirmer.band = int(examined), float(band)
+            self._confirmer.worst = float(worst[0]) if worst else np.inf
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on where `checkpoint` was taken; the table must hold its rows already.
