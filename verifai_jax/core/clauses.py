@@ -1,4 +1,7 @@
-"""The number of clauses of a requirement that have values of their own (`mtl.clauses`)."""
+"""Clauses of a requirement: how many have values of their own, and the value of one that is absent.
+
+`mtl.clauses` makes them, and searches are told of them.
+"""
 
 CLAUSES = 4
 """Clauses of a goal that have values of their own; those beyond are joined in the last one."""

@@ -349,13 +349,10 @@ class Rounds:
 
     def _begin_stage(self) -> None:
         """Compile what the next round needs for the first time, search and derivatives together."""
-        before = self._proposals.stage
         started = time.perf_counter()
-        self._proposals.begin_stage()
-        stage = self._proposals.stage
-        if stage == before:
+        if not self._proposals.begin_stage():
             return
-        if self._differentiate is not None and stage.differentiates:
+        if self._differentiate is not None and self._proposals.stage.differentiates:
             self._differentiate.begin_compiling()
         self._proposals.wait()
         self.compile_seconds += time.perf_counter() - started

@@ -226,15 +226,19 @@ class Proposals:
                 observations = observations._replace(outcomes=whole)  # pyright: ignore[reportArgumentType]
             self._state = self._verbs[verb](self._state, observations)
 
-    def begin_stage(self) -> None:
+    def begin_stage(self) -> bool:
         """Compile the parts of the search that take part in the next round, in the background.
 
         `next` does it by itself.
+
+        **Returns:** whether these are others than in the last round.
         """
         stage = self.search.stage(self._state, self.cube, self.batch)
-        if stage != self.stage:
-            self.stage = stage
-            self._program = compiled_search(stage, self.cube, self.batch, self._marks, begins=False)
+        if stage == self.stage:
+            return False
+        self.stage = stage
+        self._program = compiled_search(stage, self.cube, self.batch, self._marks, begins=False)
+        return True
 
     def wait(self) -> None:
         """Wait until what `begin_stage` began is compiled."""
