@@ -110,7 +110,6 @@ def public_names() -> str:
     return "\n".join(line for prefix in modules for line in listing(modules[prefix], prefix)) + "\n"
 
 
-@pytest.mark.thorough
 def test_names_and_signatures_are_those_of_the_list():
     # In a process of its own, where no test's import hook wraps what is public.
     command = [sys.executable, __file__]
