@@ -187,7 +187,7 @@ def _replay_batch(
     else:
         replays = Replays(problem, precision, key, features)
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
-    verdicts = replays(1, features, numbers)
+    [verdicts] = replays(1, [features], numbers)
     formulas = {name: str(formula) for name, formula in problem.formulas.items()}
     results = {}
     for i, (path, entry, _) in enumerate(batch):

@@ -207,16 +207,20 @@ class Confirmer:
         run: np.ndarray | None,
     ) -> "_Decision":
         features: dict[str, Any] = {}
-        found = {}
-        for check in plan.checks.values():
-            check.replays.begin_compiling(check.factor, len(numbers))
+        together: dict[tuple[int, int], list[str]] = {}
         for name, check in plan.checks.items():
+            check.replays.begin_compiling(check.factor, len(numbers))
             if check.precision not in features:
                 features[check.precision] = self.problem.space.features_of(rows, check.precision)
+            # What one program replays at one step fills its lanes.
+            together.setdefault((id(check.replays), check.factor), []).append(name)
+        found: dict[str, Verdicts] = {}
+        for names in together.values():
+            check = plan.checks[names[0]]
             values = features[check.precision]
-            if name == "nudged":
-                values = self.problem.space.nudged(values)
-            found[name] = check.replays(check.factor, values, numbers)
+            each = [self.problem.space.nudged(values) if n == "nudged" else values for n in names]
+            found |= dict(zip(names, check.replays(check.factor, each, numbers), strict=True))
+        found = {name: found[name] for name in plan.checks}
         return _decide(len(numbers), found, run, plan)
 
     def _join(

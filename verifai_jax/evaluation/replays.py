@@ -2,15 +2,15 @@
 
     features = problem.space.features_of(rows, "float64")   # [n, ...], the values of the table
     again = Replays(problem, "float64", key, features)
-    again(1, features, numbers).least                   # [n], at the system's own step
-    again(4, features, numbers).violated                # at a quarter of it
+    [verdicts] = again(1, [features], numbers)          # [n] rows, at the system's own step
+    finer, moved = again(4, [features, others], numbers)    # twice, at a quarter of it
 
 A system that can be refined has `refined(factor) -> system`: the same sampling and the same control
 decisions, with a `factor` times smaller step. With `traced_factor = True` its factor may be traced
 by JAX, and one program replays at every step.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache, partial
 
@@ -101,17 +101,24 @@ class Replays:
             self.refiner.traced = False
             self.draws = self._engine(1, 1).draws()
 
-    def __call__(self, factor: int, features: PyTree, numbers: Int[np.ndarray, " n"]) -> Verdicts:
+    def __call__(
+        self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
+    ) -> list[Verdicts]:
         """Simulate the rows of these numbers again, with a `factor` times smaller step.
 
         **Arguments:**
 
         - `factor`: by how much the step is smaller; 1 is the system's own step.
-        - `features`: `[n, ...]`, as `FeatureSpace.features_of` gives them.
+        - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them, once for
+          each time that the rows are simulated.
         - `numbers`: of the rows, which their random keys come from.
+
+        **Returns:** the verdicts of the rows, once for each.
         """
+        together = self._together(len(numbers))
+        features = jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
+        numbers = np.tile(numbers, len(each))
         count = len(numbers)
-        together = self._together(count)
         engine, parts = self._engine(factor, together), []
         compiled = engine.compile_seconds
         for start in range(0, count, together):
@@ -123,7 +130,8 @@ class Replays:
             except Exception as error:
                 parts.append(_raised(len(numbers[block]), len(self.problem.formulas), error))
         self.compile_seconds += engine.compile_seconds - compiled
-        return Verdicts.concatenate([part._replace(features=None) for part in parts])
+        verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
+        return verdicts.split(len(each))
 
     def begin_compiling(self, factor: int, count: int) -> None:
         """Compile what replays so many rows in the background, beside whatever else is compiled."""
@@ -195,7 +203,9 @@ class HostReplays:
     def begin_compiling(self, factor: int, count: int) -> None:
         """Do nothing: a black box is not compiled."""
 
-    def __call__(self, factor: int, features: PyTree, numbers: Int[np.ndarray, " n"]) -> Verdicts:
+    def __call__(
+        self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
+    ) -> list[Verdicts]:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""
         # One monitor for all steps.
         engine = HostEngine(
@@ -206,7 +216,9 @@ class HostReplays:
         )
         with in_precision(self.precision):
             keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
-        return engine.evaluate_features(features, keys)._replace(features=None)
+        return [
+            engine.evaluate_features(features, keys)._replace(features=None) for features in each
+        ]
 
 
 def _raised(count: int, formulas: int, error: Exception) -> Verdicts:

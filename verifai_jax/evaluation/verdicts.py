@@ -85,6 +85,19 @@ class Verdicts(NamedTuple):
         messages = [m for part in parts for m in part.messages or [""] * len(part.status)]
         return whole._replace(messages=messages)
 
+    def split(self, parts: int) -> "list[Verdicts]":
+        """Return the rows in so many parts of equal length; the inverse of `concatenate`."""
+        count = len(self.status) // parts
+        blocks = [slice(i * count, (i + 1) * count) for i in range(parts)]
+        rows = self._replace(messages=None, traces=None)
+        return [
+            jax.tree.map(lambda leaf, block=block: leaf[block], rows)._replace(
+                messages=None if self.messages is None else self.messages[block],
+                traces=None if self.traces is None else self.traces[block],
+            )
+            for block in blocks
+        ]
+
 
 class RowVerdict(NamedTuple):
     """The verdict of one simulation of a host system, before those of its batch are complete.
