@@ -18,6 +18,7 @@ those of the pairs.
 | `at1` | `verifai-jax falsify` of ARCH AT1 to its first confirmed counterexample, the second time |
 | `falsify` | what `make falsify` runs, with its pictures, the second time |
 | `brax` | ten rows of a Brax hopper, simulated and confirmed by `vj.confirm`, no program on disk |
+| `confirm` | a process that loads these ten rows, simulated before, and confirms them, likewise |
 | `help`, `import` | `verifai-jax --help`; `import verifai_jax` and `verifai_jax.Box` |
 | `list` | `verifai-jax list`, the problems of `specs/`, the second time |
 """
@@ -33,7 +34,8 @@ import time
 from pathlib import Path
 
 CASES = (
-    "cold", "again", "bound", "budget", "small", "at1", "falsify", "brax", "list", "help", "import",
+    "cold", "again", "bound", "budget", "small", "at1", "falsify", "brax", "confirm", "list", "help",
+    "import",
 )  # fmt: skip
 AT1 = "specs/arch/automatic_transmission.py:at1"
 COMMAND = "import sys; from verifai_jax.cli.main import main; sys.argv[0] = 'verifai-jax'; main()"
@@ -126,8 +128,8 @@ def run_quadrotor(problem, budget):
     print(f"{len(run.table.counterexamples)} of {len(run.table)}, {least:.9g}")
 
 
-def run_brax():
-    """Simulate ten rows of a hopper, confirm them and print how many are."""
+def hopper():
+    """Return the problem of a hopper of Brax that fails wherever it begins."""
     import jax.numpy as jnp
 
     import verifai_jax as vj
@@ -141,9 +143,22 @@ def run_brax():
         initial={"x": "q[0]"},
         exact_step=False,
     )
-    problem = vj.Problem("hopper", {"x": vj.Box(0.0, 0.1)}, system, "always height > 5")
-    run = vj.falsify(problem, "uniform", budget=10, confirm=False, progress=False)
-    print(vj.confirm(run).counts)
+    return vj.Problem("hopper", {"x": vj.Box(0.0, 0.1)}, system, "always height > 5")
+
+
+def run_brax(action, folder):
+    """Simulate ten rows of a hopper, confirm them and print how many are, or either of these."""
+    import verifai_jax as vj
+
+    problem = hopper()
+    if action == "confirm":
+        run = vj.load(folder, problem)
+    else:
+        run = vj.falsify(
+            problem, "uniform", budget=10, confirm=False, progress=False, folder=folder or None
+        )
+    if action != "simulate":
+        print(vj.confirm(run).counts)
 
 
 def measure(command, checkout, cache):
@@ -169,8 +184,12 @@ def command_of(case, place):
     if case in ("cold", "again", "bound", "budget"):
         gust, budget = 2.1 if case == "bound" else 2.0, 9000 if case == "budget" else 10_000
         return [python, __file__, "--quadrotor", str(gust), str(budget)]
-    if case in ("brax", "small"):
-        return [python, __file__, f"--{case}"]
+    if case == "small":
+        return [python, __file__, "--small"]
+    if case == "brax":
+        return [python, __file__, "--brax", "both", ""]
+    if case == "confirm":
+        return [python, __file__, "--brax", "confirm", str(place / "run")]
     if case == "list":
         return [python, "-c", COMMAND, "list"]
     if case == "import":
@@ -188,11 +207,15 @@ def one(case, checkout, caches):
     """Run a case once and return what `measure` does."""
     # One place for all: JAX knows a compiled program by the folder of its cache, too.
     cache = caches / checkout.name / "compiled"
-    if case not in ("cold", "small", "brax", "help", "import"):
+    if case not in ("cold", "small", "brax", "confirm", "help", "import"):
         fill(case, checkout, caches, cache)
     else:
         shutil.rmtree(cache, ignore_errors=True)
     with tempfile.TemporaryDirectory() as place:
+        if case == "confirm":
+            simulate = [sys.executable, __file__, "--brax", "simulate", str(Path(place) / "run")]
+            measure(simulate, checkout, cache)
+            shutil.rmtree(cache)
         result = measure(command_of(case, Path(place)), checkout, cache)
     if case == "cold":
         shutil.copytree(cache, kept(case, checkout, caches), dirs_exist_ok=True)
@@ -226,11 +249,11 @@ def main():
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--quadrotor", nargs=2, type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--brax", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--brax", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--small", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.brax:
-        run_brax()
+        run_brax(*options.brax)
         return
     if options.small:
         run_quadrotor(small_quadrotor(), 10_000)
