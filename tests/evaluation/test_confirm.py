@@ -114,6 +114,19 @@ def test_robustness_of_each_check_is_that_of_an_own_replay(circles, confirmed_ci
         np.testing.assert_allclose(found, again, rtol=1e-12)
 
 
+def test_features_one_rounding_away_are_replayed_beside_the_row_itself(circles):
+    rows = circles.table.counterexamples.iloc[:3]
+    values = {"a": rows["a"].to_numpy(), "rho": rows["rho"].to_numpy()}
+    space = circles.problem.space
+    moved = space.nudged(space.features_of(values, "float64"))
+    assert np.all(moved["a"] != values["a"])
+    found = Confirmer(circles.problem)(values, rows.index.to_numpy())
+    again = Confirmer(circles.problem)({**values, **moved}, rows.index.to_numpy())
+    # Each of these moved features is a row of its own, at the same step.
+    np.testing.assert_allclose(found.rho["nudged"], again.rho["quarter_step"], rtol=1e-12)
+    assert np.all(found.rho["nudged"] != found.rho["quarter_step"])
+
+
 def test_one_row_in_words(circles, confirmed_circles):
     one = confirm(circles, int(circles.best.name))
     assert one.confirmed

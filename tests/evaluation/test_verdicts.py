@@ -59,6 +59,21 @@ def test_batches_join_in_order():
     assert Verdicts.nothing(2, 3).least.shape == (0,)
 
 
+def test_parts_of_equal_length_are_split_again():
+    numbers = np.arange(6.0)
+    whole = Verdicts(
+        numbers[:, None],
+        np.full(6, OK),
+        numbers < 0,
+        messages=[str(n) for n in numbers],
+        traces=[None] * 6,
+    )
+    first, second = whole.split(2)
+    assert first.least.tolist() == [0.0, 1.0, 2.0] and second.least.tolist() == [3.0, 4.0, 5.0]
+    assert second.messages == ["3.0", "4.0", "5.0"] and second.traces == [None] * 3
+    assert Verdicts.concatenate([first, second]).messages == whole.messages
+
+
 def test_a_program_is_made_once_and_freed_together():
     cache, slot, made = ProgramCache(), Slot[int, list[int]]("lists"), []
 
