@@ -34,8 +34,8 @@ import time
 from pathlib import Path
 
 CASES = (
-    "cold", "again", "bound", "budget", "small", "at1", "falsify", "brax", "confirm", "list", "help",
-    "import",
+    "cold", "again", "bound", "budget", "small", "at1", "falsify", "brax", "confirm", "list",
+    "help", "import",
 )  # fmt: skip
 AT1 = "specs/arch/automatic_transmission.py:at1"
 COMMAND = "import sys; from verifai_jax.cli.main import main; sys.argv[0] = 'verifai-jax'; main()"

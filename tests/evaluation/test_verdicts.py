@@ -69,8 +69,9 @@ def test_parts_of_equal_length_are_split_again():
         traces=[None] * 6,
     )
     first, second = whole.split(2)
-    assert first.least.tolist() == [0.0, 1.0, 2.0] and second.least.tolist() == [3.0, 4.0, 5.0]
-    assert second.messages == ["3.0", "4.0", "5.0"] and second.traces == [None] * 3
+    assert [part.least.tolist() for part in (first, second)] == [[0, 1, 2], [3, 4, 5]]
+    assert second.messages == ["3.0", "4.0", "5.0"]
+    assert second.traces == [None] * 3
     assert Verdicts.concatenate([first, second]).messages == whole.messages
 
 
