@@ -109,8 +109,8 @@ class Replays:
         **Arguments:**
 
         - `factor`: by how much the step is smaller; 1 is the system's own step.
-        - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the rows
-          are simulated once with each.
+        - `each`: features `[n, ...]` of all rows, as `FeatureSpace.features_of` gives them; the
+          rows are simulated once with each.
         - `numbers`: of the rows, which their random keys come from.
 
         **Returns:** the verdicts of the rows, once for each.
