@@ -146,7 +146,7 @@ def hopper():
     return vj.Problem("hopper", {"x": vj.Box(0.0, 0.1)}, system, "always height > 5")
 
 
-def run_brax(action, folder):
+def run_brax(action, folder=None):
     """Simulate ten rows of a hopper, confirm them and print how many are, or either of these."""
     import verifai_jax as vj
 
@@ -155,7 +155,7 @@ def run_brax(action, folder):
         run = vj.load(folder, problem)
     else:
         run = vj.falsify(
-            problem, "uniform", budget=10, confirm=False, progress=False, folder=folder or None
+            problem, "uniform", budget=10, confirm=False, progress=False, folder=folder
         )
     if action != "simulate":
         print(vj.confirm(run).counts)
@@ -187,9 +187,9 @@ def command_of(case, place):
     if case == "small":
         return [python, __file__, "--small"]
     if case == "brax":
-        return [python, __file__, "--brax", "both", ""]
-    if case == "confirm":
-        return [python, __file__, "--brax", "confirm", str(place / "run")]
+        return [python, __file__, "--brax", "both"]
+    if case in ("simulate", "confirm"):
+        return [python, __file__, "--brax", case, str(place / "run")]
     if case == "list":
         return [python, "-c", COMMAND, "list"]
     if case == "import":
@@ -213,8 +213,7 @@ def one(case, checkout, caches):
         shutil.rmtree(cache, ignore_errors=True)
     with tempfile.TemporaryDirectory() as place:
         if case == "confirm":
-            simulate = [sys.executable, __file__, "--brax", "simulate", str(Path(place) / "run")]
-            measure(simulate, checkout, cache)
+            measure(command_of("simulate", Path(place)), checkout, cache)
             shutil.rmtree(cache)
         result = measure(command_of(case, Path(place)), checkout, cache)
     if case == "cold":
@@ -249,7 +248,7 @@ def main():
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--quadrotor", nargs=2, type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--brax", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--brax", nargs="+", help=argparse.SUPPRESS)
     parser.add_argument("--small", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.brax:

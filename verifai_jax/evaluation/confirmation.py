@@ -220,6 +220,7 @@ class Confirmer:
             values = features[check.precision]
             each = [self.problem.space.nudged(values) if n == "nudged" else values for n in names]
             found |= dict(zip(names, check.replays(check.factor, each, numbers), strict=True))
+        # In the order of the plan, in which they are told.
         found = {name: found[name] for name in plan.checks}
         return _decide(len(numbers), found, run, plan)
 
