@@ -6,6 +6,8 @@ of these     334 confirmed in double precision, 102 refuted and not claimed, 168
 failure rate 3.02 % (95 % interval 2.79 % to 3.27 %) as simulated
 """
 
+import numpy as np
+
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
@@ -43,7 +45,7 @@ def summarize(run: Run) -> str:
             number, message = first
             lines.append(f"               first in row {number}: {one_line(message)}")
     if lost := counts.not_differentiated:
-        lines.append(f"  gradient     not finite in {lost} of {run.simulations} simulations")
+        lines.append(f"  gradient     not finite in {lost} of {_differentiated(run)}")
     lines.extend(f"  note         {note}" for note in run.notes)
     if run.damage:
         lines.append(f"  damaged      {run.damage}")
@@ -82,6 +84,15 @@ def first_message(run: Run) -> tuple[int, str] | None:
     row = rows[rows["status"] == "error"].iloc[0]
     reason = run.problem.system.why_error({name: row[name] for name in run.table.features})
     return None if reason is None else (int(row.name), reason)  # pyright: ignore[reportArgumentType]
+
+
+def _differentiated(run: Run) -> str:
+    """Count the simulations that were differentiated: all, or those whose row says so."""
+    if "differentiated" not in next(run.table.blocks(), ()):
+        return f"{run.simulations} simulations"
+    blocks = run.table.blocks(["differentiated"])
+    count = sum(int(np.count_nonzero(block["differentiated"])) for block in blocks)
+    return f"the {count} simulations that were differentiated"
 
 
 def _headline(run: Run, violating: int) -> str:
