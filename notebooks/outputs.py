@@ -23,7 +23,7 @@ NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", re.IGNOR
 """A number, perhaps with commas between its thousands."""
 
 SPENT = re.compile(
-    r"[\d.,]+ (?:ms|s|min|h)(?= to compile| to simulate| to confirm| to run| of a core)"
+    r"[\d.,]+ (?:ms|s|min|h)(?= to compile| to search| to simulate| to confirm| to run| of a core)"
     r"|(?<=failing, )[\d.,]+ (?:ms|s|min|h)\b"
     r"|(?<=simulations in )[\d.,]+ (?:ms|s|min|h)(?=, stopped)"
     r"|[\d.,]+ (?=(?:simulations|steps)/s\b)"

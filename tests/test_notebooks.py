@@ -34,9 +34,10 @@ def notebook(*outputs, tags=()):
         ("p < 1.00e-04", "p < 0.0001"),
         ("12,345 rows", "12345 rows"),
         (
-            "0.7 s to compile, 0.05 s to simulate (20,670 simulations/s), 0.2 s to confirm",
-            "1.9 s to compile, 3 min to simulate (9 simulations/s), 2 min to confirm",
+            "0.7 s to compile, 0.1 s to search, 0.05 s to simulate (20,670 simulations/s)",
+            "1.9 s to compile, 2 min to search, 3 min to simulate (9 simulations/s)",
         ),
+        ("0.05 s to simulate, 0.2 s to confirm", "3 min to simulate, 2 min to confirm"),
         ("48 simulations in 14.3 s, stopped: budget", "48 simulations in 2 min, stopped: budget"),
         ("10 of 10, 0 failing, 1.5 s", "10 of 10, 0 failing, 2 min"),
         ("32,768 steps in 0.2 s of a core", "32,768 steps in 1.5 s of a core"),

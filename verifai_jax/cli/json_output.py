@@ -146,6 +146,7 @@ def describe_run(run: Any) -> dict[str, Any]:
         "stopped": run.stopped,
         "compile_seconds": run.compile_seconds,
         "run_seconds": run.run_seconds,
+        "search_seconds": run.search_seconds,
         "folder": run.folder,
         "table": run.table_path,
         "notes": run.notes,

@@ -353,6 +353,7 @@ def _resume(
         rounds.suggestions.check_source()
 
     rounds.confirm_seconds, rounds.checked = run.confirm_seconds, run.checked
+    rounds.search_seconds = run.search_seconds
 
     def prepare() -> None:
         if checkpoint:
@@ -443,6 +444,7 @@ def _run_rounds(
             compile_seconds=rounds.compile_seconds,
             run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds - confirmed(),
             confirm_seconds=rounds.confirm_seconds,
+            search_seconds=rounds.search_seconds if recorded.learns else 0.0,
             checked=rounds.checked,
             version=__version__,
             prior=recorded.samples_prior and not len(rounds.first),

@@ -59,7 +59,7 @@ class Rounds:
     that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
     `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
-    which they were.
+    which they were. `search_seconds` is what the search took for its proposals and to learn.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Rounds:
         self._marks = MarkBook(problem) if search.wants_marks else None
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
-        self.compile_seconds = self.confirm_seconds = 0.0
+        self.compile_seconds = self.confirm_seconds = self.search_seconds = 0.0
         self.checked = ""
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
@@ -298,7 +298,8 @@ class Rounds:
             points, self._pending = self._pending, None
             if points is None:
                 self._begin_stage()
-                points = self._proposals.next(most)
+                with self._searching():
+                    points = self._proposals.next(most)
         if not len(points):
             self._proposals.tell_refused()
             self._keep()
@@ -326,6 +327,36 @@ class Rounds:
         if self.steering.guide and verdicts.steering is not None:
             objective = self._guided(objective, verdicts.steering[:, 0])
         outcomes = self._outcomes(verdicts)
+        with self._searching():
+            self._learn(given, suggested, objective, verdicts, marks, outcomes)
+            if self._surrogate is not None:
+                self._surrogate.learn(points, verdicts)
+        self.table.append(columns)
+        self.found += int(np.sum(claimed))
+        self.violating += int(np.sum(verdicts.violated))
+        self.without_verdict += int(np.sum(~verdicts.proper))
+        self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
+        self._keep()
+
+    @contextmanager
+    def _searching(self) -> Iterator[None]:
+        """Count the time as the search's."""
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.search_seconds += time.perf_counter() - started
+
+    def _learn(
+        self,
+        given: Float[Any, "given d"],
+        suggested: bool,
+        objective: Float[np.ndarray, " n"],
+        verdicts: Verdicts,
+        marks: Int[np.ndarray, "n marks"] | None,
+        outcomes: Float[np.ndarray, "n outcome"] | None,
+    ) -> None:
+        """Let the search learn from a round, of its own points or of `given` ones."""
         if len(given):
             told = objective[verdicts.proper].astype(np.float32)
             happened = None if outcomes is None else outcomes[verdicts.proper]
@@ -338,14 +369,6 @@ class Rounds:
                 self._proposals.warm_start(given[verdicts.proper], told, happened)
         else:
             self._tell(objective, verdicts, marks, outcomes)
-        if self._surrogate is not None:
-            self._surrogate.learn(points, verdicts)
-        self.table.append(columns)
-        self.found += int(np.sum(claimed))
-        self.violating += int(np.sum(verdicts.violated))
-        self.without_verdict += int(np.sum(~verdicts.proper))
-        self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
-        self._keep()
 
     def _begin_stage(self) -> None:
         """Compile what the next round needs for the first time, search and derivatives together."""

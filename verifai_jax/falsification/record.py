@@ -42,6 +42,7 @@ ADDED = (
     "notes",
     "confirm",
     "confirm_seconds",
+    "search_seconds",
     "checked",
     "first",
     "guide",
@@ -173,6 +174,7 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "notes": _is_texts,
     "confirm": _is_flag,
     "confirm_seconds": _is_number,
+    "search_seconds": _is_number,
     "checked": _is_text,
     "guide": _is_mapping,
 }

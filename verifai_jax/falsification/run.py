@@ -62,6 +62,8 @@ class Run:
       was cut off.
     - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
       and in everything else.
+    - `search_seconds`: the part of `run_seconds` that proposals took, and learning from what came
+      of them; 0 for a search that does not learn.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
     - `folder`: on disk; None for a run in memory.
@@ -104,6 +106,7 @@ class Run:
     notes: Sequence[str] = ()
     confirm: bool = False
     confirm_seconds: float = 0.0
+    search_seconds: float = 0.0
     checked: str = ""
     first: Sequence[Sequence[float]] = ()
     guide: Mapping[str, Any] | None = None

@@ -13,9 +13,6 @@ from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
 from verifai_jax.falsification.run import Run
 
-DELIBERATE = ("Bayes(", "TuRBO(", "TraceSurrogate(", "Suggested(")
-"""Searches, alone or within others, whose proposals can take longer than the simulations."""
-
 
 def summarize(run: Run) -> str:
     """Write the summary of a run, every number of it from its table."""
@@ -59,13 +56,13 @@ def summarize(run: Run) -> str:
         lines.append(
             f"  constraint   let through {format_percent(run.acceptance)} of all proposals"
         )
-    speed = run.simulations / run.run_seconds if run.run_seconds > 0 else float("nan")
+    simulating = run.run_seconds - run.search_seconds
+    speed = run.simulations / simulating if simulating > 0 else float("nan")
+    searching = f"{run.search_seconds:.2f} s to search, " if run.search_seconds > 0 else ""
     confirming = f", {run.confirm_seconds:.2f} s to confirm" if run.checked else ""
-    deliberate = any(name in run.search for name in DELIBERATE)
-    spent = "search and simulate" if deliberate else "simulate"
     lines.append(
-        f"  time         {run.compile_seconds:.1f} s to compile, {run.run_seconds:.2f} s to "
-        f"{spent} ({speed:,.0f} simulations/s){confirming}; stopped by {run.stopped}"
+        f"  time         {run.compile_seconds:.1f} s to compile, {searching}{simulating:.2f} s to "
+        f"simulate ({speed:,.0f} simulations/s){confirming}; stopped by {run.stopped}"
     )
     lines.append(f"  search       {run.search}, seed {run.seed}")
     # Names, values and notes come from files and systems, which a terminal must not obey.
