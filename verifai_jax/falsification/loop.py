@@ -59,7 +59,8 @@ class Rounds:
     that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
     `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
-    which they were. `search_seconds` is what the search took for its proposals and to learn.
+    which they were. `search_seconds` is what the search took for its proposals and to learn, and
+    whoever suggests points to think of them.
     """
 
     def __init__(
@@ -186,7 +187,8 @@ class Rounds:
         - `most`: of the first round.
         """
         if not len(self.first):
-            self._pending = self._proposals.next(most)
+            with self._searching():
+                self._pending = self._proposals.next(most)
         points = np.asarray(self.first if len(self.first) else self._pending)
         points = points[: min(MEASURED, most)]
         engine = self.evaluate.engine
@@ -284,7 +286,8 @@ class Rounds:
         given = self.first[first : first + most]
         suggested = False
         if not len(given) and self.suggestions is not None:
-            given = self._suggested(self.suggestions, first)
+            with self._searching():
+                given = self._suggested(self.suggestions, first)
             given = given[: most if limit is None else max(limit - first, 0)]
             suggested = len(given) > 0
         if len(given):

@@ -62,8 +62,8 @@ class Run:
       was cut off.
     - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
       and in everything else.
-    - `search_seconds`: the part of `run_seconds` that proposals took, and learning from what came
-      of them; 0 for a search that does not learn.
+    - `search_seconds`: the part of `run_seconds` that proposals and suggestions took, and learning
+      from what came of them; 0 for a search that does not learn.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
     - `folder`: on disk; None for a run in memory.

@@ -89,7 +89,8 @@ def _differentiated(run: Run) -> str:
         return f"{run.simulations} simulations"
     blocks = run.table.blocks(["differentiated"])
     count = sum(int(np.count_nonzero(block["differentiated"])) for block in blocks)
-    return f"the {count} simulations that were differentiated"
+    were = "simulation that was" if count == 1 else "simulations that were"
+    return f"the {count} {were} differentiated"
 
 
 def _headline(run: Run, violating: int) -> str:
