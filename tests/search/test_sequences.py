@@ -141,4 +141,5 @@ def test_halton_points_are_the_same_in_a_loop_and_written_out(dim, monkeypatch):
         for most in (2**14, -1):
             monkeypatch.setattr("verifai_jax.search.halton.MOST_IN_LOOP", most)
             points.append(np.asarray(jax.jit(lambda i, key=key: halton_points(i, dim, key))(index)))
-        np.testing.assert_array_equal(*points)
+        # Which products and sums are joined to one operation is the compiler's choice.
+        np.testing.assert_allclose(*points, rtol=5e-7, atol=1.2e-7)

@@ -166,7 +166,10 @@ def _radical_inverse_in_loop(
     digits: Int[np.ndarray, " d"],
     maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
 ) -> Float[Array, "n d"]:
-    """Compute what `_radical_inverse` does, to the last bit, in a program a tenth as long."""
+    """Compute what `_radical_inverse` does in a program a tenth as long.
+
+    On some processors to the last bit; on others the compiler joins other products and sums.
+    """
     most = int(np.max(digits, initial=0))
     shape = (len(index), len(bases))
 
