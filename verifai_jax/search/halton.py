@@ -43,7 +43,7 @@ class HaltonState(NamedTuple):
 
 @dataclass(frozen=True)
 class Halton(Search[HaltonState]):
-    """Halton points, the first one with index 1; the same for any batch size.
+    """Halton points, the first one with index 1; the same for any batch size, up to rounding.
 
     **Arguments:**
 
