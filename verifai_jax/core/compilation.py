@@ -28,7 +28,7 @@ from verifai_jax.core.devices import enable_compile_cache
 
 Effort = Literal["most", "little", "least"]
 """How much XLA does to make a program fast on a processor. `little` computes what `most` does, on
-most processors to the last bit, in programs without long chains of products and sums; `least`
+some processors to the last bit, in programs without long chains of products and sums; `least`
 rounds each product."""
 
 _OPTIONS: dict[Effort, dict[str, Any]] = {
