@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
-from verifai_jax.core.trace import Status
-from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -28,11 +25,12 @@ from verifai_jax.falsification.checkpoint import write_checkpoint
 from verifai_jax.falsification.columns import import_tables
 from verifai_jax.falsification.marks import MarkBook
 from verifai_jax.falsification.question import describe_run
+from verifai_jax.falsification.rows import rows_of, without_failure
+from verifai_jax.falsification.run_claims import RunClaims
+from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.suggestions import Suggestions
 from verifai_jax.falsification.surrogates import Surrogate
 from verifai_jax.falsification.table import ErrorTable
-from verifai_jax.falsification.validation import SLOW
-from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Objective
 from verifai_jax.search import Diverse, Search, TraceSurrogate
@@ -41,11 +39,6 @@ from verifai_jax.search.proposals import Proposals, compiled_search
 if TYPE_CHECKING:
     import pandas as pd
 
-STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object)
-MOST_DIFFERENTIATED = 16
-"""Rows whose clauses are differentiated in one call of the engine."""
-MEASURED = 2
-"""First rows of a black box that are timed; in the first one a simulator may prepare itself."""
 MOST_WARM = 2048
 """Rows of an earlier table at most that a search starts with; the worst of a longer one."""
 
@@ -87,35 +80,17 @@ class Rounds:
         self._journal = Journal(folder) if folder is not None and problem.black_box else None
         if isinstance(search, TraceSurrogate):
             self._learn_traces(search)
-        self.evaluate = Evaluator(
+        self._simulations = Simulations(
             problem,
+            search,
             batch,
-            gradient=search.wants_gradient,
-            # Of goals that have one each, that is the robustness, which costs less.
-            clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
+            seed,
             precision=precision,
-            seed=seed,
             journal=self._journal,
             executor=executor,
             target=target,
             steering=self.steering,
             keep_traces=self._surrogate is not None,
-        )
-        # Derivatives of clauses are wanted of few points, now and then: compiled when they are.
-        self._differentiate = (
-            Evaluator(
-                problem,
-                min(batch, MOST_DIFFERENTIATED),
-                gradient=True,
-                clauses=True,
-                precision=precision,
-                seed=seed,
-                executor=executor,
-                target=target,
-                steering=self.steering,
-            )
-            if search.wants_clauses
-            else None
         )
         self._marks = MarkBook(problem) if search.wants_marks else None
         self.found = self.violating = self.without_verdict = 0
@@ -125,11 +100,10 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self.suggestions: Suggestions | None = None
-        self._confirmer = Confirmer(problem, precision, seed) if confirm else None
+        self._claims = RunClaims(problem, precision, seed) if confirm else None
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
-        self._measured: Verdicts | None = None  # Of the first points, which are
-        self._pending: Any = None  # these.
+        self._pending: Any = None  # Points of the first round that are proposed already.
         self._chosen: tuple[str, ...] = ()
         self._sends_ahead = executor is not None and not search.learns
         self._ahead: Ahead | None = None
@@ -145,16 +119,16 @@ class Rounds:
         while_compiling(import_tables, after=0.0)
         stage = self.search.stage(None, space.cube, self.batch)
         differentiates = stage.differentiates and not resumed
-        if self._differentiate is not None and differentiates:
+        if differentiates:
             # They take longest to load: first, where nothing of them is to be traced.
-            self._differentiate.begin_if_recalled()
+            self._simulations.begin_if_recalled()
         compiled_search(stage, space.cube, self.batch, marks)
         self.evaluate.begin_compiling()
-        if self._differentiate is not None and differentiates:
-            self._differentiate.begin_compiling()
-        if self._confirmer is not None:
+        if differentiates:
+            self._simulations.begin_derivatives()
+        if self._claims is not None:
             # Meanwhile; whatever fails will be replayed.
-            self._confirmer.prepare()
+            self._claims.prepare()
         self.evaluate.compile()
         self._propose()
 
@@ -190,52 +164,28 @@ class Rounds:
             with self._searching():
                 self._pending = self._proposals.next(most)
         points = np.asarray(self.first if len(self.first) else self._pending)
-        points = points[: min(MEASURED, most)]
-        engine = self.evaluate.engine
-        assert isinstance(engine, HostEngine)
-        seconds, parts = float("inf") if len(points) else 0.0, []
-        with self._as_in_a_batch(keep_traces=True):
-            for row in range(len(points)):
-                parts.append(self.evaluate(points[row : row + 1], first=row))
-                # Without the compilation of the monitor.
-                seconds = min(seconds, engine.simulation_seconds)
-                if seconds < SLOW:
-                    break
-        self._measured = Verdicts.concatenate(parts) if parts else None
-        return seconds
+        return self._simulations.measure(points[:most])
 
     def switch(self, search: Search, note: str, batch: int) -> None:
         """Go on with another search, for which the rows that are measured are given ones."""
-        if not len(self.first) and self._measured is not None:
-            self.first = np.asarray(self._pending)[: len(self._measured.status)]
+        if not len(self.first) and self._simulations.measured:
+            self.first = np.asarray(self._pending)[: self._simulations.measured]
         self._pending = None
         self.search, self.batch, self._chosen = search, batch, (note,)
-        self.evaluate.batch = batch
         if isinstance(search, TraceSurrogate):
             self._learn_traces(search)
-            assert isinstance(self.evaluate.engine, HostEngine)
-            self.evaluate.engine.keep_traces, self.evaluate.engine.journal = True, None
+        self._simulations.regroup(batch, keep_traces=self._surrogate is not None)
         self._propose()
 
-    @contextmanager
-    def _as_in_a_batch(self, keep_traces: bool) -> Iterator[None]:
-        """Let rows that are simulated on their own be those of a whole batch, bit for bit."""
-        engine = self.evaluate.engine
-        if not isinstance(engine, HostEngine):
-            yield
-            return
-        before = engine.least, engine.keep_traces
-        engine.least = 1 << (self.batch - 1).bit_length()
-        engine.keep_traces = keep_traces
-        try:
-            yield
-        finally:
-            engine.least, engine.keep_traces = before
+    @property
+    def evaluate(self) -> Evaluator:
+        """The evaluator of rounds without derivatives."""
+        return self._simulations.evaluate
 
     @property
     def confirms(self) -> bool:
         """True where only what closer replays confirm is claimed."""
-        return self._confirmer is not None
+        return self._claims is not None
 
     @property
     def distinct(self) -> int:
@@ -247,10 +197,9 @@ class Rounds:
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engines that a user may not expect."""
-        more = () if self._differentiate is None else self._differentiate.notes
-        raised = () if self._confirmer is None else self._confirmer.raised
+        raised = () if self._claims is None else self._claims.raised
         suggested = () if self.suggestions is None else self.suggestions.notes
-        return (*self._chosen, *self.evaluate.notes, *more, *raised, *suggested)
+        return (*self._chosen, *self._simulations.notes, *raised, *suggested)
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -309,7 +258,7 @@ class Rounds:
             return
         if verdicts is None:
             verdicts = self._verdicts(points, first, given=len(given) > 0)
-        columns = self._columns(verdicts)
+        columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(points), suggested)
         marks = None
@@ -321,12 +270,16 @@ class Rounds:
         if self._objective is not None:
             objective = self._objective(verdicts.rho, verdicts.rho < 0)
         claimed = verdicts.violated
-        if self._confirmer is not None:
-            columns["verdict"], refused, told = self._confirmed(self._confirmer, columns, first)
-            claimed = verdicts.violated & ~refused
+        if self._claims is not None:
+            found = self._claims(columns, first)
+            columns["verdict"] = found.verdict
+            self.compile_seconds += found.compile_seconds
+            self.confirm_seconds += found.seconds
+            self.checked = self._claims.checked or self.checked
+            claimed = verdicts.violated & ~found.refused
             # A search that took them for failures would stay with them.
-            objective = np.where(refused, told, objective)
-            verdicts = _raised(verdicts, refused)
+            objective = np.where(found.refused, found.greatest, objective)
+            verdicts = without_failure(verdicts, found.refused)
         if self.steering.guide and verdicts.steering is not None:
             objective = self._guided(objective, verdicts.steering[:, 0])
         outcomes = self._outcomes(verdicts)
@@ -378,8 +331,8 @@ class Rounds:
         started = time.perf_counter()
         if not self._proposals.begin_stage():
             return
-        if self._differentiate is not None and self._proposals.stage.differentiates:
-            self._differentiate.begin_compiling()
+        if self._proposals.stage.differentiates:
+            self._simulations.begin_derivatives()
         self._proposals.wait()
         self.compile_seconds += time.perf_counter() - started
 
@@ -441,57 +394,17 @@ class Rounds:
             return None
         return verdicts.steering[:, int(self.steering.guide) :]
 
-    def _confirmed(
-        self, confirmer: Confirmer, columns: dict[str, Any], first: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the verdict of each row, whether it is refused, and what to tell of it if it is.
-
-        The verdict is empty where nothing is violated.
-        """
-        rows = np.flatnonzero(columns["violated"])
-        verdict = np.full(len(columns["rho"]), "", object)
-        refused, told = np.zeros(len(verdict), bool), np.full(len(verdict), np.nan)
-        if not len(rows):
-            return verdict, refused, told
-        if not confirmer.finer:
-            # To simulate it again may take as long as the run, and would say little.
-            verdict[rows] = "unchecked"
-            return verdict, refused, told
-        own = {name: column[rows] for name, column in columns.items()}
-        started, compiled = time.perf_counter(), confirmer.compile_seconds
-        checked = confirmer(own, first + rows, max(LIMIT, (first + len(verdict)) // SHARE))
-        compiled = confirmer.compile_seconds - compiled
-        self.compile_seconds += compiled
-        self.confirm_seconds += time.perf_counter() - started - compiled
-        self.checked = confirmer.checked or self.checked
-        verdict[rows] = checked.verdict
-        refused[rows], told[rows] = checked.refuse(own["rho"])
-        return verdict, refused, told
-
-    def _verdicts(self, points: Float[Any, "n d"], first: int, given: bool = False) -> Verdicts:
-        if self._measured is not None:
-            known, self._measured = self._measured, None
-            count = len(known.status)
-            if len(points) <= count:
-                return known
-            with self._as_in_a_batch(keep_traces=self._surrogate is not None):
-                rest = self.evaluate(np.asarray(points)[count:], first=first + count)
-            if self._surrogate is None:
-                known = known._replace(traces=None)
-            return Verdicts.concatenate([known, rest])
-        compiled = self.evaluate.compile_seconds
-        temperature = 1.0 if given else self._proposals.temperature
-        if self._differentiate is None:
-            verdicts = self.evaluate(points, temperature, first)
-        elif given or not self._proposals.differentiate:
-            verdicts = self.evaluate(points, first=first)
-        else:
-            compiled = self._differentiate.compile_seconds
-            verdicts = self._differentiate(points, temperature, first)
-            self.compile_seconds += self._differentiate.compile_seconds - compiled
-            return verdicts
+    def _verdicts(self, points: Float[Any, "n d"], first: int, given: bool) -> Verdicts:
+        """Simulate the points of a round, proposed ones or `given` ones."""
+        compiled = self._simulations.compile_seconds
+        verdicts = self._simulations(
+            points,
+            first,
+            differentiate=not given and self._proposals.differentiate,
+            temperature=1.0 if given else self._proposals.temperature,
+        )
         # A robustness of exactly zero compiles a program of its own.
-        self.compile_seconds += self.evaluate.compile_seconds - compiled
+        self.compile_seconds += self._simulations.compile_seconds - compiled
         return verdicts
 
     def warm(self, table: "pd.DataFrame") -> None:
@@ -529,29 +442,17 @@ class Rounds:
             # Only now: rows of the table that the checkpoint does not know are simulated again.
             self._journal.settle(int(self.checkpoint.get("rows", 0)))
 
-    def _restore_confirmer(self, checkpoint: Mapping[str, Any]) -> None:
-        if self._confirmer is not None and "confirmer" in checkpoint:
-            # Checkpoints of before the worst row was noted hold two numbers.
-            examined, band, *worst = checkpoint["confirmer"]
-            self._confirmer.examined, self._confirmer.band = int(examined), float(band)
-            self._confirmer.worst = float(worst[0]) if worst else np.inf
-
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on where `checkpoint` was taken; the table must hold its rows already.
 
         **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """
         self._proposals.restore(checkpoint)
-        self._restore_confirmer(checkpoint)
         if self._objective is not None:
             names = self._objective.state
             self._objective.state = {name: checkpoint[f"objective.{name}"] for name in names}
-        if self._surrogate is not None:
-            self._surrogate.restore(checkpoint)
-        if self._marks is not None:
-            self._marks.restore(checkpoint)
-        if self.suggestions is not None:
-            self.suggestions.restore(checkpoint)
+        for part in self._parts:
+            part.restore(checkpoint)
         counts = self.table.counts
         self.without_verdict, self.violating = counts.without_verdict, counts.violating
         self.found = counts.claimed
@@ -567,45 +468,11 @@ class Rounds:
             **{f"objective.{name}": value for name, value in objective.items()},
             "rows": np.array(len(self.table)),
         }
-        if self._surrogate is not None:
-            self.checkpoint |= self._surrogate.checkpoint()
-        if self._marks is not None:
-            self.checkpoint |= self._marks.checkpoint()
-        if self.suggestions is not None:
-            self.checkpoint |= self.suggestions.checkpoint()
-        if self._confirmer is not None:
-            seen = self._confirmer
-            self.checkpoint["confirmer"] = np.array(
-                [seen.examined, seen.band, seen.worst], np.float64
-            )
+        for part in self._parts:
+            self.checkpoint |= part.checkpoint()
 
-    def _columns(self, verdicts: Verdicts) -> dict[str, np.ndarray]:
-        """Return the columns of the table, as the rows are before they are confirmed."""
-        space, count = self.problem.space, len(verdicts.status)
-        assert verdicts.features is not None
-        columns: dict[str, np.ndarray] = {**space.rows(verdicts.features), "rho": verdicts.least}
-        if len(self.problem.formulas) > 1:
-            for i, name in enumerate(self.problem.formulas):
-                columns[f"rho.{name}"] = verdicts.rho[:, i]
-        columns |= {"violated": verdicts.violated, "status": STATUS_NAMES[verdicts.status]}
-        if verdicts.gradient is not None:
-            columns["gradient_finite"] = np.all(np.isfinite(verdicts.gradient), axis=1)
-        if self._differentiate is not None:
-            clause_gradients = verdicts.clause_gradients
-            columns["differentiated"] = np.full(count, clause_gradients is not None)
-            columns["gradient_finite"] = (
-                np.ones(count, bool)
-                if clause_gradients is None
-                else np.all(np.isfinite(clause_gradients), axis=(1, 2))
-            )
-        if verdicts.messages is not None:
-            columns["message"] = np.array(verdicts.messages, dtype=object)
-        return columns
-
-
-def _raised(verdicts: Verdicts, rows: Bool[np.ndarray, " n"]) -> Verdicts:
-    """Raise the clauses of these rows until they are not broken."""
-    if verdicts.clauses is None or not rows.any():
-        return verdicts
-    lift = np.where(rows, 1e-6 - np.max(verdicts.clauses, axis=1), 0.0)
-    return verdicts._replace(clauses=verdicts.clauses + lift[:, None])
+    @property
+    def _parts(self) -> list[Surrogate | MarkBook | Suggestions | RunClaims]:
+        """What has entries of its own in a checkpoint."""
+        each = (self._surrogate, self._marks, self.suggestions, self._claims)
+        return [part for part in each if part is not None]

@@ -1,0 +1,203 @@
+"""The simulations of a run: of its rounds, and of the first rows that are timed one by one.
+
+    simulations = Simulations(problem, search, batch=32, seed=0)
+    verdicts = simulations(points, first=0)                      # of a round
+    verdicts = simulations(points, first=32, differentiate=True, temperature=temperature)
+    seconds = simulations.measure(points)                        # of a black box
+
+Derivatives of clauses are wanted for some rounds only, so an evaluator of their own computes them,
+which is compiled when it is needed.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.core.executors import Executor
+from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.steering import Steering
+from verifai_jax.evaluation.verdicts import Verdicts
+from verifai_jax.falsification.validation import SLOW
+from verifai_jax.mtl.clauses import goals_of
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+
+MOST_DIFFERENTIATED = 16
+"""Rows whose clauses are differentiated in one call of the engine."""
+MEASURED = 2
+"""First rows of a black box that are timed; in the first one a simulator may prepare itself."""
+
+
+class Simulations:
+    """Evaluators with and without derivatives of clauses, and the first rows where these are timed.
+
+    **Arguments:**
+
+    - `problem`: on the backend that it runs on.
+    - `search`: what it wants decides what is computed beside the robustness.
+    - `batch`: simulations of a round at most.
+    - `seed`: of the run.
+    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`: as for `Evaluator`.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        search: Search,
+        batch: int,
+        seed: int,
+        *,
+        precision: str,
+        journal: Journal | None,
+        executor: Executor | None,
+        target: str | None,
+        steering: Steering,
+        keep_traces: bool,
+    ) -> None:
+        self.batch, self.keep_traces = batch, keep_traces
+        self.evaluate = Evaluator(
+            problem,
+            batch,
+            gradient=search.wants_gradient,
+            # Of goals that have one each, that is the robustness, which costs less.
+            clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
+            precision=precision,
+            seed=seed,
+            journal=journal,
+            executor=executor,
+            target=target,
+            steering=steering,
+            keep_traces=keep_traces,
+        )
+        self._differentiate: Evaluator | None = None
+        if search.wants_clauses:
+            self._differentiate = Evaluator(
+                problem,
+                min(batch, MOST_DIFFERENTIATED),
+                gradient=True,
+                clauses=True,
+                precision=precision,
+                seed=seed,
+                executor=executor,
+                target=target,
+                steering=steering,
+            )
+        self._measured: Verdicts | None = None
+
+    @property
+    def differentiates(self) -> bool:
+        """True where some rounds are differentiated."""
+        return self._differentiate is not None
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds that all evaluators have spent compiling."""
+        more = 0.0 if self._differentiate is None else self._differentiate.compile_seconds
+        return self.evaluate.compile_seconds + more
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Decisions of the engines that a user may not expect."""
+        more = () if self._differentiate is None else self._differentiate.notes
+        return (*self.evaluate.notes, *more)
+
+    @property
+    def measured(self) -> int:
+        """Number of first rows that are simulated already, and wait for their round."""
+        return 0 if self._measured is None else len(self._measured.status)
+
+    def begin_if_recalled(self) -> None:
+        """Begin to compile derivatives where they need not be traced; see `Engine`."""
+        if self._differentiate is not None:
+            self._differentiate.begin_if_recalled()
+
+    def begin_derivatives(self) -> None:
+        """Trace derivatives now, and compile them in the background."""
+        if self._differentiate is not None:
+            self._differentiate.begin_compiling()
+
+    def __call__(
+        self,
+        points: Float[Any, "n d"],
+        first: int,
+        *,
+        differentiate: bool = False,
+        temperature: Float[np.ndarray, " n"] | float = 1.0,
+    ) -> Verdicts:
+        """Simulate and evaluate the points of a round.
+
+        **Arguments:**
+
+        - `points`: of the unit cube.
+        - `first`: number of the first of them in the run.
+        - `differentiate`: whether derivatives of their clauses are wanted.
+        - `temperature`: of the smooth robustness, one for all or one each.
+        """
+        if self._measured is not None:
+            return self._after_measured(points, first)
+        if self._differentiate is None:
+            return self.evaluate(points, temperature, first)
+        if differentiate:
+            return self._differentiate(points, temperature, first)
+        return self.evaluate(points, first=first)
+
+    def measure(self, points: Float[np.ndarray, "n d"]) -> float:
+        """Simulate the first rows of the run one by one, and return the least seconds of one.
+
+        A first one that is quick is the only one. Their round does not simulate them again.
+        """
+        engine = self.evaluate.engine
+        assert isinstance(engine, HostEngine)
+        points = points[:MEASURED]
+        seconds, parts = float("inf") if len(points) else 0.0, []
+        with self._as_in_a_batch(engine, keep_traces=True):
+            for row in range(len(points)):
+                parts.append(self.evaluate(points[row : row + 1], first=row))
+                # Without the compilation of the monitor.
+                seconds = min(seconds, engine.simulation_seconds)
+                if seconds < SLOW:
+                    break
+        self._measured = Verdicts.concatenate(parts) if parts else None
+        return seconds
+
+    def regroup(self, batch: int, keep_traces: bool) -> None:
+        """Go on with another batch size; with traces, also those of rows that are measured.
+
+        Rows of a journal have no traces, so it is left.
+        """
+        self.batch = self.evaluate.batch = batch
+        if keep_traces:
+            assert isinstance(self.evaluate.engine, HostEngine)
+            self.keep_traces = self.evaluate.engine.keep_traces = True
+            self.evaluate.engine.journal = None
+
+    def _after_measured(self, points: Float[Any, "n d"], first: int) -> Verdicts:
+        """Return the verdicts of the first round, whose first rows are there."""
+        known, self._measured = self._measured, None
+        assert known is not None
+        count = len(known.status)
+        if len(points) <= count:
+            return known
+        engine = self.evaluate.engine
+        assert isinstance(engine, HostEngine)
+        with self._as_in_a_batch(engine, keep_traces=self.keep_traces):
+            rest = self.evaluate(np.asarray(points)[count:], first=first + count)
+        if not self.keep_traces:
+            known = known._replace(traces=None)
+        return Verdicts.concatenate([known, rest])
+
+    @contextmanager
+    def _as_in_a_batch(self, engine: HostEngine, keep_traces: bool) -> Iterator[None]:
+        """Let rows that are simulated on their own be those of a whole batch, bit for bit."""
+        before = engine.least, engine.keep_traces
+        engine.least = 1 << (self.batch - 1).bit_length()
+        engine.keep_traces = keep_traces
+        try:
+            yield
+        finally:
+            engine.least, engine.keep_traces = before
