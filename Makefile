@@ -72,7 +72,7 @@ lint: .venv/lint
 	$(BIN)/basedpyright
 
 notebooks: .venv/installed
-	$(BIN)/python notebooks/execute.py
+	$(BIN)/python notebooks/execute.py --at-once 2
 
 notebooks-update: .venv/installed
 	$(BIN)/python notebooks/execute.py --update

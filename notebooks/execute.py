@@ -1,6 +1,7 @@
 """Execute the notebooks, and compare what they print with what is stored in them.
 
-python notebooks/execute.py                                     # all, as CI does
+python notebooks/execute.py                                     # all
+python notebooks/execute.py --at-once 2                         # two side by side, as CI does
 python notebooks/execute.py 01_falsify_cartpole.ipynb           # one
 python notebooks/execute.py --update 01_falsify_cartpole.ipynb  # store the new outputs
 """
@@ -9,6 +10,7 @@ import argparse
 import copy
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -64,9 +66,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("notebooks", nargs="*", type=Path)
     parser.add_argument("--update", action="store_true", help="store the outputs in the files")
+    parser.add_argument(
+        "--at-once", type=int, default=1, metavar="N", help="notebooks that run side by side"
+    )
     options = parser.parse_args()
+    if options.at_once < 1:
+        parser.error(f"--at-once must be a positive integer; got {options.at_once}")
+    if options.update and options.at_once > 1:
+        parser.error(
+            "--update stores seconds too, which are those of one notebook: leave --at-once"
+        )
     paths = [HERE / path.name for path in options.notebooks] or sorted(HERE.glob("*.ipynb"))
-    results = [execute(path, options.update) for path in paths]
+    with ThreadPoolExecutor(options.at_once) as pool:
+        results = list(pool.map(lambda path: execute(path, options.update), paths))
     sys.exit(0 if all(results) else 1)
 
 

@@ -48,7 +48,12 @@ def test_lifted_bounds_give_the_features_that_the_space_gives():
     u[0], u[1] = 0.0, 1.0
     verdicts = Engine(mine, 64).evaluate(u, KEY)
     expected = jax.jit(jax.vmap(mine.space.unflatten))(u)
-    jax.tree.map(np.testing.assert_array_equal, verdicts.features, jax.tree.map(np.array, expected))
+
+    # A compiler may join a product with its sum, which rounds once and not twice.
+    def same(one, other):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
+
+    jax.tree.map(same, verdicts.features, jax.tree.map(np.array, expected))
     assert verdicts.features["a"].max() == 2.0
 
 
