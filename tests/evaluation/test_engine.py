@@ -48,7 +48,8 @@ def test_a_streaming_monitor_says_what_the_stored_trace_says(terminate):
     rho, status = jax.jit(jax.vmap(lambda f: monitor(f, KEY)))(features)
     wanted = jax.jit(jax.vmap(lambda f: trace_verdict(problem, problem.system(f, KEY))))(features)
     np.testing.assert_array_equal(status, wanted[1])
-    np.testing.assert_array_equal(rho, wanted[0])
+    # Two programs, of which a compiler may join other products and sums.
+    np.testing.assert_allclose(rho, wanted[0], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.thorough

@@ -8,7 +8,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
-from verifai_jax.falsification import loop
+from verifai_jax.falsification import simulations
 from verifai_jax.falsification.surrogates import Surrogate, _padded, _spread
 from verifai_jax.falsification.trace_form import TraceForm
 from verifai_jax.mtl import parse, robustness
@@ -176,7 +176,7 @@ class TestDefault:
     @pytest.mark.thorough
     def test_slow_ones_a_model_and_resume_keeps_it(self, tmp_path, monkeypatch):
         # The clock is not asked: as if each simulation took as long as it takes to be slow.
-        monkeypatch.setattr(loop, "SLOW", 0.0)
+        monkeypatch.setattr(simulations, "SLOW", 0.0)
         monkeypatch.setattr("verifai_jax.falsification.validation.SLOW", 0.0)
         run = vj.falsify(
             problem(), budget=16, stop_after=100, seed=2, folder=tmp_path / "run", progress=False
