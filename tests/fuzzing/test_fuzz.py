@@ -190,7 +190,7 @@ def test_a_fault_that_needs_three_events_is_found_many_times_sooner():
     from specs.handover import MODES, handover
 
     found = []
-    for seed in range(5):
+    for seed in range(3):
         run = vj.fuzz(handover, 20_000, cells=MODES, seed=seed, stop_after=1, progress=False)
         found.append(run.simulations)
     uniform = vj.falsify(handover, "uniform", 60_000, progress=False).table.counts.violating

@@ -83,7 +83,8 @@ def test_in_a_group_and_under_vmap_as_alone(name):
         np.testing.assert_array_equal(ours, alone)
     for one, other in zip(policies, trained(group, per_device=3), strict=True):
         for a, b in zip(one, other, strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-3)
+            # Rounding grows in a thousand steps; another learning rate moves weights far more.
+            np.testing.assert_allclose(a, b, atol=5e-3)
     assert np.any(policies[0][0] != policies[1][0])
 
 
