@@ -36,7 +36,7 @@ def execute(path: Path, update: bool) -> bool:
     stored = nbformat.read(path, as_version=4)
     notebook = copy.deepcopy(stored)
     started = time.perf_counter()
-    client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": HERE.parent}})
+    client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": HERE.parent}})
     try:
         client.execute()
     except CellExecutionError as error:
