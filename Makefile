@@ -49,19 +49,20 @@ docs: .venv/docs
 falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
-# With XLA's older emitters of loops tests take a quarter to a third less processor time; notebooks
-# compile as a user does.
 # Tests of one file share what they compile, so a file stays with one worker; long files begin.
+AS_A_USER := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+# With XLA's older emitters of loops tests take a quarter to a third less processor time.
 PYTEST := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1" \
-  $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+  $(AS_A_USER)
 
-# Slow tests compile with all optimisations: what they run takes longer than compilation.
 test: .venv/installed
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
 
+# What a training ends with depends on every rounding, so slow tests of it compile as a user does.
 test-slow: .venv/extras
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST) -m "thorough and not slow"
-	$(PYTEST) -m slow
+	$(PYTEST) -m slow --ignore tests/rl
+	$(AS_A_USER) -m slow tests/rl
 
 test-all: test test-slow
 
