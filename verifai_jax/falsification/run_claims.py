@@ -40,7 +40,7 @@ class Claimed(NamedTuple):
 
 
 class RunClaims:
-    """Closer replays of the violating rows of one run; `checked` says in words which they were.
+    """Closer replays of the violating rows of one run.
 
     **Arguments:**
 
@@ -51,11 +51,15 @@ class RunClaims:
 
     def __init__(self, problem: Problem, precision: str, seed: int) -> None:
         self._confirmer = Confirmer(problem, precision, seed)
-        self.checked = ""
 
     def prepare(self) -> None:
         """Trace the replays before there is a row, while something else compiles."""
         self._confirmer.prepare()
+
+    @property
+    def checked(self) -> str:
+        """Checks that a confirmed row has passed, in words; empty before any row was examined."""
+        return self._confirmer.checked
 
     @property
     def raised(self) -> tuple[str, ...]:
@@ -87,7 +91,6 @@ class RunClaims:
         checked = confirmer(own, first + rows, max(LIMIT, (first + count) // SHARE))
         compiled = confirmer.compile_seconds - compiled
         seconds = time.perf_counter() - started - compiled
-        self.checked = confirmer.checked or self.checked
         verdict[rows] = checked.verdict
         refused[rows], greatest[rows] = checked.refuse(own["rho"])
         return claimed._replace(seconds=seconds, compile_seconds=compiled)

@@ -1,6 +1,6 @@
 """The simulations of a run: of its rounds, and of the first rows that are timed one by one.
 
-    simulations = Simulations(problem, search, batch=32, seed=0)
+    simulations = Simulations(problem, search, batch=32, seed=0, precision="float32", ...)
     verdicts = simulations(points, first=0)                      # of a round
     verdicts = simulations(points, first=32, differentiate=True, temperature=temperature)
     seconds = simulations.measure(points)                        # of a black box
@@ -11,6 +11,7 @@ which is compiled when it is needed.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,33 +61,27 @@ class Simulations:
         keep_traces: bool,
     ) -> None:
         self.batch, self.keep_traces = batch, keep_traces
-        self.evaluate = Evaluator(
+        evaluator = partial(
+            Evaluator,
             problem,
+            precision=precision,
+            seed=seed,
+            executor=executor,
+            target=target,
+            steering=steering,
+        )
+        self.evaluate = evaluator(
             batch,
             gradient=search.wants_gradient,
             # Of goals that have one each, that is the robustness, which costs less.
             clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
-            precision=precision,
-            seed=seed,
             journal=journal,
-            executor=executor,
-            target=target,
-            steering=steering,
             keep_traces=keep_traces,
         )
         self._differentiate: Evaluator | None = None
         if search.wants_clauses:
-            self._differentiate = Evaluator(
-                problem,
-                min(batch, MOST_DIFFERENTIATED),
-                gradient=True,
-                clauses=True,
-                precision=precision,
-                seed=seed,
-                executor=executor,
-                target=target,
-                steering=steering,
-            )
+            most = min(batch, MOST_DIFFERENTIATED)
+            self._differentiate = evaluator(most, gradient=True, clauses=True)
         self._measured: Verdicts | None = None
 
     @property
