@@ -1,14 +1,15 @@
 """Searches for failing regions that do not depend on one another, nor on splitting.
 
-    exploration = explore(limit_state, rng, chains=64)
+    exploration = explore(limit_state, rng, simulations=3000)
     exploration.points, exploration.chain_ids       # failures, and the chain of each
-    exploration.nearest                             # least distant failure of each chain
+    exploration.nearest, exploration.regions        # least distant failure and region of each chain
 
 Splitting follows the robustness as a population: where it falls fastest, all chains gather, and a
-region that the robustness leads to more slowly is left behind, however probable it is. Here every
-chain is alone. It starts anywhere from the middle of the prior to far outside of it, descends until
-it fails, comes in towards the origin, where failures are more probable, and then walks among the
-failures by moves that keep the prior.
+region that the robustness leads to more slowly is left behind, however probable it is. Here
+descents begin in many places and end at their first failure (`descents`). Failures between which
+another one lies count as one region, and each region has about as many chains as any other: they
+come in towards the origin, where failures are more probable, and then walk among the failures by
+moves that keep the prior.
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the failures of splitting that this mends; Hasofer and
@@ -20,35 +21,31 @@ Computers and Structures 9 (1978), for the least distant failure and the steps t
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from verifai_jax.estimation.descents import HALVINGS, Ends, come_in, descend_from_many, scores_of
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.splitting import ACCEPTED
 
-WIDEST = 3.0
-"""Standard deviation of the starts that lie farthest out; that of the others is 0.5 at least."""
-DESCENT = 24
-"""Steps of a descent without gradients, at most."""
-GRADIENT_DESCENT = 8
-"""Steps of a descent with gradients, at most."""
-HALVINGS = 5
-"""Halvings of the way in towards the origin."""
+DESCENTS = 0.55
+"""Share of the simulations for descents."""
+TELLING_APART = 0.1
+"""Share of the simulations for points between ends, which tell regions apart."""
+SAME = 0.01
+"""Distance of ends below which they are one."""
+APART = 1.0
+"""Distance from which least distant failures belong to different regions."""
+LINKS = 2
+"""Ends with which another one is compared, the nearest first."""
 WALK = 24
-"""Steps of a walk among the failures; the second half of its states is kept."""
+"""Steps of a walk among the failures, half of them where gradients have led there; the second half
+of its states is kept."""
+FALL = -0.5
+"""Change of the logarithm of a walk's step that is refused, until one is taken."""
 NEAREST_STEPS = 6
 """Steps to the least distant failure, at most, where there are gradients."""
-DRAWN = 6
-"""Starts that are drawn for each chain."""
-COST = DRAWN + DESCENT + HALVINGS + WALK
-"""Simulations of one chain, at most, without gradients."""
-GRADIENT_COST = (
-    DRAWN + 2 * (1 + GRADIENT_DESCENT) + DESCENT // 2 + HALVINGS + WALK + 3 * NEAREST_STEPS
-)
-"""The same with gradients, one of which counts as a further simulation."""
-BEYOND = 0.05
-"""Share of the way to the limit state that a step with gradients goes beyond it."""
-LONGEST = 3.0
-"""Length of a step with gradients, at most."""
+FEWEST_CHAINS = 8
+"""Chains, at least, where there are as many ends."""
 
 
 @dataclass(frozen=True)
@@ -58,145 +55,142 @@ class Exploration:
     - `points`: failures `[n, d]`, several of each chain.
     - `chain_ids`: the chain `[n]` of each.
     - `nearest`: for each chain the failure `[m, d]` nearest to the origin.
+    - `regions`: for each chain the number `[m]` of its region.
     """
 
     points: Float[np.ndarray, "n d"]
     chain_ids: Int[np.ndarray, " n"]
     nearest: Float[np.ndarray, "m d"]
+    regions: Int[np.ndarray, " m"]
 
 
-def explore(limit_state: LimitState, rng: np.random.Generator, chains: int) -> Exploration:
-    """Search for failures by chains that do not know of one another.
+def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Exploration:
+    """Search for failures, by descents and by chains among what they find.
 
     **Arguments:**
 
-    - `chains`: number of starts; those that find no failure are left out of the result.
+    - `simulations`: number of them, about.
 
-    **Returns:** the failures; none where no chain found one.
+    **Returns:** the failures; none where no descent found one.
 
     **Raises:** `Ended` where time is over.
     """
-    z, score = _descend(limit_state, rng, *_starts(limit_state, rng, chains))
-    z = z[score == -np.inf]
-    if not len(z):
-        none = np.zeros((0, limit_state.dim))
-        return Exploration(none, np.zeros(0, int), none)
-    z = _come_in(limit_state, z)
-    states, nearest = _walk_alone(limit_state, rng, z)
-    if limit_state.gradient is not None:
+    begin = limit_state.simulations
+    ends = descend_from_many(limit_state, rng, round(DESCENTS * simulations))
+    if not len(ends.points):
+        none, no_chain = np.zeros((0, limit_state.dim)), np.zeros(0, int)
+        return Exploration(none, no_chain, none, no_chain)
+    differentiates = limit_state.gradient is not None
+    steps = WALK // 2 if differentiates else WALK
+    cost = steps + (HALVINGS + 3 * NEAREST_STEPS) * differentiates
+    telling = round(TELLING_APART * simulations)
+    left = simulations - telling - (limit_state.simulations - begin)
+    chains = min(max(FEWEST_CHAINS, left // cost), len(ends.points))
+    rows = _choose_ends(limit_state, ends, chains, telling)
+    z = ends.points[rows]
+    if differentiates:
+        z = come_in(limit_state, z)
+    states, nearest = _walk_alone(limit_state, rng, z, steps)
+    if differentiates:
         nearest = approach_origin(limit_state, nearest)
     chain_ids = np.tile(np.arange(len(z)), len(states))
-    return Exploration(np.concatenate(states), chain_ids, nearest)
+    regions = _regions_of(limit_state, nearest)
+    return Exploration(np.concatenate(states), chain_ids, nearest, regions)
 
 
-def _starts(
-    limit_state: LimitState, rng: np.random.Generator, chains: int
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
-    """Draw starts between the middle of the prior and far outside of it, and score them.
+def _choose_ends(
+    limit_state: LimitState, ends: Ends, chains: int, simulations: int
+) -> Int[np.ndarray, " chains"]:
+    """Choose ends for chains, in turn from each region; one with few ends has some of them twice.
 
-    Of more starts than there are chains, those that fail themselves come first, up to half of the
-    chains: a region that no descent leads to may be large enough to be hit.
+    Ends belong together where the point between them fails; each is compared with the nearest of
+    those before it.
     """
-    wanted = DRAWN * chains
-    accepted = np.zeros((0, limit_state.dim))
-    for _ in range(20):
-        spread = rng.uniform(0.5, WIDEST, (wanted, 1))
-        z = spread * rng.standard_normal((wanted, limit_state.dim))
-        accepted = np.concatenate([accepted, z[limit_state.accepts(z)]])[:wanted]
-        if len(accepted) == wanted:
-            break
-    score = limit_state(accepted).score
-    failing, others = np.flatnonzero(score == -np.inf), np.flatnonzero(score > -np.inf)
-    # The starts are independent, so the first ones are as good as any.
-    hits = failing[: max(chains // 2, chains - len(others))]
-    rows = np.concatenate([hits, others[: chains - len(hits)]])
-    return accepted[rows], score[rows]
+    rows = _spread_out(ends, max(chains, simulations // LINKS))
+    gaps = _gaps(ends, rows, rows)
+    gaps[np.triu_indices(len(rows))] = np.inf
+    group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
+    # The nearest to the origin comes first, then those far apart, should there be several regions.
+    norms = np.linalg.norm(ends.points[rows], axis=1)
+    members = []
+    for number in range(group.max() + 1):
+        own = np.flatnonzero(group == number)
+        members.append(np.append(own[norms[own].argmin()], np.delete(own, norms[own].argmin())))
+    members.sort(key=lambda own: norms[own[0]])
+    turns = [own[turn % len(own)] for turn in range(chains) for own in members]
+    return rows[np.array(turns[:chains])]
 
 
-def _descend(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    z: Float[np.ndarray, "n d"],
-    score: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
-    """Lower the robustness of each point until it fails or its steps are used up."""
-    steps = DESCENT
-    if limit_state.gradient is not None:
-        # Points without a usable gradient go on without.
-        z, score = _descend_by_gradient(limit_state, z)
-        steps = DESCENT // 2
-    length, last = np.ones(len(z)), np.zeros_like(z)
-    for _ in range(steps):
-        rows = np.flatnonzero(score > -np.inf)
-        if not len(rows):
-            break
-        # A step that was good is taken again, with some noise.
-        step = length[rows, None] * rng.standard_normal((len(rows), limit_state.dim))
-        repeats = np.any(last[rows] != 0, axis=1)
-        step[repeats] = 1.3 * last[rows[repeats]] + 0.3 * step[repeats]
-        moved = z[rows] + step
-        new = _scores(limit_state, moved)
-        better = new < score[rows]
-        z[rows[better]], score[rows[better]] = moved[better], new[better]
-        last[rows] = np.where(better[:, None], step, 0.0)
-        length[rows] *= np.where(better, 1.2, np.where(repeats, 1.0, 0.85))
-    return z, score
+def _regions_of(
+    limit_state: LimitState, nearest: Float[np.ndarray, "m d"]
+) -> Int[np.ndarray, " m"]:
+    """Return the region `[m]` of chains: of one are near ones between which another point fails."""
+    order = np.argsort(np.linalg.norm(nearest, axis=1))
+    z = nearest[order]
+    gaps = np.linalg.norm(z[:, None] - z[None], axis=2)
+    gaps[np.triu_indices(len(z))] = np.inf
+    others = np.argsort(gaps, axis=1)[:, :LINKS]
+    near = np.take_along_axis(gaps, others, axis=1) < APART
+    own = np.arange(len(z))[:, None]
+    region = np.empty(len(z), int)
+    region[order] = _joined(limit_state, z, np.where(near, others, own))
+    return region
 
 
-def _descend_by_gradient(
-    limit_state: LimitState, z: Float[np.ndarray, "n d"]
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
-    """Take Newton's steps to the limit state, halved where they do not lower the robustness."""
-    z = z.copy()
-    score, _, gradient = limit_state.linearize(z)
-    longest = np.full(len(z), LONGEST)
-    for _ in range(GRADIENT_DESCENT):
-        square = np.sum(gradient * gradient, axis=1)
-        rows = np.flatnonzero((score > -np.inf) & np.isfinite(score) & (square > 0))
-        if not len(rows):
-            break
-        step = -(1 + BEYOND) * (score[rows] / square[rows])[:, None] * gradient[rows]
-        size = np.linalg.norm(step, axis=1)
-        # A robustness of zero is no failure yet: a small step goes beyond it.
-        direction = -gradient[rows] / np.sqrt(square[rows])[:, None]
-        moved = z[rows] + direction * np.clip(size, 1e-3, longest[rows])[:, None]
-        fits = limit_state.accepts(moved)
-        new = limit_state.linearize(np.where(fits[:, None], moved, z[rows]))
-        better = fits & (new.score < score[rows])
-        took = rows[better]
-        z[took], score[took] = moved[better], new.score[better]
-        gradient[took] = new.gradient[better]
-        longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
-    return z, score
+def _joined(
+    limit_state: LimitState, z: Float[np.ndarray, "k d"], others: Int[np.ndarray, "k links"]
+) -> Int[np.ndarray, " k"]:
+    """Return numbers `[k]` of groups of failures: joined to others where the middle fails."""
+    group, places = np.arange(len(z)), np.arange(len(z))
+    for other in others.T:
+        tried = np.flatnonzero((other < places) & (group[other] != group))
+        middle = (z[tried] + z[other[tried]]) / 2
+        for row in tried[scores_of(limit_state, middle) == -np.inf]:
+            group[group == group[row]] = group[other[row]]
+    return np.unique(group, return_inverse=True)[1]
 
 
-def _come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Halve the way to the origin as far as the points still fail."""
-    low, high = np.zeros(len(z)), np.ones(len(z))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        fails = _scores(limit_state, middle[:, None] * z) == -np.inf
-        low, high = np.where(fails, low, middle), np.where(fails, middle, high)
-    return high[:, None] * z
+def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
+    """Return ends far from one another, the least distant first; no two that are one."""
+    everything = np.arange(len(ends.points))
+    chosen = [int(np.linalg.norm(ends.points, axis=1).argmin())]
+    gap = _gaps(ends, everything, np.array(chosen))[:, 0]
+    while len(chosen) < min(most, len(everything)) and gap.max() > SAME:
+        chosen.append(int(gap.argmax()))
+        gap = np.minimum(gap, _gaps(ends, everything, np.array(chosen[-1:]))[:, 0])
+    return np.array(chosen)
+
+
+def _gaps(
+    ends: Ends, rows: Int[np.ndarray, " n"], others: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, "n m"]:
+    """Return distances of ends: of the points or of the feet, whichever is less."""
+    points, feet = (
+        np.linalg.norm(part[rows][:, None] - part[others][None], axis=2)
+        for part in (ends.points, ends.feet)
+    )
+    return np.minimum(points, feet)
 
 
 def _walk_alone(
-    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"], steps: int
 ) -> tuple[list[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
     """Walk among the failures, each chain by moves of its own size that keep the prior.
 
     **Returns:** the states of the second half, and the state of each chain nearest to the origin.
     """
     scale, states, nearest = np.full(len(z), 0.5), [], z.copy()
-    # What gradients lead to needs less of a walk.
-    steps = WALK if limit_state.gradient is None else WALK // 2
+    moving = np.zeros(len(z), bool)
     for step in range(1, steps + 1):
         moved = np.sqrt(1 - scale**2)[:, None] * z
         moved += scale[:, None] * rng.standard_normal(z.shape)
-        take = _scores(limit_state, moved) == -np.inf
+        take = scores_of(limit_state, moved) == -np.inf
         z = np.where(take[:, None], moved, z)
-        # Gains fall with the steps, so that the sizes settle.
+        moving |= take
+        # Gains fall with the steps, so that the sizes settle. In a small region no step is taken
+        # until it is small as well.
         gain = np.where(take, 1 - ACCEPTED, -ACCEPTED) / np.sqrt(1 + step / 8)
+        gain = np.where(moving, gain, FALL)
         scale = np.clip(scale * np.exp(gain), 1e-4, 0.95)
         closer = np.sum(z * z, axis=1) < np.sum(nearest * nearest, axis=1)
         nearest = np.where(closer[:, None], z, nearest)
@@ -225,18 +219,9 @@ def approach_origin(
         inner = np.sum(gradient * point, axis=1) - np.where(usable, rho, 0.0)
         target = (inner / square)[:, None] * gradient * (1 + 1e-3)
         moved = np.where(usable[:, None], point + share[:, None] * (target - point), point)
-        fails = _scores(limit_state, moved) == -np.inf
+        fails = scores_of(limit_state, moved) == -np.inf
         closer = fails & (np.sum(moved**2, axis=1) < np.sum(best**2, axis=1))
         best = np.where(closer[:, None], moved, best)
         share = np.where(fails, np.minimum(1.0, 1.5 * share), share / 2)
         point = np.where(fails[:, None], moved, best)
     return best
-
-
-def _scores(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Return the scores of points; infinity where the constraint refuses one."""
-    fits: Bool[np.ndarray, " n"] = limit_state.accepts(z)
-    score = np.full(len(z), np.inf)
-    if fits.any():
-        score[fits] = limit_state(z[fits]).score
-    return score

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.estimation.initial_proposal import CHAINS_WORTH, Anchors
 from verifai_jax.estimation.intervals import (
     WeightedMean,
     skewed_interval,
@@ -34,10 +35,10 @@ KEPT = 0.25
 """Share of the previous proposal in the next one, so that no stage can spoil it."""
 ANCHORED = 0.1
 """Share of the anchors in a proposal, so that no stage forgets a region that a search has found."""
-CHAINS_WORTH = 1.5
-"""Independent failures that the states of one splitting chain are worth."""
 ENOUGH = 2500
 """Effective failures beyond which a further stage is not worth its simulations."""
+STEADY = 0.5
+"""Tail index below which the weights have a finite variance, and more need not be fitted."""
 DEFENSIVE = 0.1
 """Share of the prior in a proposal, which bounds the importance weights."""
 OUTERMOST = 5.54
@@ -136,7 +137,7 @@ def fit_proposal(
     chain_ids: Int[np.ndarray, " n"],
     simulations: int,
     initial: Mixture | None = None,
-    anchors: Mixture | None = None,
+    anchors: Anchors | None = None,
     defensive: float = DEFENSIVE,
 ) -> FittedProposal:
     """Fit a proposal to failures, and improve it by samples of itself.
@@ -147,7 +148,7 @@ def fit_proposal(
     - `chain_ids`: the splitting chain `[n]` that each failure comes from.
     - `simulations`: number of simulations left; each stage takes a share of them.
     - `initial`: proposal of the first stage; fitted to the failures when left out.
-    - `anchors`: a mixture that keeps a share of every proposal.
+    - `anchors`: regions, whose components keep a share of every proposal.
     - `defensive`: share of the prior in the proposal.
     """
     proposal = initial or fit_mixture(points, np.ones(len(points)), chain_ids, rng, defensive)
@@ -180,8 +181,8 @@ def fit_proposal(
         proposal = fit_mixture(np.concatenate([points, new]), weight, all_ids, rng, defensive)
         proposal = proposal.join(proposals[-1], KEPT)
         if anchors is not None:
-            proposal = proposal.join(anchors, ANCHORED)
-        if stage and (effective * left > ENOUGH or effective * left < before):
+            proposal = proposal.join(anchors.fit(new, inverse), ANCHORED)
+        if stage and tail < STEADY and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left
     return FittedProposal(proposal, effective, tail)

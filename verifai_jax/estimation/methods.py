@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
-from verifai_jax.estimation.exploration import COST, GRADIENT_COST, Exploration, explore
+from verifai_jax.estimation.exploration import Exploration, explore
 from verifai_jax.estimation.importance import DEFENSIVE
 from verifai_jax.estimation.initial_proposal import (
     Agreement,
-    around_centres,
+    anchors_of,
     compare_explorations,
     join_explorations,
     mix,
@@ -53,12 +53,10 @@ SHARE_OF_REPLICATE = 0.02
 """Share of the budget for each level of splitting runs that are the estimate themselves."""
 EXPLORATIONS = 2
 """Independent searches for failures beside splitting."""
-SHARE_OF_EXPLORATION = 0.06
-"""Share of the budget for each of them, at most."""
-MANY_COORDINATES, SHARE_IN_MANY_COORDINATES = 8, 0.1
-"""Coordinates from which chains with gradients take this share: there is more to search."""
-FEWEST_CHAINS = 8
-"""Chains of a search, below which it says too little to be worth its simulations."""
+SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.1
+"""Share of the budget for each of them."""
+FEWEST_OF_EXPLORATION = 600
+"""Simulations of a search, below which it says too little to be worth them."""
 SHARE_OF_PATHS = 0.03
 """Share of the budget for paths between the failures of different searches."""
 RESERVED = 0.3
@@ -180,7 +178,7 @@ def estimate_by_importance_sampling(
         if run.stopped is not None and not explorations:
             return _bound_only(limit_state, rng, plan, run, counts)
         points, chain_ids, proposals = _proposals(limit_state, rng, plan, run, explorations)
-        anchors = around_centres(explorations, DEFENSIVE) if explorations else None
+        anchors = anchors_of(explorations, DEFENSIVE) if explorations else None
         fitted = importance.fit_proposal(
             limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
         )
@@ -231,15 +229,11 @@ def _without_samples(
 
 def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Exploration]:
     """Search for failures independently; return the searches that found some."""
-    share, cost = SHARE_OF_EXPLORATION, COST
-    if limit_state.gradient is not None and limit_state.dim >= MANY_COORDINATES:
-        share = SHARE_IN_MANY_COORDINATES
-    if limit_state.gradient is not None:
-        cost = GRADIENT_COST
-    chains = int(share * limit_state.budget / cost)
-    if chains < FEWEST_CHAINS:
+    share = SHARE_OF_EXPLORATION if limit_state.gradient is None else SHARE_WITH_GRADIENTS
+    simulations = round(share * limit_state.budget)
+    if simulations < FEWEST_OF_EXPLORATION:
         return []
-    found = [explore(limit_state, rng, chains) for _ in range(EXPLORATIONS)]
+    found = [explore(limit_state, rng, simulations) for _ in range(EXPLORATIONS)]
     return [exploration for exploration in found if len(exploration.points)]
 
 

@@ -132,15 +132,23 @@ def _look(
     z: Float[np.ndarray, "n d"],
     share: Float[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
-    """Draw failures by their share; return their rows, and which a path joins to a region."""
+    """Draw failures by their share; return their rows, and which a path joins to a region.
+
+    These are points of their regions from then on, so that others are assigned by more of them.
+    """
     rows = rng.choice(len(z), LOOKED_AT, p=share)
     order = _by_distance(z[rows], regions.points)[:, :NEIGHBOURS]
-    joined = np.zeros(len(rows), bool)
+    region = np.full(len(rows), -1)
     for column in order.T:
-        left = np.flatnonzero(~joined)
+        left = np.flatnonzero(region < 0)
         if not len(left):
             break
-        joined[left] = connected(limit_state, z[rows[left]], regions.points[column[left]])
+        joined = left[connected(limit_state, z[rows[left]], regions.points[column[left]])]
+        region[joined] = regions.region[column[joined]]
+    joined = region >= 0
+    new = joined & (np.unique(rows, return_index=True)[1][:, None] == np.arange(len(rows))).any(0)
+    regions.points = np.concatenate([regions.points, z[rows[new]]])
+    regions.region = np.append(regions.region, region[new])
     return rows, joined
 
 
