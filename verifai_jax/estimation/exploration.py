@@ -23,7 +23,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.estimation.descents import HALVINGS, Ends, come_in, descend_from_many, scores_of
+from verifai_jax.estimation.descents import (
+    BEYOND,
+    HALVINGS,
+    Ends,
+    come_in,
+    descend_from_many,
+    scores_of,
+)
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.splitting import ACCEPTED
 
@@ -82,7 +89,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
         return Exploration(none, no_chain, none, no_chain)
     differentiates = limit_state.gradient is not None
     steps = WALK // 2 if differentiates else WALK
-    cost = steps + (HALVINGS + 3 * NEAREST_STEPS) * differentiates
+    cost = steps + (HALVINGS + 4 * NEAREST_STEPS) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
     chains = min(max(FEWEST_CHAINS, left // cost), len(ends.points))
@@ -204,24 +211,27 @@ def approach_origin(
 ) -> Float[np.ndarray, "n d"]:
     """Move failures to the least distant ones near them, by the gradient.
 
-    A step goes to the point nearest to the origin where the linearised robustness is just below
-    zero (Rackwitz and Fiessler, 1978); it is halved where that does not fail or is no nearer.
+    A step goes towards the point nearest to the origin where the linearised robustness is just
+    below zero (Rackwitz and Fiessler, 1978). Where that does not fail, as on a limit state that
+    bends away, Newton's step leads back to it; where it is no nearer, the next step is half as far.
 
     **Returns:** failures `[n, d]`, none farther from the origin than its start.
     """
-    best, point = z.copy(), z.copy()
+    best = z.copy()
     share = np.ones(len(z))
     for _ in range(steps):
-        _, rho, gradient = limit_state.linearize(point)
+        _, rho, gradient = limit_state.linearize(best)
         square = np.sum(gradient * gradient, axis=1)
         usable = np.isfinite(rho) & (square > 0)
-        square = np.where(usable, square, 1.0)
-        inner = np.sum(gradient * point, axis=1) - np.where(usable, rho, 0.0)
-        target = (inner / square)[:, None] * gradient * (1 + 1e-3)
-        moved = np.where(usable[:, None], point + share[:, None] * (target - point), point)
-        fails = scores_of(limit_state, moved) == -np.inf
-        closer = fails & (np.sum(moved**2, axis=1) < np.sum(best**2, axis=1))
+        normal = gradient / np.where(usable, square, 1.0)[:, None]
+        inner = np.sum(gradient * best, axis=1) - np.where(usable, rho, 0.0)
+        target = inner[:, None] * normal * (1 + 1e-3)
+        moved = np.where(usable[:, None], best + share[:, None] * (target - best), best)
+        score = scores_of(limit_state, moved)
+        safe = np.flatnonzero(usable & (score > -np.inf) & np.isfinite(score))
+        moved[safe] -= (1 + BEYOND) * score[safe, None] * normal[safe]
+        score[safe] = scores_of(limit_state, moved[safe])
+        closer = (score == -np.inf) & (np.sum(moved**2, axis=1) < np.sum(best**2, axis=1))
         best = np.where(closer[:, None], moved, best)
-        share = np.where(fails, np.minimum(1.0, 1.5 * share), share / 2)
-        point = np.where(fails[:, None], moved, best)
+        share = np.where(closer, np.minimum(1.0, 1.5 * share), share / 2)
     return best
