@@ -1,20 +1,25 @@
 """Planted modes of failure: how many `vj.modes` finds, and how right their numbers are.
 
-python benchmarks/modes.py                          # everything, 20 seeds: an hour
-python benchmarks/modes.py --seeds 3 --dims 2 10
+python benchmarks/modes.py                          # everything, 20 seeds: two hours
+python benchmarks/modes.py --seeds 3 --dims 2 10 --shapes half-spaces
 
-Half-spaces in directions at right angles, whose robustness falls at very different speeds, so that
-a population that follows it gathers in few of them. Masses and distances are known. A line says in
-how many runs every mode of at least 0.5 % of the probability was found, how many 95 % intervals
-hold the true mass, and the greatest ratio of the distance of a likeliest point to the true one.
+Half-spaces in directions at right angles, balls in normal space, and balls inside a box of uniform
+features, which no corner and no tail leads to. The robustness falls to them at different speeds,
+so that a population that follows it gathers in few of them. Masses and distances are known. A line
+says in how many runs every mode of at least 0.5 % of the probability was found, how many 95 %
+intervals hold the true mass, and the greatest ratio of the distance of a likeliest point to the
+true one, which uniform features do not have.
 """
 
 import argparse
+import math
 import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import ncx2, norm
 
 import verifai_jax as vj
 
@@ -22,37 +27,105 @@ LEAST = 0.005
 """Part of the probability from which a mode has to be found."""
 
 
-def planted(dim: int, count: int, seed: int = 0) -> tuple[vj.Problem, np.ndarray, np.ndarray]:
-    """A problem with modes planted in normal space, their directions and their distances."""
-    random = np.random.default_rng(1000 * dim + count + seed)
+class Planted(NamedTuple):
+    """A problem with modes: their masses, distances (None: as probable everywhere), and margins."""
+
+    problem: vj.Problem
+    masses: np.ndarray
+    distances: np.ndarray | None
+    margins: Callable[[np.ndarray], np.ndarray]  # from features [d] to the margin of each mode
+
+
+def posed(name: str, domain: vj.Domain, dim: int, robustness) -> vj.Problem:
+    """A system of one sample, whose only signal is the robustness."""
+
+    def system(features, key):
+        return vj.Trace({"margin": robustness(features["x"])[None]}, dt=1.0)
+
+    return vj.Problem(name, {"x": vj.Array(domain, dim)}, system, "margin >= 0")
+
+
+def half_spaces(dim: int, count: int) -> Planted:
+    """Half-spaces at right angles, whose robustness falls at speeds up to fifty times apart."""
+    random = np.random.default_rng(1000 * dim + count)
     axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T
     directions = np.concatenate([axes, -axes])[:count]
     distances = np.sort(random.uniform(3.7, 4.6, count))
     speeds = np.exp(random.uniform(-2, 2, count))
     normals, offsets = jnp.asarray(directions, jnp.float32), jnp.asarray(distances, jnp.float32)
     factors = jnp.asarray(speeds, jnp.float32)
+    problem = posed(
+        f"half_spaces_{dim}_{count}",
+        vj.Normal(0.0, 1.0),
+        dim,
+        lambda x: jnp.min((offsets - normals @ x) * factors),
+    )
+    return Planted(problem, norm.sf(distances), distances, lambda x: distances - directions @ x)
 
-    def system(features, key):
-        margin = jnp.min((offsets - normals @ features["x"]) * factors)
-        return vj.Trace({"margin": margin[None]}, dt=1.0)
 
-    space = {"x": vj.Array(vj.Normal(0.0, 1.0), dim)}
-    return vj.Problem(f"planted_{dim}_{count}", space, system, "margin >= 0"), directions, distances
+def islands(name: str, domain: vj.Domain, centres, radii, speeds, masses, distances) -> Planted:
+    """Balls of these centres and radii."""
+    middles, reach = jnp.asarray(centres, jnp.float32), jnp.asarray(radii, jnp.float32)
+    factors = jnp.asarray(speeds, jnp.float32)
+    problem = posed(
+        name,
+        domain,
+        centres.shape[1],
+        lambda x: jnp.min((jnp.linalg.norm(x - middles, axis=1) - reach) * factors),
+    )
+    return Planted(
+        problem, masses, distances, lambda x: np.linalg.norm(x - centres, axis=1) - radii
+    )
 
 
-def measure(dim: int, count: int, budget: int, seeds: int) -> str:
+def balls(dim: int, count: int) -> Planted:
+    """Balls in normal space, 3.3 to 4.2 from the origin, with speeds up to four times apart."""
+    random = np.random.default_rng(2000 * dim + count)
+    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T
+    far = random.uniform(3.3, 4.2, count)
+    centres = np.concatenate([axes, -axes])[:count] * far[:, None]
+    wanted = 10 ** random.uniform(-5.3, -4, count)
+    radii = np.sqrt(ncx2.ppf(wanted, dim, far**2))
+    speeds = np.exp(random.uniform(-0.7, 0.7, count))
+    masses = ncx2.cdf(radii**2, dim, far**2)
+    name = f"balls_{dim}_{count}"
+    return islands(name, vj.Normal(0.0, 1.0), centres, radii, speeds, masses, far - radii)
+
+
+def balls_in_a_box(dim: int, count: int) -> Planted:
+    """Balls inside the unit cube of uniform features, apart from one another and the faces."""
+    random = np.random.default_rng(3000 * dim + count)
+    masses = 10 ** random.uniform(-5, -4, count)
+    radii = (masses * math.gamma(dim / 2 + 1) / math.pi ** (dim / 2)) ** (1 / dim)
+    speeds = np.exp(random.uniform(-0.7, 0.7, count))
+    while True:
+        centres = np.stack([random.uniform(r, 1 - r, dim) for r in radii])
+        gaps = np.linalg.norm(centres[:, None] - centres, axis=2) - radii - radii[:, None]
+        if np.all(gaps[~np.eye(count, dtype=bool)] > 0.05):
+            break
+    name = f"balls_in_a_box_{dim}_{count}"
+    return islands(name, vj.Box(0.0, 1.0), centres, radii, speeds, masses, None)
+
+
+SHAPES = {"half-spaces": half_spaces, "balls": balls, "balls in a box": balls_in_a_box}
+
+MOST_DIMENSIONS = {"half-spaces": 50, "balls": 10, "balls in a box": 5}
+"""Dimensions from which little of the space leads to a ball: nothing but luck finds it."""
+
+
+def measure(shape: str, dim: int, count: int, budget: int, seeds: int) -> str:
     """One line of the table."""
-    problem, directions, distances = planted(dim, count)
-    masses = norm.sf(distances)
+    planted = SHAPES[shape](dim, count)
+    masses = planted.masses
     wanted = np.flatnonzero(masses >= LEAST * masses.sum())
     complete = covered = intervals = extra = 0
     farthest, started = 1.0, time.perf_counter()
     for seed in range(seeds):
-        found = vj.modes(problem, budget, seed=seed, progress=False)
+        found = vj.modes(planted.problem, budget, seed=seed, progress=False)
         own: dict[int, vj.Mode] = {}
         for mode in found:
             x = np.array([mode.features[f"x[{i}]"] for i in range(dim)])
-            number = int(np.argmax(directions @ x - distances))
+            number = int(np.argmin(planted.margins(x)))
             extra += number in own
             own.setdefault(number, mode)
         complete += all(number in own for number in wanted)
@@ -60,11 +133,13 @@ def measure(dim: int, count: int, budget: int, seeds: int) -> str:
             mode = own[number]
             intervals += 1
             covered += mode.low <= masses[number] <= mode.high
-            farthest = max(farthest, mode.distance / distances[number])
+            if planted.distances is not None:
+                farthest = max(farthest, mode.distance / planted.distances[number])
     seconds = (time.perf_counter() - started) / seeds
+    ratio = "" if planted.distances is None else f"{farthest:.4f}"
     return (
-        f"| {dim} | {count} | {complete}/{seeds} | {extra} | {covered}/{intervals} | "
-        f"{farthest:.4f} | {seconds:.0f} |"
+        f"| {shape} | {dim} | {count} | {complete}/{seeds} | {extra} | {covered}/{intervals} | "
+        f"{ratio} | {seconds:.0f} |"
     )
 
 
@@ -75,13 +150,17 @@ def main() -> None:
     parser.add_argument("--budget", type=int, default=50_000)
     parser.add_argument("--dims", type=int, nargs="+", default=[2, 5, 10, 20, 50])
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 4, 8])
+    parser.add_argument("--shapes", nargs="+", choices=[*SHAPES], default=[*SHAPES])
     options = parser.parse_args()
-    print("| d | modes | all found | split in two | masses in intervals | distance / true | s |")
-    print("|---|---|---|---|---|---|---|")
-    for dim in options.dims:
-        for count in options.counts:
-            if count <= 2 * dim:
-                print(measure(dim, count, options.budget, options.seeds), flush=True)
+    print(
+        "| modes are | d | modes | all found | split in two | masses in intervals | distance / true | s |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
+    for shape in options.shapes:
+        for dim in options.dims:
+            for count in options.counts:
+                if count <= 2 * dim and dim <= MOST_DIMENSIONS[shape]:
+                    print(measure(shape, dim, count, options.budget, options.seeds), flush=True)
 
 
 if __name__ == "__main__":

@@ -51,6 +51,8 @@ FALL = -0.5
 """Change of the logarithm of a walk's step that is refused, until one is taken."""
 NEAREST_STEPS = 6
 """Steps to the least distant failure, at most, where there are gradients."""
+IMPROBABLE = 20.0
+"""Logarithm of the prior's density beside the greatest, below which a region is left out."""
 FEWEST_CHAINS = 8
 """Chains, at least, where there are as many ends."""
 
@@ -100,7 +102,10 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     states, nearest = _walk_alone(limit_state, rng, z, steps)
     if differentiates:
         nearest = approach_origin(limit_state, nearest)
-    chain_ids = np.tile(np.arange(len(z)), len(states))
+    square = np.sum(nearest**2, axis=1)
+    probable = square < square.min() + 2 * IMPROBABLE
+    nearest, states = nearest[probable], [state[probable] for state in states]
+    chain_ids = np.tile(np.arange(len(nearest)), len(states))
     regions = _regions_of(limit_state, nearest)
     return Exploration(np.concatenate(states), chain_ids, nearest, regions)
 

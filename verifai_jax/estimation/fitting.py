@@ -35,7 +35,12 @@ CELLS = 48
 
 def effective_size(weight: Float[np.ndarray, " n"]) -> float:
     """Return the number of equally weighted points that these weights are worth."""
-    return float(weight.sum() ** 2 / np.sum(weight * weight)) if len(weight) else 0.0
+    most = weight.max(initial=0.0)
+    if not most > 0:
+        return 0.0
+    # Of the largest, so that squares of small ones do not all vanish.
+    parts = weight / most
+    return float(parts.sum() ** 2 / np.sum(parts * parts))
 
 
 def fit_gaussian(

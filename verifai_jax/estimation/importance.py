@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.initial_proposal import CHAINS_WORTH, Anchors
 from verifai_jax.estimation.intervals import (
     WeightedMean,
@@ -164,14 +165,14 @@ def fit_proposal(
         w = 1 / ratio[scores.failing]
         if len(w) < 10:
             continue
-        effective, tail = _worth(w) / len(z), tail_index(w)
+        effective, tail = effective_size(w) / len(z), tail_index(w)
         # All stages together are samples of the mean of their proposals.
         new = np.concatenate([z[f] for z, f in zip(zs, failing, strict=True)])
         counts = np.array([len(z) for z in zs], float)
         density = np.stack([p.ratio(new) for p in proposals], axis=1) @ (counts / counts.sum())
         # Failures of the splitting and of the stages stand for the same distribution, each for as
         # much as they are worth; states of a chain are alike and worth less than they count.
-        worth = np.array([CHAINS_WORTH * len(np.unique(chain_ids)), _worth(1 / density)])
+        worth = np.array([CHAINS_WORTH * len(np.unique(chain_ids)), effective_size(1 / density)])
         worth[0] *= worth[0] / (worth[0] + worth[1])
         inverse = 1 / density
         weight = np.concatenate(
@@ -186,11 +187,6 @@ def fit_proposal(
             break
         before = effective * left
     return FittedProposal(proposal, effective, tail)
-
-
-def _worth(weight: Float[np.ndarray, " n"]) -> float:
-    """Return the number of equally weighted samples that these weights are worth."""
-    return float(weight.sum() ** 2 / np.sum(weight * weight))
 
 
 def sample_proposal(

@@ -147,6 +147,7 @@ def _together(
     weight: Float[np.ndarray, " n"],
 ) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " k"]]:
     """Return states of chains and weighted failures together, each for what they are worth."""
+    weight = weight / weight.max()
     fresh = effective_size(weight)
     worth *= worth / (worth + fresh)
     part = np.concatenate(
