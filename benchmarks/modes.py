@@ -36,7 +36,7 @@ class Planted(NamedTuple):
     margins: Callable[[np.ndarray], np.ndarray]  # from features [d] to the margin of each mode
 
 
-def posed(name: str, domain: vj.Domain, dim: int, robustness) -> vj.Problem:
+def posed(name: str, domain: vj.Box | vj.Normal, dim: int, robustness) -> vj.Problem:
     """A system of one sample, whose only signal is the robustness."""
 
     def system(features, key):
@@ -63,7 +63,9 @@ def half_spaces(dim: int, count: int) -> Planted:
     return Planted(problem, norm.sf(distances), distances, lambda x: distances - directions @ x)
 
 
-def islands(name: str, domain: vj.Domain, centres, radii, speeds, masses, distances) -> Planted:
+def islands(
+    name: str, domain: vj.Box | vj.Normal, centres, radii, speeds, masses, distances
+) -> Planted:
     """Balls of these centres and radii."""
     middles, reach = jnp.asarray(centres, jnp.float32), jnp.asarray(radii, jnp.float32)
     factors = jnp.asarray(speeds, jnp.float32)
@@ -152,9 +154,8 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[2, 4, 8])
     parser.add_argument("--shapes", nargs="+", choices=[*SHAPES], default=[*SHAPES])
     options = parser.parse_args()
-    print(
-        "| modes are | d | modes | all found | split in two | masses in intervals | distance / true | s |"
-    )
+    columns = "modes are", "d", "modes", "all found", "split", "masses", "distance", "s"
+    print(f"| {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|---|")
     for shape in options.shapes:
         for dim in options.dims:

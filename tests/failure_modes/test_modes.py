@@ -109,6 +109,32 @@ def test_planted_modes_have_their_probabilities(found):
     assert found.simulations <= 20_000
 
 
+CENTRES = np.array([[0.3, 0.3], [0.36, 0.3], [0.7, 0.6], [0.2, 0.8]])
+RADII = np.array([0.008, 0.004, 0.006, 0.005])
+
+
+@pytest.mark.thorough
+def test_islands_inside_a_box_are_modes_with_their_areas():
+    """Two lie side by side, and no corner and no tail leads to any."""
+
+    def system(features, key):
+        far = jnp.linalg.norm(features["p"] - CENTRES, axis=1)
+        return vj.Trace({"far": jnp.min(far - RADII)[None]}, dt=1.0)
+
+    space = {"p": vj.Array(vj.Box(0.0, 1.0), 2)}
+    found = vj.modes(
+        vj.Problem("islands", space, system, "far >= 0"), budget=30_000, progress=False
+    )
+    areas = np.pi * RADII**2
+    centre = np.array([[mode.features["p[0]"], mode.features["p[1]"]] for mode in found])
+    island = np.linalg.norm(centre[:, None] - CENTRES, axis=2).argmin(axis=1)
+    assert sorted(island) == [0, 1, 2, 3]
+    for mode, area in zip(found, areas[island], strict=True):
+        assert mode.probability == pytest.approx(area, rel=0.1)
+        assert mode.low / 1.05 < area < mode.high * 1.05
+    assert found.low <= areas.sum() <= found.high
+
+
 @pytest.mark.thorough
 def test_a_mode_is_replayed_explained_and_shrunk(found, tmp_path):
     assert found[0].replay().violated
