@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.normal_space import LimitState
 
-WIDEST = 3.0
+WIDEST = 2.5
 """Standard deviation of the starts that lie farthest out; that of the others is 0.5 at least."""
 DRAWN = 0.2
 """Share of the simulations that score starts, of which the most promising descend first."""
