@@ -28,7 +28,7 @@ HITS = 0.02
 """Starts that fail themselves and count as ends, at most, in parts of the simulations."""
 HALVINGS = 5
 """Halvings of the way in towards the origin."""
-AT_ONCE = 64
+FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
 """Descents that are side by side."""
 STEPS = 24
 """Steps of a descent without gradients, at most; half of them where gradients lead nowhere."""
@@ -70,7 +70,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations
-    z = draw_starts(limit_state, rng, max(AT_ONCE // 4, round(DRAWN * simulations)))
+    z = draw_starts(limit_state, rng, max(FEWEST_AT_ONCE, round(DRAWN * simulations)))
     score = scores_of(limit_state, z)
     hits = np.flatnonzero(score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(score > -np.inf)
@@ -78,12 +78,13 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     # Far out, where they lie, several regions overlap.
     points = [come_in(limit_state, z[hits])]
     feet = points.copy()
+    count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
-        now, others = others[:AT_ONCE], others[AT_ONCE:]
+        now, others = others[:count], others[count:]
         if len(now):
             descents = _Descents(z[now], score[now], z[now])
         else:
-            start = draw_starts(limit_state, rng, AT_ONCE)
+            start = draw_starts(limit_state, rng, count)
             descents = _Descents(start, scores_of(limit_state, start), start)
         if not len(descents.z):
             break
@@ -94,6 +95,11 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
             descents.feet = descents.z
         points.append(descents.z[fails])
         feet.append(descents.feet[fails])
+        # As many more as what is left allows, if they take as long as those so far.
+        begun += len(descents.z)
+        left = begin + simulations - limit_state.simulations
+        count = left * begun // max(limit_state.simulations - before, 1)
+        count = min(max(count, FEWEST_AT_ONCE), MOST_AT_ONCE)
     return Ends(np.concatenate(points), np.concatenate(feet))
 
 

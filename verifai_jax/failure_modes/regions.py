@@ -146,7 +146,8 @@ def _look(
         joined = left[connected(limit_state, z[rows[left]], regions.points[column[left]])]
         region[joined] = regions.region[column[joined]]
     joined = region >= 0
-    new = joined & (np.unique(rows, return_index=True)[1][:, None] == np.arange(len(rows))).any(0)
+    # One that was drawn twice is one point.
+    new = joined & np.isin(np.arange(len(rows)), np.unique(rows, return_index=True)[1])
     regions.points = np.concatenate([regions.points, z[rows[new]]])
     regions.region = np.append(regions.region, region[new])
     return rows, joined
