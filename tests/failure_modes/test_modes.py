@@ -164,6 +164,21 @@ def test_a_run_and_the_command(tmp_path):
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("budget", [50, 1000])
+def test_what_always_fails_does_so_with_probability_one_within_the_budget(budget):
+    system = lambda f, key: vj.Trace({"x": f["x"][None]}, dt=1.0)  # noqa: E731
+    problem = vj.Problem("hopeless", {"x": vj.Box(0.0, 1.0)}, system, "x >= 2")
+    found = vj.modes(problem, budget=budget, progress=False)
+    assert 0.9 < found.probability <= 1.0
+    assert found.low <= found.probability <= found.high == 1.0
+    assert sum(mode.probability for mode in found) <= found.probability
+    assert found.simulations <= budget
+    answer = vj.estimate(problem, budget=budget, progress=False)
+    assert answer.probability == 1.0
+    assert answer.simulations <= budget
+
+
+@pytest.mark.thorough
 def test_what_cannot_fail_has_no_mode():
     system = lambda f, key: vj.Trace({"x": f["x"][None]}, dt=1.0)  # noqa: E731
     problem = vj.Problem("safe", {"x": vj.Box(0.0, 1.0)}, system, "x >= -1")

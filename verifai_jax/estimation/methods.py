@@ -170,6 +170,8 @@ def estimate_by_importance_sampling(
     if first is None:
         return bound_from_pilot(limit_state, plan)
     counts = _counts(first)
+    if limit_state.left <= 0:
+        return _monte_carlo_answer(counts, plan)
     run = SplittingRun(stopped="ended")
     try:
         explorations = _explore(limit_state, rng)
@@ -266,7 +268,7 @@ def _importance_answer(
     low, high = samples.interval(plan.confidence)
     failing, drawn = samples.defensive_counts
     high = min(1.0, high / (1 - agreement.unseen))
-    answer = Answer(counts, mean.mean, low, high, "importance", mean.effective, mean.cv)
+    answer = Answer(counts, min(mean.mean, 1.0), low, high, "importance", mean.effective, mean.cv)
     answer.diagnostics = {
         "tail_index": mean.tail,
         "largest_share": mean.largest,

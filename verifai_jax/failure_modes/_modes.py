@@ -235,7 +235,7 @@ def _list_modes(
     numbers: _Numbers, rng: np.random.Generator, samples: ImportanceSamples, regions: Regions
 ) -> tuple[tuple[Mode, ...], float, Run | None]:
     """Return the modes in the order of their probability, what is left, and their simulations."""
-    problem, whole = numbers.problem, samples.mean.mean
+    problem, whole = numbers.problem, min(samples.mean.mean, 1.0)
     of_sample = np.full(len(samples.x), -1)
     of_sample[samples.failing] = regions.assign(samples.failures)
     parts = [_part_of(samples, of_sample == k) for k in range(regions.count)]
@@ -262,7 +262,7 @@ def _list_modes(
             Mode(
                 number=number,
                 name=name_mode(failures, prior),
-                probability=parts[k].mean.mean,
+                probability=whole * float(masses[k]),
                 low=low,
                 high=high,
                 share=float(masses[k]),

@@ -30,6 +30,8 @@ NEIGHBOURS = 5
 """Points of regions to which paths are tried, the nearest first."""
 LOOKED_AT = 150
 """Failures from which paths to their region are tried, at a time."""
+WHOLE_EFFORT = 5000
+"""Simulations left from which so many are looked at; with fewer, as many fewer are."""
 ROUNDS = 3
 """Times that failures without a path are looked at for further regions."""
 SHRINKING = 60
@@ -89,15 +91,16 @@ def find_regions(
     **Raises:** `Ended` where time is over.
     """
     d = limit_state.dim
+    most = _scaled(limit_state, CANDIDATES)
     regions = Regions(np.zeros((0, d)), np.zeros(0, int))
-    near = z[np.argsort(np.sum(z * z, axis=1))[: CANDIDATES // 4]]
-    drawn = z[rng.choice(len(z), CANDIDATES // 2, p=share)]
-    _extend(limit_state, rng, regions, np.concatenate([_spread(nearest), near, drawn]))
+    near = z[np.argsort(np.sum(z * z, axis=1))[: max(1, most // 4)]]
+    drawn = z[rng.choice(len(z), most // 2, p=share)]
+    _extend(limit_state, rng, regions, np.concatenate([_spread(nearest, most), near, drawn]))
     for _ in range(ROUNDS):
         rows, joined = _look(limit_state, rng, regions, z, share)
         if joined.all():
             break
-        _extend(limit_state, rng, regions, z[rows[~joined]][:CANDIDATES])
+        _extend(limit_state, rng, regions, z[rows[~joined]][: _scaled(limit_state, CANDIDATES)])
     return regions
 
 
@@ -113,13 +116,18 @@ def share_explained(
     return int(joined.sum()), len(joined)
 
 
-def _spread(points: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "_ d"]:
+def _scaled(limit_state: LimitState, most: int) -> int:
+    """Return how many to look at, at least two, by the simulations that are left."""
+    return max(2, round(most * min(1.0, limit_state.left / WHOLE_EFFORT)))
+
+
+def _spread(points: Float[np.ndarray, "m d"], most: int) -> Float[np.ndarray, "_ d"]:
     """Choose points that are far from one another, beginning with the least distant one."""
-    if len(points) <= CANDIDATES:
+    if len(points) <= most:
         return points
     chosen = [int(np.sum(points**2, axis=1).argmin())]
     gaps = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < CANDIDATES:
+    while len(chosen) < most:
         chosen.append(int(gaps.argmax()))
         gaps = np.minimum(gaps, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return points[chosen]
@@ -136,7 +144,7 @@ def _look(
 
     These are points of their regions from then on, so that others are assigned by more of them.
     """
-    rows = rng.choice(len(z), LOOKED_AT, p=share)
+    rows = rng.choice(len(z), _scaled(limit_state, LOOKED_AT), p=share)
     order = _by_distance(z[rows], regions.points)[:, :NEIGHBOURS]
     region = np.full(len(rows), -1)
     for column in order.T:
