@@ -7,7 +7,7 @@ import pytest
 from benchmarks.faults import folders, formulas, kills, messages
 from benchmarks.faults.cases import tally
 
-SECONDS = 45.0
+SECONDS = 30.0
 
 
 @pytest.mark.slow

@@ -5,12 +5,11 @@ import pytest
 from closed_forms import closed_form, normal
 from scipy.stats import norm
 
+from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import approach_origin, explore
 from verifai_jax.estimation.initial_proposal import (
-    anchors_of,
     compare_explorations,
-    join_explorations,
 )
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture

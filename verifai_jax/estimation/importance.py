@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.estimation.anchors import CHAINS_WORTH, Anchors
 from verifai_jax.estimation.fitting import effective_size
-from verifai_jax.estimation.initial_proposal import CHAINS_WORTH, Anchors
 from verifai_jax.estimation.intervals import (
     WeightedMean,
     skewed_interval,

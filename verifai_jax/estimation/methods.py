@@ -18,13 +18,12 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
+from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.exploration import Exploration, explore
 from verifai_jax.estimation.importance import DEFENSIVE
 from verifai_jax.estimation.initial_proposal import (
     Agreement,
-    anchors_of,
     compare_explorations,
-    join_explorations,
     mix,
     proposal_from,
 )
