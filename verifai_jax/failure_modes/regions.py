@@ -30,7 +30,7 @@ NEIGHBOURS = 5
 """Points of regions to which paths are tried, the nearest first."""
 LOOKED_AT = 150
 """Failures from which paths to their region are tried, at a time."""
-WHOLE_EFFORT = 5000
+WHOLE_EFFORT = 4500
 """Simulations left from which so many are looked at; with fewer, as many fewer are."""
 ROUNDS = 3
 """Times that failures without a path are looked at for further regions."""
