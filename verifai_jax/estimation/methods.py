@@ -20,7 +20,7 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.exploration import Exploration, explore
-from verifai_jax.estimation.importance import DEFENSIVE
+from verifai_jax.estimation.importance import DEFENSIVE, STEADY
 from verifai_jax.estimation.initial_proposal import (
     Agreement,
     compare_explorations,
@@ -44,8 +44,6 @@ LEAST_EFFECTIVE = 60
 """Effective failures that importance sampling has to promise."""
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
-STEADY_TAIL = 0.5
-"""Tail index below which the weights have a finite variance."""
 SHARE_OF_LEVEL = 0.06
 """Share of the budget for each level of the splitting that makes the proposal."""
 SHARE_OF_REPLICATE = 0.02
@@ -328,7 +326,7 @@ def _check_by_splitting(
     apart = np.log(answer.probability * max(reached, 1e-6) / run.estimate)
     if abs(apart) <= 3.5 * np.hypot(UNDERSTATED * run.cv, answer.relative_error):
         return
-    if apart > 0 and answer.diagnostics["tail_index"] < STEADY_TAIL:
+    if apart > 0 and answer.diagnostics["tail_index"] < STEADY:
         # Weighted samples are as likely to be too high as too low; chains that few of them lead to
         # a region, or none, are too low. So steady weights need no wider interval below.
         return
