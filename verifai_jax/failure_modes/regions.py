@@ -32,6 +32,8 @@ LOOKED_AT = 150
 """Failures from which paths to their region are tried, at a time."""
 WHOLE_EFFORT = 4500
 """Simulations left from which so many are looked at; with fewer, as many fewer are."""
+A_LOOK = 8
+"""Simulations that a look at a failure takes, about."""
 ROUNDS = 3
 """Times that failures without a path are looked at for further regions."""
 SHRINKING = 60
@@ -97,7 +99,8 @@ def find_regions(
     drawn = z[rng.choice(len(z), most // 2, p=share)]
     _extend(limit_state, rng, regions, np.concatenate([_spread(nearest, most), near, drawn]))
     for _ in range(ROUNDS):
-        rows, joined = _look(limit_state, rng, regions, z, share)
+        count = _scaled(limit_state, LOOKED_AT)
+        rows, joined = _look(limit_state, rng, regions, z, share, count)
         if joined.all():
             break
         _extend(limit_state, rng, regions, z[rows[~joined]][: _scaled(limit_state, CANDIDATES)])
@@ -112,13 +115,15 @@ def share_explained(
     share: Float[np.ndarray, " n"],
 ) -> tuple[int, int]:
     """Draw failures, and count those that a path of failures joins to a region; return both."""
-    _, joined = _look(limit_state, rng, regions, z, share)
+    count = min(LOOKED_AT, max(2, limit_state.left // A_LOOK))
+    _, joined = _look(limit_state, rng, regions, z, share, count)
     return int(joined.sum()), len(joined)
 
 
 def _scaled(limit_state: LimitState, most: int) -> int:
-    """Return how many to look at, at least two, by the simulations that are left."""
-    return max(2, round(most * min(1.0, limit_state.left / WHOLE_EFFORT)))
+    """Return how many to look at, at least two; those that share_explained looks at are kept."""
+    left = limit_state.left - A_LOOK * LOOKED_AT
+    return max(2, round(most * min(1.0, left / WHOLE_EFFORT)))
 
 
 def _spread(points: Float[np.ndarray, "m d"], most: int) -> Float[np.ndarray, "_ d"]:
@@ -139,12 +144,13 @@ def _look(
     regions: Regions,
     z: Float[np.ndarray, "n d"],
     share: Float[np.ndarray, " n"],
+    count: int,
 ) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
     """Draw failures by their share; return their rows, and which a path joins to a region.
 
     These are points of their regions from then on, so that others are assigned by more of them.
     """
-    rows = rng.choice(len(z), _scaled(limit_state, LOOKED_AT), p=share)
+    rows = rng.choice(len(z), count, p=share)
     order = _by_distance(z[rows], regions.points)[:, :NEIGHBOURS]
     region = np.full(len(rows), -1)
     for column in order.T:
