@@ -122,7 +122,7 @@ def share_explained(
 
 def _scaled(limit_state: LimitState, most: int) -> int:
     """Return how many to look at, at least two; those that share_explained looks at are kept."""
-    left = limit_state.left - A_LOOK * LOOKED_AT
+    left = limit_state.left - min(A_LOOK * LOOKED_AT, limit_state.left // 4)
     return max(2, round(most * min(1.0, left / WHOLE_EFFORT)))
 
 
