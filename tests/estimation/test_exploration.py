@@ -8,9 +8,7 @@ from scipy.stats import norm
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import approach_origin, explore
-from verifai_jax.estimation.initial_proposal import (
-    compare_explorations,
-)
+from verifai_jax.estimation.initial_proposal import compare_explorations
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.normal_space import LimitState
@@ -191,7 +189,7 @@ def test_anchors_follow_the_failures_of_their_region():
     assert any(np.linalg.norm(c.mean - [6.0, 1.0]) < 0.5 for c in fits)
     assert not any(np.all(np.abs(c.mean - [6.0, 1.0]) < 0.5) for c in anchors.fit().components[1:])
     # The other region, where none of them lies, keeps its components.
-    assert np.sum(two_sides(fitted.sample(rng, 2000)[0][:, :]) < 0) > 100
+    assert np.sum(two_sides(fitted.sample(rng, 2000)[0]) < 0) > 100
 
 
 @pytest.mark.slow

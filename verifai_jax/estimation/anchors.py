@@ -15,6 +15,7 @@ from verifai_jax.estimation.components import Component, Gaussian, Prior
 from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.fitting import effective_size, fit_gaussian
 from verifai_jax.estimation.mixture import Mixture
+from verifai_jax.estimation.normal_space import squared_distances
 
 ONE = 0.25
 """Distance below which two least distant failures of different searches count as one."""
@@ -110,13 +111,6 @@ def _together(
         [np.full(len(states), worth / len(states)), fresh * weight / weight.sum()]
     )
     return np.concatenate([states, z]), part / part.sum()
-
-
-def squared_distances(
-    z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
-) -> Float[np.ndarray, "n m"]:
-    """Return the squared distance of each point `z` from each of the others."""
-    return np.sum(points**2, axis=1)[None] - 2 * z @ points.T + np.sum(z * z, axis=1)[:, None]
 
 
 def join_explorations(explorations: Sequence[Exploration]) -> Exploration:

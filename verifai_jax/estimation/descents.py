@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.estimation.normal_space import LimitState, squared_distances
 
 WIDEST = 2.5
 """Standard deviation of the starts that lie farthest out; that of the others is 0.5 at least."""
@@ -140,8 +140,7 @@ def _worse_neighbours(
     z: Float[np.ndarray, "n d"], score: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
     """Return for each point how many others are nearer than the nearest better one."""
-    square = np.sum(z * z, axis=1)
-    gaps = square[:, None] + square[None] - 2 * z @ z.T
+    gaps = squared_distances(z, z)
     nearest = np.where(score[None] < score[:, None], gaps, np.inf).min(axis=1)
     return np.sum(gaps < nearest[:, None], axis=1)
 

@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.estimation.anchors import anchors_of, squared_distances, weigh_chains
+from verifai_jax.estimation.anchors import anchors_of, weigh_chains
 from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.mixture import Mixture, fit_mixture
-from verifai_jax.estimation.normal_space import Ended, LimitState
+from verifai_jax.estimation.normal_space import Ended, LimitState, squared_distances
 from verifai_jax.estimation.paths import COST_OF_PATHS, connected
 
 REACHED = 0.01

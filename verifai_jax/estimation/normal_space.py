@@ -229,3 +229,10 @@ def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     from scipy.special import ndtr
 
     return ndtr(z)
+
+
+def squared_distances(
+    z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the squared distance of each point `z` from each of the others."""
+    return np.sum(points**2, axis=1)[None] - 2 * z @ points.T + np.sum(z * z, axis=1)[:, None]
