@@ -1,6 +1,6 @@
 """Sequences of timed events that an automaton allows (`Automaton`)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,18 +13,11 @@ from jaxtyping import Bool, Float, Int, PyTree
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.events import ABSENT, Events
-from verifai_jax.features.domain import (
-    Domain,
-    Row,
-    as_numbers,
-    as_real,
-    cell,
-    centre,
-    dotted,
-    indexed,
-)
+from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
 from verifai_jax.features.event_descriptions import describe_event, read_event
+from verifai_jax.features.event_tables import EventTables
 from verifai_jax.features.transitions import Graph, Transition, unfold
+from verifai_jax.features.written_events import WrittenEvents, where_there
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -99,7 +92,7 @@ class Automaton(Domain):
 
     def _check_parameters(self) -> None:
         """Refuse parameters of one name whose values have different forms."""
-        for name, domains in self._domains.items():
+        for name, domains in self._tables.domains.items():
             forms = {}
             for each in domains:
                 form = jax.eval_shape(each.from_unit, jax.ShapeDtypeStruct((each.size,), "float32"))
@@ -138,10 +131,10 @@ class Automaton(Domain):
             found += [each.source, each.to]
         return tuple(dict.fromkeys(found))
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the kinds of events, in the order written."""
-        return tuple(dict.fromkeys(each.name for each in self.transitions))
+        return self._tables.names
 
     @cached_property
     def graph(self) -> Graph:
@@ -149,20 +142,12 @@ class Automaton(Domain):
         return unfold(self.start, self.transitions, self.most)
 
     @cached_property
-    def _domains(self) -> dict[str, tuple[Domain, ...]]:
-        """The different domains of each parameter, in the order written."""
-        found: dict[str, dict[Domain, None]] = {}
-        for each in self.transitions:
-            for name, domain in each.parameters:
-                found.setdefault(name, {})[domain] = None
-        return {name: tuple(domains) for name, domains in found.items()}
+    def _tables(self) -> EventTables:
+        return EventTables(self.transitions, self.graph)
 
     @cached_property
-    def _widths(self) -> tuple[int, ...]:
-        """Coordinates of an event: one for its kind, those of its wait and of each parameter."""
-        waits = max(each.wait.size for each in self.transitions)
-        others = [max(domain.size for domain in group) for group in self._domains.values()]
-        return (1, waits, *others)
+    def _written(self) -> WrittenEvents:
+        return WrittenEvents(self._tables, self.least, self.most)
 
     @property
     def _varies(self) -> bool:
@@ -172,7 +157,7 @@ class Automaton(Domain):
     def levels(self) -> tuple[int, ...]:
         length = (self.most - self.least + 1,) if self._varies else ()
         # Which cells a coordinate of an event has depends on the events before it.
-        return length + (0,) * (sum(self._widths) * self.most)
+        return length + (0,) * (sum(self._tables.widths) * self.most)
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -180,17 +165,17 @@ class Automaton(Domain):
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        return ((0, 1, sum(self._widths), self.most),) if self._varies else ()
+        return ((0, 1, sum(self._tables.widths), self.most),) if self._varies else ()
 
     @property
     def nominal(self) -> PyTree:
         return () if self.least == 0 else None
 
     def coordinates(self, name: str) -> tuple[str, ...]:
-        parts = ("kind", "wait", *self._domains)
+        parts = ("kind", "wait", *self._tables.domains)
         found = (f"{name}.length",) * self._varies
         for item in indexed(name, self.most):
-            for part, width in zip(parts, self._widths, strict=True):
+            for part, width in zip(parts, self._tables.widths, strict=True):
                 label = dotted(item, part)
                 found += indexed(label, width) if width > 1 else (label,) * width
         return found
@@ -198,33 +183,33 @@ class Automaton(Domain):
     def from_unit(self, u: Float[jax.Array, " size"]) -> Events:
         taken, _, slots = self._walk(u)
         units = self._split(slots)
-        kinds = jnp.where(taken >= 0, jnp.asarray(self._kind_of)[taken], ABSENT)
+        kinds = jnp.where(taken >= 0, jnp.asarray(self._tables.kind_of)[taken], ABSENT)
         waits = jnp.zeros(self.most, u.dtype)
-        for domain, users in self._waits.items():
+        for domain, users in self._tables.waits.items():
             values = jax.vmap(domain.from_unit, axis_size=self.most)(units[1][:, : domain.size])
             waits = jnp.where(_among(taken, users), values.astype(u.dtype), waits)
         parameters = {}
-        for (name, groups), unit in zip(self._users.items(), units[2:], strict=True):
+        for (name, groups), unit in zip(self._tables.users.items(), units[2:], strict=True):
             chosen = None
             for domain, users in groups.items():
                 mine = _among(taken, users)[:, None]
                 own = jnp.where(mine, unit[:, : domain.size], 0.5)
                 values = jax.vmap(domain.from_unit, axis_size=self.most)(own)
                 # The first domain's middle stands where there is no such parameter.
-                chosen = values if chosen is None else _where(mine[:, 0], values, chosen)
+                chosen = values if chosen is None else where_there(mine[:, 0], values, chosen)
             parameters[name] = chosen
         return Events(kinds, waits, parameters, self.names)
 
     def to_unit(self, value: Events) -> Float[jax.Array, " size"]:
         kinds, waits = jnp.asarray(value.kinds), as_real(value.waits)
         taken, nodes = self._follow(kinds)
-        edges = jnp.asarray(self._interval_middles)
+        edges = jnp.asarray(self._tables.interval_middles)
         place = jnp.where(taken >= 0, edges[nodes, taken], 0.5).astype(waits.dtype)
         columns = [place[:, None]]
         for groups, values, width in zip(
-            (self._waits, *self._users.values()),
-            (waits, *(value.parameters[name] for name in self._users)),
-            self._widths[1:],
+            (self._tables.waits, *self._tables.users.values()),
+            (waits, *(value.parameters[name] for name in self._tables.users)),
+            self._tables.widths[1:],
             strict=True,
         ):
             units = jnp.full((self.most, width), 0.5, waits.dtype)
@@ -246,8 +231,8 @@ class Automaton(Domain):
 
     def settled(self, u: Float[jax.Array, " size"]) -> Float[jax.Array, " size"]:
         taken, nodes, slots = self._walk(u)
-        place = jnp.asarray(self._interval_middles)[nodes, taken].astype(u.dtype)
-        used = jnp.asarray(self._uses)[taken] & (taken >= 0)[:, None]
+        place = jnp.asarray(self._tables.interval_middles)[nodes, taken].astype(u.dtype)
+        used = jnp.asarray(self._tables.uses)[taken] & (taken >= 0)[:, None]
         slots = jnp.where(used, slots, 0.5)
         slots = slots.at[:, 0].set(jnp.where(taken >= 0, place, 0.5))
         length = self._wanted(taken, nodes)
@@ -261,9 +246,10 @@ class Automaton(Domain):
         self, u: Float[jax.Array, " size"], drop: Bool[jax.Array, " items"]
     ) -> Float[jax.Array, " size"]:
         taken, _, slots = self._walk(u)
-        kinds = jnp.where(taken >= 0, jnp.asarray(self._kind_of)[taken], ABSENT)
-        lookup = jnp.asarray(self._by_kind)
-        following, middles = jnp.asarray(self.graph.following), jnp.asarray(self._interval_middles)
+        kinds = jnp.where(taken >= 0, jnp.asarray(self._tables.kind_of)[taken], ABSENT)
+        lookup = jnp.asarray(self._tables.by_kind)
+        following = jnp.asarray(self.graph.following)
+        middles = jnp.asarray(self._tables.interval_middles)
 
         def step(node: Any, event: Any) -> Any:
             kind, dropped = event
@@ -292,7 +278,7 @@ class Automaton(Domain):
         length = jnp.int32(self.most)
         if self._varies:
             length = self.least + cell(u[0], self.levels[0])
-        slots = u[int(self._varies) :].reshape(self.most, sum(self._widths))
+        slots = u[int(self._varies) :].reshape(self.most, sum(self._tables.widths))
         edges, last = jnp.asarray(self.graph.edges), jnp.asarray(self.graph.last)
         following = jnp.asarray(self.graph.following)
 
@@ -309,7 +295,8 @@ class Automaton(Domain):
 
     def _follow(self, kinds: Int[jax.Array, " places"]) -> tuple[jax.Array, jax.Array]:
         """Return the transition at each place and the node before it, from the kinds of events."""
-        lookup, following = jnp.asarray(self._by_kind), jnp.asarray(self.graph.following)
+        lookup = jnp.asarray(self._tables.by_kind)
+        following = jnp.asarray(self.graph.following)
 
         def step(node: Any, kind: Any) -> Any:
             number = jnp.where(kind >= 0, lookup[node, kind], ABSENT)
@@ -326,56 +313,7 @@ class Automaton(Domain):
         return jnp.where(forced, self.most, count)
 
     def _split(self, slots: jax.Array) -> list[jax.Array]:
-        return jnp.split(slots, np.cumsum(self._widths)[:-1].tolist(), axis=1)
-
-    @cached_property
-    def _kind_of(self) -> Int[np.ndarray, " transitions"]:
-        return np.array([self.names.index(each.name) for each in self.transitions], np.int32)
-
-    @cached_property
-    def _by_kind(self) -> Int[np.ndarray, "nodes kinds"]:
-        """The transition that each kind of event is at each node; -1 where it is not enabled."""
-        table = np.full((len(self.graph.states), len(self.names)), ABSENT, np.int32)
-        for node, number in np.argwhere(self.graph.enabled):
-            table[node, self._kind_of[number]] = number
-        return table
-
-    @cached_property
-    def _interval_middles(self) -> Float[np.ndarray, "nodes transitions"]:
-        edges = self.graph.edges
-        before = np.concatenate([np.zeros_like(edges[:, :1]), edges[:, :-1]], axis=1)
-        return ((before + edges) / 2).astype(np.float32)
-
-    @cached_property
-    def _waits(self) -> dict[Domain, tuple[int, ...]]:
-        """The different domains of waiting times, each with the transitions that have it."""
-        found: dict[Domain, tuple[int, ...]] = {}
-        for number, each in enumerate(self.transitions):
-            found[each.wait] = (*found.get(each.wait, ()), number)
-        return found
-
-    @cached_property
-    def _users(self) -> dict[str, dict[Domain, tuple[int, ...]]]:
-        """For each parameter its domains, each with the transitions that have it."""
-        found: dict[str, dict[Domain, tuple[int, ...]]] = {name: {} for name in self._domains}
-        for number, each in enumerate(self.transitions):
-            for name, domain in each.parameters:
-                found[name][domain] = (*found[name].get(domain, ()), number)
-        return found
-
-    @cached_property
-    def _uses(self) -> Bool[np.ndarray, "transitions width"]:
-        """The coordinates of an event that matter, for each transition."""
-        table = np.zeros((len(self.transitions), sum(self._widths)), bool)
-        starts = np.concatenate([[0], np.cumsum(self._widths)])
-        for number, each in enumerate(self.transitions):
-            table[number, 0] = True
-            table[number, 1 : 1 + each.wait.size] = True
-            own = dict(each.parameters)
-            for name, begin in zip(self._domains, starts[2:], strict=False):
-                if name in own:
-                    table[number, begin : begin + own[name].size] = True
-        return table
+        return jnp.split(slots, np.cumsum(self._tables.widths)[:-1].tolist(), axis=1)
 
     @property
     def mark_count(self) -> int:
@@ -383,192 +321,24 @@ class Automaton(Domain):
 
     def marks(self, value: Events) -> Int[jax.Array, " marks"]:
         taken, _ = self._follow(jnp.asarray(value.kinds))
-        pairs = jnp.asarray(self._pair_marks)[taken[:-1], taken[1:]]
+        pairs = jnp.asarray(self._tables.pair_marks)[taken[:-1], taken[1:]]
         both = (taken[:-1] >= 0) & (taken[1:] >= 0)
         return jnp.concatenate([taken, jnp.where(both, pairs, ABSENT)])
 
-    @cached_property
-    def _pair_marks(self) -> Int[np.ndarray, "transitions transitions"]:
-        count = len(self.transitions)
-        table = np.full((count, count), ABSENT, np.int32)
-        for i, (one, other) in enumerate(self.graph.pairs):
-            table[one, other] = count + i
-        return table
+    def check(self, value: object, name: str) -> None:
+        self._written.check(value, name)
 
     def coerce(self, value: PyTree) -> Events:
-        if isinstance(value, Events):
-            kinds = jnp.asarray(value.kinds, jnp.int32)
-            there, absent = kinds >= 0, self._absent(as_real(value.waits).dtype)
-            return Events(
-                kinds,
-                jnp.where(there, as_real(value.waits), 0.0),
-                {
-                    name: _where(there, jnp.asarray(value.parameters[name]), middle)
-                    for name, middle in absent.items()
-                },
-                self.names,
-            )
-        entries = list(value)
-        now, node, written = 0.0, 0, []
-        for event in entries:
-            number = int(self._by_kind[node, self.names.index(event["kind"])])
-            each = self.transitions[number]
-            wait = event["wait"] if "wait" in event else event["time"] - now
-            now, node = now + wait, int(self.graph.following[node, number])
-            own = dict(each.parameters)
-            coerced = {name: domain.coerce(event[name]) for name, domain in own.items()}
-            written.append((number, each.wait.coerce(wait), coerced))
-        return self._built(written)
-
-    def _built(self, events: list[tuple[int, Any, dict[str, Any]]]) -> Events:
-        """Return the value with these transitions, waits and parameters."""
-        dtype = jnp.result_type(float)
-        missing = self.most - len(events)
-        kinds = [self._kind_of[number] for number, _, _ in events] + [ABSENT] * missing
-        waits = [as_real(wait) for _, wait, _ in events] + [jnp.zeros(())] * missing
-        parameters = {}
-        for name, middle in self._absent(dtype).items():
-            values = [own.get(name, middle) for _, _, own in events] + [middle] * missing
-            parameters[name] = jnp.stack([jnp.asarray(value, middle.dtype) for value in values])
-        return Events(
-            jnp.asarray(np.array(kinds, np.int32)),
-            jnp.stack([wait.astype(dtype) for wait in waits]),
-            parameters,
-            self.names,
-        )
-
-    def _absent(self, dtype: Any) -> dict[str, jax.Array]:
-        """Return what each parameter is where there is none."""
-        return {
-            name: domains[0].from_unit(jnp.full(domains[0].size, 0.5, dtype))
-            for name, domains in self._domains.items()
-        }
-
-    def check(self, value: object, name: str) -> None:
-        if isinstance(value, Events):
-            value = self._written(value)
-        if isinstance(value, str | Mapping) or not isinstance(value, Sequence):
-            raise ValueError(
-                f'{name} must be a list of events such as {{"kind": {self.names[0]!r}, "wait": 1.0'
-                f"}}; got {value!r}"
-            )
-        if not len(value) <= self.most:
-            raise ValueError(f"{name} must have at most {self.most} events; got {len(value)}")
-        node, now = 0, 0.0
-        for i, event in enumerate(value):
-            node, now = self._check_event(event, f"{name}[{i}]", node, now)
-        if len(value) < self.least and self.graph.last[node] >= 0:
-            raise ValueError(f"{name} must have at least {self.least} events; got {len(value)}")
-
-    def _check_event(self, event: object, name: str, node: int, now: float) -> tuple[int, float]:
-        if not isinstance(event, Mapping) or "kind" not in event:
-            raise ValueError(
-                f'{name} must be a dictionary with the event\'s "kind", its "wait" in seconds (or '
-                f'its "time") and its parameters; got {event!r}'
-            )
-        kind = event["kind"]
-        if kind not in self.names:
-            raise unknown_name(f"kind of {name}", kind, self.names)
-        number = int(self._by_kind[node, self.names.index(kind)])
-        if number < 0:
-            enabled = [
-                self.transitions[n].name for n in np.flatnonzero(self.graph.enabled[node]).tolist()
-            ]
-            raise ValueError(
-                f"{name} cannot be {kind!r} here: in state {self.graph.states[node]!r}, after the "
-                f"events before it, {_listed(enabled)}"
-            )
-        each = self.transitions[number]
-        own = dict(each.parameters)
-        if "wait" not in event and "time" not in event:
-            raise ValueError(f"{name}.wait is missing; got {', '.join(map(str, event))}")
-        wait = event["wait"] if "wait" in event else event["time"] - now
-        each.wait.check(wait, dotted(name, "wait"))
-        for key in event:
-            if key not in (*own, "kind", "wait", "time"):
-                raise unknown_name(f"parameter of {name}, an event {kind!r},", key, own)
-        for key, domain in own.items():
-            if key not in event:
-                raise ValueError(
-                    f"{dotted(name, key)} is missing; got {', '.join(map(str, event))}"
-                )
-            domain.check(event[key], dotted(name, key))
-        return int(self.graph.following[node, number]), now + float(np.asarray(wait))
-
-    def _written(self, value: Events) -> list[dict[str, Any]]:
-        """Return the events as a person writes them, each with its own parameters."""
-        kinds, node, found = np.asarray(value.kinds), 0, []
-        if np.any(kinds[int(value.length) :] >= 0):
-            raise ValueError(f"events must stand one after another; got kinds {kinds.tolist()}")
-        for i, kind in enumerate(kinds[: int(value.length)].tolist()):
-            event: dict[str, Any] = {"kind": self.names[kind], "wait": np.asarray(value.waits)[i]}
-            number = int(self._by_kind[node, kind])
-            for name, _ in self.transitions[number].parameters if number >= 0 else ():
-                event[name] = np.asarray(value.parameters[name])[i]
-            found.append(event)
-            node = int(self.graph.following[node, number]) if number >= 0 else node
-        return found
+        return self._written.coerce(value)
 
     def columns(self, name: str) -> tuple[str, ...]:
-        found = (f"{name}.length",)
-        for item in indexed(name, self.most):
-            found += (dotted(item, "kind"), dotted(item, "wait"))
-            for parameter, domains in self._domains.items():
-                found += domains[0].columns(dotted(item, parameter))
-        return found
+        return self._written.columns(name)
 
     def to_columns(self, values: Events, name: str) -> dict[str, np.ndarray]:
-        kinds, waits = np.asarray(values.kinds), np.asarray(values.waits)
-        taken = self._followed(kinds)
-        columns: dict[str, np.ndarray] = {
-            f"{name}.length": (kinds >= 0).sum(axis=1).astype(np.int32)
-        }
-        # Texts throughout, so that a column has one type in every batch, on the disk too.
-        shown = np.array([*self.names, ""], object)
-        for i, item in enumerate(indexed(name, self.most)):
-            columns[dotted(item, "kind")] = shown[kinds[:, i]]
-            columns[dotted(item, "wait")] = np.where(kinds[:, i] >= 0, waits[:, i], np.nan)
-            for parameter, groups in self._users.items():
-                column = dotted(item, parameter)
-                place = np.asarray(values.parameters[parameter])[:, i]
-                columns |= _own_entries(groups, place, taken[:, i], column)
-        return columns
+        return self._written.to_columns(values, name)
 
     def from_columns(self, row: Row, name: str) -> Events:
-        length = as_numbers(row[f"{name}.length"], f"{name}.length").item()
-        if length not in range(self.most + 1):
-            raise ValueError(
-                f"{name}.length must be an integer from 0 to {self.most}; got {length!r}"
-            )
-        node, written = 0, []
-        for item in indexed(name, self.most)[: int(length)]:
-            kind = row[dotted(item, "kind")]
-            if kind not in self.names:
-                raise unknown_name(dotted(item, "kind"), kind, self.names)
-            number = int(self._by_kind[node, self.names.index(kind)])
-            if number < 0:
-                raise ValueError(
-                    f"{dotted(item, 'kind')} cannot be {kind!r} after the events before it"
-                )
-            each = self.transitions[number]
-            # One column each, whatever the domain of the waiting time calls its own.
-            wait = each.wait.from_columns({"wait": row[dotted(item, "wait")]}, "wait")
-            own = {
-                parameter: domain.from_columns(row, dotted(item, parameter))
-                for parameter, domain in each.parameters
-            }
-            written.append((number, wait, own))
-            node = int(self.graph.following[node, number])
-        return self._built(written)
-
-    def _followed(self, kinds: Int[np.ndarray, "n places"]) -> Int[np.ndarray, "n places"]:
-        """Return the transition at each place, from the kinds of many sequences."""
-        taken, node = np.full(kinds.shape, ABSENT), np.zeros(len(kinds), int)
-        for i in range(kinds.shape[1]):
-            there = kinds[:, i] >= 0
-            taken[:, i] = np.where(there, self._by_kind[node, kinds[:, i]], ABSENT)
-            node = np.where(there, self.graph.following[node, taken[:, i]], node)
-        return taken
+        return self._written.from_columns(row, name)
 
     def __repr__(self) -> str:
         events = ", ".join(describe_event(each) for each in self.transitions)
@@ -581,33 +351,3 @@ def _among(taken: jax.Array, numbers: tuple[int, ...]) -> jax.Array:
     for number in numbers[1:]:
         found |= taken == number
     return found
-
-
-def _where(mask: Any, one: Any, other: Any) -> Any:
-    axes = max(jnp.ndim(one), jnp.ndim(other)) - jnp.ndim(mask)
-    return jnp.where(jnp.reshape(mask, jnp.shape(mask) + (1,) * axes), one, other)
-
-
-def _own_entries(
-    groups: Mapping[Domain, tuple[int, ...]],
-    values: np.ndarray,
-    taken: Int[np.ndarray, " n"],
-    column: str,
-) -> dict[str, np.ndarray]:
-    """Return columns of a parameter, empty in rows whose event does not have it."""
-    parts = [(domain.to_columns(values, column), users) for domain, users in groups.items()]
-    found = {}
-    for place, name in enumerate(parts[0][0]):
-        entries = [(list(part.values())[place], users) for part, users in parts]
-        numeric = all(part.dtype.kind in "iufb" for part, _ in entries)
-        real = entries[0][0].dtype if entries[0][0].dtype.kind == "f" else np.float64
-        whole = np.full(len(taken), np.nan if numeric else "", real if numeric else object)
-        for part, users in entries:
-            mine = np.isin(taken, users)
-            whole[mine] = part[mine]
-        found[name] = whole
-    return found
-
-
-def _listed(enabled: Sequence[str]) -> str:
-    return f"it can be {', '.join(enabled)}" if enabled else "no event is possible"

@@ -1,0 +1,245 @@
+"""Sequences of events as a person writes them, and as the columns of a table.
+
+written = WrittenEvents(tables, least=0, most=6)
+written.check([{"kind": "brake", "wait": 1.0, "rate": 4.0}], "events")
+value = written.coerce([{"kind": "brake", "wait": 1.0, "rate": 4.0}])
+written.to_columns(values, "events")            # events.length, events[0].kind, ...
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int, PyTree
+
+from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.events import ABSENT, Events
+from verifai_jax.features.domain import Domain, Row, as_numbers, as_real, dotted, indexed
+from verifai_jax.features.event_tables import EventTables
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenEvents:
+    """The written forms of an automaton's sequences.
+
+    - `tables`: the automaton's tables.
+    - `least`, `most`: number of events of a sequence.
+    """
+
+    tables: EventTables
+    least: int
+    most: int
+
+    def coerce(self, value: PyTree) -> Events:
+        """Return a checked list of events, or an `Events`, as a value of the domain."""
+        tables = self.tables
+        if isinstance(value, Events):
+            kinds = jnp.asarray(value.kinds, jnp.int32)
+            there, absent = kinds >= 0, self._absent(as_real(value.waits).dtype)
+            return Events(
+                kinds,
+                jnp.where(there, as_real(value.waits), 0.0),
+                {
+                    name: where_there(there, jnp.asarray(value.parameters[name]), middle)
+                    for name, middle in absent.items()
+                },
+                tables.names,
+            )
+        entries = list(value)
+        now, node, written = 0.0, 0, []
+        for event in entries:
+            number = int(tables.by_kind[node, tables.names.index(event["kind"])])
+            each = tables.transitions[number]
+            wait = event["wait"] if "wait" in event else event["time"] - now
+            now, node = now + wait, int(tables.graph.following[node, number])
+            own = dict(each.parameters)
+            coerced = {name: domain.coerce(event[name]) for name, domain in own.items()}
+            written.append((number, each.wait.coerce(wait), coerced))
+        return self._built(written)
+
+    def _built(self, events: list[tuple[int, Any, dict[str, Any]]]) -> Events:
+        """Return the value with these transitions, waits and parameters."""
+        tables = self.tables
+        dtype = jnp.result_type(float)
+        missing = self.most - len(events)
+        kinds = [tables.kind_of[number] for number, _, _ in events] + [ABSENT] * missing
+        waits = [as_real(wait) for _, wait, _ in events] + [jnp.zeros(())] * missing
+        parameters = {}
+        for name, middle in self._absent(dtype).items():
+            values = [own.get(name, middle) for _, _, own in events] + [middle] * missing
+            parameters[name] = jnp.stack([jnp.asarray(value, middle.dtype) for value in values])
+        return Events(
+            jnp.asarray(np.array(kinds, np.int32)),
+            jnp.stack([wait.astype(dtype) for wait in waits]),
+            parameters,
+            tables.names,
+        )
+
+    def _absent(self, dtype: Any) -> dict[str, jax.Array]:
+        """Return what each parameter is where there is none."""
+        return {
+            name: domains[0].from_unit(jnp.full(domains[0].size, 0.5, dtype))
+            for name, domains in self.tables.domains.items()
+        }
+
+    def check(self, value: object, name: str) -> None:
+        """Refuse what is no sequence of the automaton.
+
+        **Raises:** `ValueError`, which names the event and what it can be.
+        """
+        tables = self.tables
+        if isinstance(value, Events):
+            value = self._written(value)
+        if isinstance(value, str | Mapping) or not isinstance(value, Sequence):
+            raise ValueError(
+                f'{name} must be a list of events such as {{"kind": {tables.names[0]!r}, '
+                f'"wait": 1.0}}; got {value!r}'
+            )
+        if not len(value) <= self.most:
+            raise ValueError(f"{name} must have at most {self.most} events; got {len(value)}")
+        node, now = 0, 0.0
+        for i, event in enumerate(value):
+            node, now = self._check_event(event, f"{name}[{i}]", node, now)
+        if len(value) < self.least and tables.graph.last[node] >= 0:
+            raise ValueError(f"{name} must have at least {self.least} events; got {len(value)}")
+
+    def _check_event(self, event: object, name: str, node: int, now: float) -> tuple[int, float]:
+        tables = self.tables
+        if not isinstance(event, Mapping) or "kind" not in event:
+            raise ValueError(
+                f'{name} must be a dictionary with the event\'s "kind", its "wait" in seconds (or '
+                f'its "time") and its parameters; got {event!r}'
+            )
+        kind = event["kind"]
+        if kind not in tables.names:
+            raise unknown_name(f"kind of {name}", kind, tables.names)
+        number = int(tables.by_kind[node, tables.names.index(kind)])
+        if number < 0:
+            numbers = np.flatnonzero(tables.graph.enabled[node]).tolist()
+            raise ValueError(
+                f"{name} cannot be {kind!r} here: in state {tables.graph.states[node]!r}, after "
+                f"the events before it, {_listed([tables.transitions[n].name for n in numbers])}"
+            )
+        each = tables.transitions[number]
+        own = dict(each.parameters)
+        if "wait" not in event and "time" not in event:
+            raise ValueError(f"{name}.wait is missing; got {', '.join(map(str, event))}")
+        wait = event["wait"] if "wait" in event else event["time"] - now
+        each.wait.check(wait, dotted(name, "wait"))
+        for key in event:
+            if key not in (*own, "kind", "wait", "time"):
+                raise unknown_name(f"parameter of {name}, an event {kind!r},", key, own)
+        for key, domain in own.items():
+            if key not in event:
+                raise ValueError(
+                    f"{dotted(name, key)} is missing; got {', '.join(map(str, event))}"
+                )
+            domain.check(event[key], dotted(name, key))
+        return int(tables.graph.following[node, number]), now + float(np.asarray(wait))
+
+    def _written(self, value: Events) -> list[dict[str, Any]]:
+        """Return the events as a person writes them, each with its own parameters."""
+        tables = self.tables
+        kinds, node, found = np.asarray(value.kinds), 0, []
+        if np.any(kinds[int(value.length) :] >= 0):
+            raise ValueError(f"events must stand one after another; got kinds {kinds.tolist()}")
+        for i, kind in enumerate(kinds[: int(value.length)].tolist()):
+            wait = np.asarray(value.waits)[i]
+            event: dict[str, Any] = {"kind": tables.names[kind], "wait": wait}
+            number = int(tables.by_kind[node, kind])
+            for name, _ in tables.transitions[number].parameters if number >= 0 else ():
+                event[name] = np.asarray(value.parameters[name])[i]
+            found.append(event)
+            node = int(tables.graph.following[node, number]) if number >= 0 else node
+        return found
+
+    def columns(self, name: str) -> tuple[str, ...]:
+        """Return the names of the columns of a table."""
+        found = (f"{name}.length",)
+        for item in indexed(name, self.most):
+            found += (dotted(item, "kind"), dotted(item, "wait"))
+            for parameter, domains in self.tables.domains.items():
+                found += domains[0].columns(dotted(item, parameter))
+        return found
+
+    def to_columns(self, values: Events, name: str) -> dict[str, np.ndarray]:
+        """Return values, one of each row, as columns of a table."""
+        tables = self.tables
+        kinds, waits = np.asarray(values.kinds), np.asarray(values.waits)
+        taken = tables.followed(kinds)
+        columns: dict[str, np.ndarray] = {
+            f"{name}.length": (kinds >= 0).sum(axis=1).astype(np.int32)
+        }
+        # Texts throughout, so that a column has one type in every batch, on the disk too.
+        shown = np.array([*tables.names, ""], object)
+        for i, item in enumerate(indexed(name, self.most)):
+            columns[dotted(item, "kind")] = shown[kinds[:, i]]
+            columns[dotted(item, "wait")] = np.where(kinds[:, i] >= 0, waits[:, i], np.nan)
+            for parameter, groups in tables.users.items():
+                column = dotted(item, parameter)
+                place = np.asarray(values.parameters[parameter])[:, i]
+                columns |= _own_entries(groups, place, taken[:, i], column)
+        return columns
+
+    def from_columns(self, row: Row, name: str) -> Events:
+        """Return the value in a row of a table."""
+        tables = self.tables
+        length = as_numbers(row[f"{name}.length"], f"{name}.length").item()
+        if length not in range(self.most + 1):
+            raise ValueError(
+                f"{name}.length must be an integer from 0 to {self.most}; got {length!r}"
+            )
+        node, written = 0, []
+        for item in indexed(name, self.most)[: int(length)]:
+            kind = row[dotted(item, "kind")]
+            if kind not in tables.names:
+                raise unknown_name(dotted(item, "kind"), kind, tables.names)
+            number = int(tables.by_kind[node, tables.names.index(kind)])
+            if number < 0:
+                raise ValueError(
+                    f"{dotted(item, 'kind')} cannot be {kind!r} after the events before it"
+                )
+            each = tables.transitions[number]
+            # One column each, whatever the domain of the waiting time calls its own.
+            wait = each.wait.from_columns({"wait": row[dotted(item, "wait")]}, "wait")
+            own = {
+                parameter: domain.from_columns(row, dotted(item, parameter))
+                for parameter, domain in each.parameters
+            }
+            written.append((number, wait, own))
+            node = int(tables.graph.following[node, number])
+        return self._built(written)
+
+
+def where_there(there: Any, one: Any, other: Any) -> Any:
+    """Choose one where an event is there, else the other; a parameter may have further axes."""
+    axes = max(jnp.ndim(one), jnp.ndim(other)) - jnp.ndim(there)
+    return jnp.where(jnp.reshape(there, jnp.shape(there) + (1,) * axes), one, other)
+
+
+def _own_entries(
+    groups: Mapping[Domain, tuple[int, ...]],
+    values: np.ndarray,
+    taken: Int[np.ndarray, " n"],
+    column: str,
+) -> dict[str, np.ndarray]:
+    """Return columns of a parameter, empty in rows whose event does not have it."""
+    parts = [(domain.to_columns(values, column), users) for domain, users in groups.items()]
+    found = {}
+    for place, name in enumerate(parts[0][0]):
+        entries = [(list(part.values())[place], users) for part, users in parts]
+        numeric = all(part.dtype.kind in "iufb" for part, _ in entries)
+        real = entries[0][0].dtype if entries[0][0].dtype.kind == "f" else np.float64
+        whole = np.full(len(taken), np.nan if numeric else "", real if numeric else object)
+        for part, users in entries:
+            mine = np.isin(taken, users)
+            whole[mine] = part[mine]
+        found[name] = whole
+    return found
+
+
+def _listed(enabled: Sequence[str]) -> str:
+    return f"it can be {', '.join(enabled)}" if enabled else "no event is possible"
