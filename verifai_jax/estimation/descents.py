@@ -16,9 +16,10 @@ Preuss, Niching the CMA-ES via nearest-better clustering, GECCO 2010, for the or
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from verifai_jax.estimation.normal_space import LimitState, squared_distances
+from verifai_jax.estimation.normal_space import LimitState, scores_of, squared_distances
+from verifai_jax.estimation.towards_origin import BEYOND, come_in
 
 WIDEST = 2.5
 """Standard deviation of the starts that lie farthest out; that of the others is 0.5 at least."""
@@ -26,16 +27,12 @@ DRAWN = 0.2
 """Share of the simulations that score starts, of which the most promising descend first."""
 HITS = 0.02
 """Starts that fail themselves and count as ends, at most, in parts of the simulations."""
-HALVINGS = 5
-"""Halvings of the way in towards the origin."""
 FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
 """Descents that are side by side."""
-STEPS = 24
-"""Steps of a descent without gradients, at most; half of them where gradients lead nowhere."""
+STEPS, FURTHER_STEPS = 60, 12
+"""Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
 NEWTON_STEPS = 8
 """Steps of a descent with gradients, at most."""
-BEYOND = 0.05
-"""Share of the way to the limit state that a step with gradients goes beyond it."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
 
@@ -117,25 +114,6 @@ def draw_starts(
     return accepted
 
 
-def come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Halve the way to the origin as far as the points still fail."""
-    low, high = np.zeros(len(z)), np.ones(len(z))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        fails = scores_of(limit_state, middle[:, None] * z) == -np.inf
-        low, high = np.where(fails, low, middle), np.where(fails, middle, high)
-    return high[:, None] * z
-
-
-def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Return the scores of points; infinity where the constraint refuses one."""
-    fits: Bool[np.ndarray, " n"] = limit_state.accepts(z)
-    score = np.full(len(z), np.inf)
-    if fits.any():
-        score[fits] = limit_state(z[fits]).score
-    return score
-
-
 def _worse_neighbours(
     z: Float[np.ndarray, "n d"], score: Float[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
@@ -151,7 +129,7 @@ def _descend(limit_state: LimitState, rng: np.random.Generator, descents: _Desce
     if limit_state.gradient is not None:
         # Points without a usable gradient go on without.
         _descend_by_gradient(limit_state, descents)
-        steps = STEPS // 2
+        steps = FURTHER_STEPS
     z, score = descents.z, descents.score
     length, last = np.ones(len(z)), np.zeros_like(z)
     for _ in range(steps):

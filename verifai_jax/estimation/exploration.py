@@ -8,14 +8,13 @@ Splitting follows the robustness as a population: where it falls fastest, all ch
 region that the robustness leads to more slowly is left behind, however probable it is. Here
 descents begin in many places and end at their first failure (`descents`). Failures between which
 another one lies count as one region, and each region has about as many chains as any other: they
-come in towards the origin, where failures are more probable, and then walk among the failures by
-moves that keep the prior.
+come in towards the origin, where failures are more probable (`towards_origin`), find out which
+coordinates decide, and then walk among the failures by moves that keep the prior (`walks`).
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the failures of splitting that this mends; Hasofer and
 Lind, Exact and invariant second-moment code format, Journal of the Engineering Mechanics Division
-100 (1974), and Rackwitz and Fiessler, Structural reliability under combined random load sequences,
-Computers and Structures 9 (1978), for the least distant failure and the steps to it.
+100 (1974), for the least distant failure.
 """
 
 from dataclasses import dataclass
@@ -23,18 +22,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.estimation.descents import (
-    BEYOND,
+from verifai_jax.estimation.descents import Ends, descend_from_many
+from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.towards_origin import (
     HALVINGS,
-    Ends,
+    NEAREST_STEPS,
+    approach_origin,
     come_in,
-    descend_from_many,
-    scores_of,
+    come_in_by_parts,
+    redraw_by_parts,
 )
-from verifai_jax.estimation.normal_space import LimitState
-from verifai_jax.estimation.splitting import ACCEPTED
+from verifai_jax.estimation.walks import walk_among_failures
 
-DESCENTS = 0.55
+DESCENTS = 0.5
 """Share of the simulations for descents."""
 TELLING_APART = 0.1
 """Share of the simulations for points between ends, which tell regions apart."""
@@ -45,12 +45,11 @@ APART = 1.0
 LINKS = 2
 """Ends with which another one is compared, the nearest first."""
 WALK = 24
-"""Steps of a walk among the failures, half of them where gradients have led there; the second half
-of its states is kept."""
-FALL = -0.5
-"""Change of the logarithm of a walk's step that is refused, until one is taken."""
-NEAREST_STEPS = 6
-"""Steps to the least distant failure, at most, where there are gradients."""
+"""Steps of a walk among the failures; the second half of its states is kept."""
+FIRST_STEPS = 2
+"""Steps to the least distant failure before it is known which coordinates decide."""
+A_PART = 4
+"""Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
 """Logarithm of the prior's density beside the greatest, below which a region is left out."""
 FEWEST_CHAINS = 8
@@ -90,19 +89,23 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
         none, no_chain = np.zeros((0, limit_state.dim)), np.zeros(0, int)
         return Exploration(none, no_chain, none, no_chain)
     differentiates = limit_state.gradient is not None
-    steps = WALK // 2 if differentiates else WALK
-    cost = steps + (HALVINGS + 4 * NEAREST_STEPS) * differentiates
+    cost = WALK + round(A_PART * np.log2(1 + limit_state.dim))
+    cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS)) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
     chains = min(max(FEWEST_CHAINS, left // cost), len(ends.points))
-    rows = _choose_ends(limit_state, ends, chains, telling)
+    rows, groups = _choose_ends(limit_state, ends, chains, telling)
     z = ends.points[rows]
     if differentiates:
-        z = come_in(limit_state, z)
-    states, nearest = _walk_alone(limit_state, rng, z, steps)
+        z = approach_origin(limit_state, come_in(limit_state, z), FIRST_STEPS)
+    z = come_in_by_parts(limit_state, rng, z)
+    groups = _regions_of(limit_state, z, groups)
+    redrawn, deciding = redraw_by_parts(limit_state, rng, z)
+    states, walked = walk_among_failures(limit_state, rng, redrawn, deciding, groups, WALK)
+    nearest = np.where(_squares(walked) < _squares(z), walked, z)
     if differentiates:
         nearest = approach_origin(limit_state, nearest)
-    square = np.sum(nearest**2, axis=1)
+    square = _squares(nearest)[:, 0]
     probable = square < square.min() + 2 * IMPROBABLE
     nearest, states = nearest[probable], [state[probable] for state in states]
     chain_ids = np.tile(np.arange(len(nearest)), len(states))
@@ -112,11 +115,13 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
 
 def _choose_ends(
     limit_state: LimitState, ends: Ends, chains: int, simulations: int
-) -> Int[np.ndarray, " chains"]:
+) -> tuple[Int[np.ndarray, " chains"], Int[np.ndarray, " chains"]]:
     """Choose ends for chains, in turn from each region; one with few ends has some of them twice.
 
     Ends belong together where the point between them fails; each is compared with the nearest of
     those before it.
+
+    **Returns:** rows of ends, and the region of each.
     """
     rows = _spread_out(ends, max(chains, simulations // LINKS))
     gaps = _gaps(ends, rows, rows)
@@ -130,13 +135,18 @@ def _choose_ends(
         members.append(np.append(own[norms[own].argmin()], np.delete(own, norms[own].argmin())))
     members.sort(key=lambda own: norms[own[0]])
     turns = [own[turn % len(own)] for turn in range(chains) for own in members]
-    return rows[np.array(turns[:chains])]
+    return rows[np.array(turns[:chains])], np.arange(chains) % len(members)
 
 
 def _regions_of(
-    limit_state: LimitState, nearest: Float[np.ndarray, "m d"]
+    limit_state: LimitState,
+    nearest: Float[np.ndarray, "m d"],
+    known: Int[np.ndarray, " m"] | None = None,
 ) -> Int[np.ndarray, " m"]:
-    """Return the region `[m]` of chains: of one are near ones between which another point fails."""
+    """Return the region `[m]` of chains: of one are near ones between which another point fails.
+
+    Those that are `known` to belong together do so.
+    """
     order = np.argsort(np.linalg.norm(nearest, axis=1))
     z = nearest[order]
     gaps = np.linalg.norm(z[:, None] - z[None], axis=2)
@@ -145,15 +155,20 @@ def _regions_of(
     near = np.take_along_axis(gaps, others, axis=1) < APART
     own = np.arange(len(z))[:, None]
     region = np.empty(len(z), int)
-    region[order] = _joined(limit_state, z, np.where(near, others, own))
+    links = np.where(near, others, own)
+    region[order] = _joined(limit_state, z, links, None if known is None else known[order])
     return region
 
 
 def _joined(
-    limit_state: LimitState, z: Float[np.ndarray, "k d"], others: Int[np.ndarray, "k links"]
+    limit_state: LimitState,
+    z: Float[np.ndarray, "k d"],
+    others: Int[np.ndarray, "k links"],
+    known: Int[np.ndarray, " k"] | None = None,
 ) -> Int[np.ndarray, " k"]:
     """Return numbers `[k]` of groups of failures: joined to others where the middle fails."""
-    group, places = np.arange(len(z)), np.arange(len(z))
+    places = np.arange(len(z))
+    group = places.copy() if known is None else known.copy()
     for other in others.T:
         tried = np.flatnonzero((other < places) & (group[other] != group))
         middle = (z[tried] + z[other[tried]]) / 2
@@ -173,6 +188,11 @@ def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
     return np.array(chosen)
 
 
+def _squares(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
+    """Return the squared distances of points from the origin."""
+    return np.sum(z**2, axis=1, keepdims=True)
+
+
 def _gaps(
     ends: Ends, rows: Int[np.ndarray, " n"], others: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n m"]:
@@ -182,61 +202,3 @@ def _gaps(
         for part in (ends.points, ends.feet)
     )
     return np.minimum(points, feet)
-
-
-def _walk_alone(
-    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"], steps: int
-) -> tuple[list[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
-    """Walk among the failures, each chain by moves of its own size that keep the prior.
-
-    **Returns:** the states of the second half, and the state of each chain nearest to the origin.
-    """
-    scale, states, nearest = np.full(len(z), 0.5), [], z.copy()
-    moving = np.zeros(len(z), bool)
-    for step in range(1, steps + 1):
-        moved = np.sqrt(1 - scale**2)[:, None] * z
-        moved += scale[:, None] * rng.standard_normal(z.shape)
-        take = scores_of(limit_state, moved) == -np.inf
-        z = np.where(take[:, None], moved, z)
-        moving |= take
-        # Gains fall with the steps, so that the sizes settle. In a small region no step is taken
-        # until it is small as well.
-        gain = np.where(take, 1 - ACCEPTED, -ACCEPTED) / np.sqrt(1 + step / 8)
-        gain = np.where(moving, gain, FALL)
-        scale = np.clip(scale * np.exp(gain), 1e-4, 0.95)
-        closer = np.sum(z * z, axis=1) < np.sum(nearest * nearest, axis=1)
-        nearest = np.where(closer[:, None], z, nearest)
-        if step > steps // 2:
-            states.append(z)
-    return states, nearest
-
-
-def approach_origin(
-    limit_state: LimitState, z: Float[np.ndarray, "n d"], steps: int = NEAREST_STEPS
-) -> Float[np.ndarray, "n d"]:
-    """Move failures to the least distant ones near them, by the gradient.
-
-    A step goes towards the point nearest to the origin where the linearised robustness is just
-    below zero (Rackwitz and Fiessler, 1978). Where that does not fail, as on a limit state that
-    bends away, Newton's step leads back to it; where it is no nearer, the next step is half as far.
-
-    **Returns:** failures `[n, d]`, none farther from the origin than its start.
-    """
-    best = z.copy()
-    share = np.ones(len(z))
-    for _ in range(steps):
-        _, rho, gradient = limit_state.linearize(best)
-        square = np.sum(gradient * gradient, axis=1)
-        usable = np.isfinite(rho) & (square > 0)
-        normal = gradient / np.where(usable, square, 1.0)[:, None]
-        inner = np.sum(gradient * best, axis=1) - np.where(usable, rho, 0.0)
-        target = inner[:, None] * normal * (1 + 1e-3)
-        moved = np.where(usable[:, None], best + share[:, None] * (target - best), best)
-        score = scores_of(limit_state, moved)
-        safe = np.flatnonzero(usable & (score > -np.inf) & np.isfinite(score))
-        moved[safe] -= (1 + BEYOND) * score[safe, None] * normal[safe]
-        score[safe] = scores_of(limit_state, moved[safe])
-        closer = (score == -np.inf) & (np.sum(moved**2, axis=1) < np.sum(best**2, axis=1))
-        best = np.where(closer[:, None], moved, best)
-        share = np.where(closer, np.minimum(1.0, 1.5 * share), share / 2)
-    return best

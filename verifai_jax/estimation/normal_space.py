@@ -231,6 +231,15 @@ def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     return ndtr(z)
 
 
+def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """Return the scores of points; infinity where the constraint refuses one."""
+    fits: Bool[np.ndarray, " n"] = limit_state.accepts(z)
+    score = np.full(len(z), np.inf)
+    if fits.any():
+        score[fits] = limit_state(z[fits]).score
+    return score
+
+
 def squared_distances(
     z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
 ) -> Float[np.ndarray, "n m"]:

@@ -1,0 +1,135 @@
+"""Ways of failures towards the origin of normal space, the middle of the prior.
+
+    z = come_in(limit_state, z)                     # straight, as far as that fails
+    z = approach_origin(limit_state, z)             # along the limit state, by its gradients
+    z = come_in_by_parts(limit_state, rng, z)       # in some coordinates only
+    z, deciding = redraw_by_parts(limit_state, rng, z)
+
+A failure often needs a few coordinates only, and any value of the others. The third way sets these
+others to zero, so that failures of one region become alike, in however many dimensions.
+
+Sources: Rackwitz and Fiessler, Structural reliability under combined random load sequences,
+Computers and Structures 9 (1978), for the steps to the least distant failure; Zeller and
+Hildebrandt, Simplifying and isolating failure-inducing input, IEEE Transactions on Software
+Engineering 28 (2002), for the order of the parts.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from verifai_jax.estimation.normal_space import LimitState, scores_of
+
+HALVINGS = 5
+"""Halvings of the way in towards the origin."""
+BEYOND = 0.05
+"""Share of the way to the limit state that a step with gradients goes beyond it."""
+NEAREST_STEPS = 6
+"""Steps to the least distant failure, at most, where there are gradients."""
+SHORTEST = 0.05
+"""Part of a step to the least distant failure below which no further one is tried."""
+
+
+def come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    """Halve the way to the origin as far as the points still fail."""
+    low, high = np.zeros(len(z)), np.ones(len(z))
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        fails = scores_of(limit_state, middle[:, None] * z) == -np.inf
+        low, high = np.where(fails, low, middle), np.where(fails, middle, high)
+    return high[:, None] * z
+
+
+def approach_origin(
+    limit_state: LimitState, z: Float[np.ndarray, "n d"], steps: int = NEAREST_STEPS
+) -> Float[np.ndarray, "n d"]:
+    """Move failures to the least distant ones near them, by the gradient.
+
+    A step goes towards the point nearest to the origin where the linearised robustness is just
+    below zero (Rackwitz and Fiessler, 1978). Where that does not fail, as on a limit state that
+    bends away, Newton's step leads back to it; where it is no nearer, the next step is half as far,
+    until steps are too short.
+
+    **Returns:** failures `[n, d]`, none farther from the origin than its start.
+    """
+    best = z.copy()
+    share = np.ones(len(z))
+    for _ in range(steps):
+        rows = np.flatnonzero(share > SHORTEST)
+        if not len(rows):
+            break
+        here = best[rows]
+        _, rho, gradient = limit_state.linearize(here)
+        square = np.sum(gradient * gradient, axis=1)
+        usable = np.isfinite(rho) & (square > 0)
+        normal = gradient / np.where(usable, square, 1.0)[:, None]
+        inner = np.sum(gradient * here, axis=1) - np.where(usable, rho, 0.0)
+        target = inner[:, None] * normal * (1 + 1e-3)
+        moved = np.where(usable[:, None], here + share[rows, None] * (target - here), here)
+        score = scores_of(limit_state, moved)
+        safe = np.flatnonzero(usable & (score > -np.inf) & np.isfinite(score))
+        moved[safe] -= (1 + BEYOND) * score[safe, None] * normal[safe]
+        score[safe] = scores_of(limit_state, moved[safe])
+        closer = (score == -np.inf) & (np.sum(moved**2, axis=1) < np.sum(here**2, axis=1))
+        best[rows] = np.where(closer[:, None], moved, here)
+        share[rows] = np.where(closer, np.minimum(1.0, 1.5 * share[rows]), share[rows] / 2)
+    return best
+
+
+def come_in_by_parts(
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "n d"]:
+    """Set parts of the coordinates to zero, the middle of the prior, as far as that still fails."""
+    return _replace_by_parts(limit_state, rng, z, np.zeros_like(z), z != 0)[0]
+
+
+def redraw_by_parts(
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
+) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, "n d"]]:
+    """Draw coordinates that are zero from the prior, as far as that still fails.
+
+    **Returns:** the failures `[n, d]`, and the coordinates that decide: those that were not drawn.
+    """
+    return _replace_by_parts(limit_state, rng, z, rng.standard_normal(z.shape), z == 0)
+
+
+def _replace_by_parts(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    z: Float[np.ndarray, "n d"],
+    values: Float[np.ndarray, "n d"],
+    among: Bool[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, "n d"]]:
+    """Replace parts of the coordinates of failures by other values, as far as they still fail.
+
+    Halves are tried first, then quarters, and so on down to single coordinates; where no quarter
+    can be replaced, no more is tried.
+
+    **Returns:** the failures `[n, d]`, and the coordinates that have kept their value.
+    """
+    z, kept, d = z.copy(), np.ones(z.shape, bool), z.shape[1]
+    # The place of each coordinate in the row of those that are tried; the others come last.
+    place = np.argsort(np.argsort(np.where(among, rng.random(z.shape), 2.0), axis=1), axis=1)
+    count = among.sum(axis=1)
+    begin, size, quarter = np.zeros(len(z), int), (count + 1) // 2, (count + 3) // 4
+    active = count > 0
+    while active.any():
+        rows = np.flatnonzero(active)
+        end = np.minimum(begin[rows] + size[rows], count[rows])[:, None]
+        part = (place[rows] >= begin[rows, None]) & (place[rows] < end)
+        moved = np.where(part, values[rows], z[rows])
+        fails = scores_of(limit_state, moved) == -np.inf
+        # Another region may fail there too: in the same one the middle of the way fails as well.
+        tried = np.flatnonzero(fails)
+        middle = (moved[tried] + z[rows[tried]]) / 2
+        fails[tried] = scores_of(limit_state, middle) == -np.inf
+        z[rows] = np.where(fails[:, None], moved, z[rows])
+        kept[rows] &= ~(part & fails[:, None])
+        begin[rows] += size[rows]
+        for row in rows[begin[rows] >= count[rows]]:
+            # The parts of what is left are half as large.
+            left = among[row] & kept[row]
+            fruitless = size[row] <= quarter[row] and np.array_equal(left, among[row])
+            active[row] = left.any() and size[row] > 1 and not fruitless
+            place[row] = np.argsort(np.argsort(np.where(left, place[row], d)))
+            begin[row], size[row], count[row] = 0, (size[row] + 1) // 2, np.sum(left)
+    return z, kept
