@@ -3,19 +3,20 @@
 anchors = anchors_of(explorations, defensive=0.1)
 anchors.fit()                                   # a mixture, of about equal parts for all regions
 anchors.fit(failures, weights)                  # the same, fitted to samples as well
+anchors.owners(failures)                        # the region [n] of each
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from verifai_jax.estimation.components import Component, Gaussian, Prior
+from verifai_jax.estimation.components import Component, Gaussian, Marginals, Prior, log_ratios
 from verifai_jax.estimation.exploration import Exploration
-from verifai_jax.estimation.fitting import effective_size, fit_gaussian
+from verifai_jax.estimation.fitting import effective_size, fit_diagonal, fit_gaussian, fit_marginals
 from verifai_jax.estimation.mixture import Mixture
-from verifai_jax.estimation.normal_space import squared_distances
 
 ONE = 0.25
 """Distance below which two least distant failures of different searches count as one."""
@@ -25,6 +26,10 @@ WIDER = 1.3
 """Factor on the standard deviations of a region's own component."""
 CHAINS_WORTH = 1.5
 """Independent failures that the states of one chain are worth."""
+FAR_WIDER = 3.0
+"""Factor on those of a component for what few chains have not seen of a region."""
+KINDS = 5
+"""Components of a region."""
 LEAST_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
 
@@ -54,41 +59,63 @@ class Anchors:
 
         **Arguments:**
 
-        - `z`: failures `[n, d]`; each belongs to the region with the nearest state of a chain.
+        - `z`: failures `[n, d]`.
         - `weight`: parts `[n]` of the failures' distribution that they stand for.
+
+        **Returns:** the mixture; for every fit it has the same kinds of components in the same
+        order, `KINDS` of each region.
         """
-        nearest, of_chain = self.chains.nearest, weigh_chains(self.chains)
-        d = nearest.shape[1]
-        states = [np.isin(self.chains.chain_ids, chains) for chains in self.regions]
-        owner = None if z is None else self._owners(z, states)
+        d, of_chain = self.chains.nearest.shape[1], weigh_chains(self.chains)
+        fitted = list(self._by_chains)
+        if z is not None and weight is not None and len(z):
+            owner = self.owners(z)
+            for number in np.unique(owner).tolist():
+                own = owner == number
+                fitted[number] = self._around(number, z[own], weight[own])
         components: list[Component] = []
         shares: list[float] = []
-        for number, chains in enumerate(self.regions):
-            row = chains[np.linalg.norm(nearest[chains], axis=1).argmin()]
-            around: list[Component] = [Gaussian(nearest[row], np.eye(d), np.ones(d))]
-            own = self.chains.points[states[number]]
-            part = np.full(len(own), 1 / len(own))
-            if z is not None and weight is not None and np.any(owner == number):
-                own, part = _together(
-                    own, CHAINS_WORTH * len(chains), z[owner == number], weight[owner == number]
-                )
-            if len(own) > 2:
-                gaussian = fit_gaussian(own, part)
-                around.append(Gaussian(gaussian.mean, gaussian.axes, WIDER * gaussian.stds))
-                around.append(Gaussian(gaussian.mean, np.eye(d), np.ones(d)))
+        for chains, around in zip(self.regions, fitted, strict=True):
+            # As wide as the prior at the likeliest failure, and wider than the failures found: few
+            # chains may know a part of the region only.
+            row = chains[np.linalg.norm(self.chains.nearest[chains], axis=1).argmin()]
+            components.append(Gaussian(self.chains.nearest[row], np.eye(d), np.ones(d)))
+            components.append(around[1].widened(FAR_WIDER))
             components += around
-            shares += [float(of_chain[row]) ** 0.5 / len(around)] * len(around)
+            shares += [float(of_chain[row]) ** 0.5] * KINDS
         share = np.array(shares) / sum(shares) * (1 - self.defensive)
         return Mixture((Prior(d), *components), np.append(self.defensive, share))
 
-    def _owners(
-        self, z: Float[np.ndarray, "n d"], states: Sequence[Bool[np.ndarray, " m"]]
-    ) -> Int[np.ndarray, " n"]:
-        gaps = [
-            np.min(squared_distances(z, self.chains.points[own]), axis=1, initial=np.inf)
-            for own in states
-        ]
-        return np.argmin(gaps, axis=0)
+    def owners(self, z: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
+        """Return the region `[n]` whose chains make each failure most probable."""
+        return np.argmax([log_ratios(each, z).max(axis=1) for each in self._by_chains], axis=0)
+
+    @cached_property
+    def _by_chains(self) -> tuple[tuple[Gaussian, Gaussian, Marginals], ...]:
+        return tuple(self._around(number) for number in range(len(self.regions)))
+
+    def _around(
+        self,
+        number: int,
+        z: Float[np.ndarray, "n d"] | None = None,
+        weight: Float[np.ndarray, " n"] | None = None,
+    ) -> tuple[Gaussian, Gaussian, Marginals]:
+        """Fit components to a region's chains, and to weighted failures where given.
+
+        In many dimensions a few chains know no correlations, but how each coordinate is spread.
+        """
+        chains = self.regions[number]
+        points = self.chains.points[np.isin(self.chains.chain_ids, chains)]
+        worth = CHAINS_WORTH * len(chains)
+        part, each = np.full(len(points), 1 / len(points)), min(1.0, worth / len(points))
+        if z is not None and weight is not None:
+            points, part = _together(points, worth, z, weight)
+            each = 1.0
+        gaussian = fit_gaussian(points, part)
+        return (
+            Gaussian(gaussian.mean, gaussian.axes, WIDER * gaussian.stds),
+            fit_diagonal(points, part, each),
+            fit_marginals(points, part, worth=each),
+        )
 
 
 def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors:

@@ -52,6 +52,11 @@ class Gaussian:
     axes: Float[np.ndarray, "d d"]
     stds: Float[np.ndarray, " d"]
 
+    def widened(self, factor: float) -> "Gaussian":
+        """Return it with standard deviations below the prior's enlarged, up to the prior's."""
+        stds = np.where(self.stds < 1, np.minimum(factor * self.stds, 1.0), self.stds)
+        return Gaussian(self.mean, self.axes, stds)
+
     def sample(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
         return self.mean + (rng.standard_normal((n, len(self.mean))) * self.stds) @ self.axes.T
 

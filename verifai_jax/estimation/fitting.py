@@ -23,6 +23,8 @@ from verifai_jax.estimation.components import (
     rank_scores,
 )
 
+WIDER = 1.3
+"""Factor on the standard deviations of a Gaussian without correlations."""
 SWEEPS = 12
 """Iterations of expectation maximisation, at most."""
 KERNELS = 400
@@ -74,6 +76,22 @@ def fit_gaussian(
         level = float(values.mean())
     values = np.where(inside, level, values) if inside.any() else values
     return Gaussian(mean, axes, np.sqrt(np.clip(values, 1e-8, 25.0)))
+
+
+def fit_diagonal(
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
+) -> Gaussian:
+    """Fit a Gaussian without correlations, a little wider than the points.
+
+    A coordinate that differs from the prior's by no more than sampling noise is the prior's.
+    """
+    size = max(effective_size(weight) * worth, 2.0)
+    mean = weight @ z
+    stds = np.maximum(np.sqrt(weight @ (z - mean) ** 2), 1e-9)
+    noise = 3 / np.sqrt(size)
+    free = (np.abs(mean) < noise) & (np.abs(np.log(stds)) < noise / np.sqrt(2))
+    mean, stds = np.where(free, 0.0, mean), np.where(free, 1.0, WIDER * stds)
+    return Gaussian(mean, np.eye(z.shape[1]), np.clip(stds, 1e-4, 5.0))
 
 
 def fit_gaussian_mixture(

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.anchors import CHAINS_WORTH, Anchors
+from verifai_jax.estimation.components import log_ratios
 from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.intervals import (
     WeightedMean,
@@ -25,7 +26,7 @@ from verifai_jax.estimation.intervals import (
     tail_index,
     weighted_mean,
 )
-from verifai_jax.estimation.mixture import Mixture, fit_mixture
+from verifai_jax.estimation.mixture import Mixture, fit_mixture, optimal_shares
 from verifai_jax.estimation.normal_space import Ended, LimitState, Scores
 
 SHARE_OF_STAGE = 0.1
@@ -36,6 +37,8 @@ KEPT = 0.25
 """Share of the previous proposal in the next one, so that no stage can spoil it."""
 ANCHORED = 0.1
 """Share of the anchors in a proposal, so that no stage forgets a region that a search has found."""
+LEAST_REGION = 1e-3
+"""Part of the failures as which a region counts at least, where shares are given out."""
 ENOUGH = 2500
 """Effective failures beyond which a further stage is not worth its simulations."""
 STEADY = 0.5
@@ -153,6 +156,7 @@ def fit_proposal(
     - `defensive`: share of the prior in the proposal.
     """
     proposal = initial or fit_mixture(points, np.ones(len(points)), chain_ids, rng, defensive)
+    mixture, anchored = proposal, None if anchors is None else anchors.fit()
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposals, zs, failing = [], [], []
     effective, tail, before, left = 0.0, np.inf, 0.0, simulations
@@ -179,14 +183,44 @@ def fit_proposal(
             [np.full(len(points), worth[0] / len(points)), worth[1] * inverse / inverse.sum()]
         )
         all_ids = np.append(chain_ids, chain_ids.max() + 1 + np.arange(len(new)))
-        proposal = fit_mixture(np.concatenate([points, new]), weight, all_ids, rng, defensive)
-        proposal = proposal.join(proposals[-1], KEPT)
+        # The shares are those that were best for failures to which the last fit was not fitted.
+        fresh, last = (z[scores.failing], w), (mixture, anchored)
+        mixture = fit_mixture(np.concatenate([points, new]), weight, all_ids, rng, defensive)
+        proposal = mixture
         if anchors is not None:
-            proposal = proposal.join(anchors.fit(new, inverse), ANCHORED)
+            shares = _share_out(*last, anchors, *fresh, defensive)
+            anchored = anchors.fit(new, inverse)
+            best = anchored.with_shares(shares)
+            proposal = mixture.join(best, float(shares.sum())).join(anchored, ANCHORED)
+        proposal = proposal.join(proposals[-1], KEPT)
         if stage and tail < STEADY and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left
     return FittedProposal(proposal, effective, tail)
+
+
+def _share_out(
+    mixture: Mixture,
+    anchored: Mixture | None,
+    anchors: Anchors,
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    defensive: float,
+) -> Float[np.ndarray, " k"]:
+    """Return the best share of each component of the anchors beside a mixture, of sum one at most.
+
+    The best ones for the whole would leave an improbable region without samples, and its own
+    probability unknown. So failures `z` are weighed by one over the probability of their region,
+    which gives it samples by the root of its probability.
+    """
+    assert anchored is not None
+    owner = anchors.owners(z)
+    mass = np.bincount(owner, weight)
+    balanced = weight / np.maximum(mass, LEAST_REGION * mass.sum())[owner]
+    table = np.exp(log_ratios(anchored.components[1:], z))
+    others = mixture.fitted_ratio(z) / (1 - mixture.shares[0])
+    shares = optimal_shares(np.column_stack([others, table]), balanced / balanced.sum(), defensive)
+    return shares[1:]
 
 
 def sample_proposal(

@@ -50,7 +50,7 @@ SHARE_OF_REPLICATE = 0.02
 """Share of the budget for each level of splitting runs that are the estimate themselves."""
 EXPLORATIONS = 2
 """Independent searches for failures beside splitting."""
-SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.1
+SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.12
 """Share of the budget for each of them."""
 FEWEST_OF_EXPLORATION = 600
 """Simulations of a search, below which it says too little to be worth them."""

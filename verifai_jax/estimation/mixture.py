@@ -84,6 +84,12 @@ class Mixture:
             tuple(c for c, use in zip(components, keep, strict=True) if use), shares[keep]
         )
 
+    def with_shares(self, shares: Float[np.ndarray, " k"]) -> "Mixture":
+        """Return this mixture with other shares in these proportions; the prior keeps its own."""
+        prior = float(self.shares[0])
+        rest = shares * (1 - prior) / max(float(shares.sum()), 1e-12)
+        return Mixture(self.components, np.append(prior, rest))
+
     def ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the proposal density over the prior's."""
         return np.exp(log_ratios(self.components, z)) @ self.shares
