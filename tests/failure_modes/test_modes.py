@@ -14,7 +14,7 @@ import verifai_jax as vj
 from verifai_jax.cli.modes import modes as command
 from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.failure_modes.naming import name_mode
-from verifai_jax.failure_modes.regions import find_regions, share_explained
+from verifai_jax.failure_modes.region_search import find_regions, share_explained
 
 
 def three(z):

@@ -41,7 +41,8 @@ from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.failure_modes.naming import name_mode
-from verifai_jax.failure_modes.regions import Regions, find_regions, share_explained
+from verifai_jax.failure_modes.region_search import find_regions, share_explained
+from verifai_jax.failure_modes.regions import Regions
 from verifai_jax.failure_modes.result import Mode, Modes
 from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
