@@ -159,7 +159,7 @@ LIMIT_STATES: dict[str, tuple[Callable, int, float | None]] = {
     "Breitung's trap": (breitung_trap, 2, None),
     "ring of five": (ring, 2, None),
     "oscillator": (oscillator, 6, 9.133e-6),  # Importance sampling, known to 0.04 %.
-    "parabola": (parabola, 40, 4.17e-5),  # 834 failures of 2e7.
+    "parabola": (parabola, 40, 4.2005e-5),  # By an integral over the sum of squares.
     "hat": (hat, 2, None),
     "Himmelblau": (himmelblau, 2, None),
     "product": (product, 2, None),
