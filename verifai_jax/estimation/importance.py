@@ -184,11 +184,11 @@ def fit_proposal(
         )
         all_ids = np.append(chain_ids, chain_ids.max() + 1 + np.arange(len(new)))
         # The shares are those that were best for failures to which the last fit was not fitted.
-        fresh, last = (z[scores.failing], w), (mixture, anchored)
+        before_it = mixture
         mixture = fit_mixture(np.concatenate([points, new]), weight, all_ids, rng, defensive)
         proposal = mixture
-        if anchors is not None:
-            shares = _share_out(*last, anchors, *fresh, defensive)
+        if anchors is not None and anchored is not None:
+            shares = _share_out(before_it, anchored, anchors, z[scores.failing], w, defensive)
             anchored = anchors.fit(new, inverse)
             best = anchored.with_shares(shares)
             proposal = mixture.join(best, float(shares.sum())).join(anchored, ANCHORED)
@@ -201,7 +201,7 @@ def fit_proposal(
 
 def _share_out(
     mixture: Mixture,
-    anchored: Mixture | None,
+    anchored: Mixture,
     anchors: Anchors,
     z: Float[np.ndarray, "n d"],
     weight: Float[np.ndarray, " n"],
@@ -213,7 +213,6 @@ def _share_out(
     probability unknown. So failures `z` are weighed by one over the probability of their region,
     which gives it samples by the root of its probability.
     """
-    assert anchored is not None
     owner = anchors.owners(z)
     mass = np.bincount(owner, weight)
     balanced = weight / np.maximum(mass, LEAST_REGION * mass.sum())[owner]
