@@ -7,6 +7,7 @@ from scipy.stats import norm
 
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
+from verifai_jax.estimation.descents import descend_from_many
 from verifai_jax.estimation.exploration import approach_origin, explore
 from verifai_jax.estimation.initial_proposal import compare_explorations
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
@@ -166,6 +167,28 @@ def test_small_islands_beside_one_another_are_two_regions():
     gaps = np.linalg.norm(found.nearest[:, None] - centres, axis=2).argmin(axis=1)
     assert set(gaps) == {0, 1}
     assert not set(found.regions[gaps == 0]) & set(found.regions[gaps == 1])
+
+
+def test_few_descents_go_on_to_a_plane_that_many_have_come_to():
+    """Four half-spaces; the robustness falls to the first over most of the space."""
+    normals, distances = np.eye(30)[:4], np.array([4.0, 4.1, 4.2, 4.3])
+    speeds = np.array([0.1, 1.0, 3.0, 4.0])
+
+    def robustness(z):
+        return np.min((distances - z @ normals.T) * speeds, axis=1)
+
+    def gradient(z):
+        own = np.argmin((distances - z @ normals.T) * speeds, axis=1)
+        return -normals[own] * speeds[own][:, None]
+
+    known = with_gradient(robustness, gradient, 30, 10_000)
+    ends = descend_from_many(known, np.random.default_rng(0), 2000)
+    planes = np.bincount(np.argmin(distances - ends.points @ normals.T, axis=1), minlength=4)
+    assert planes.min() >= 3
+    assert planes[0] < 100
+    # Ends of a plane share its foot, starts that fail themselves too; not those of random steps.
+    gaps = np.linalg.norm(ends.feet[:, None] - distances[:, None] * normals, axis=2)
+    assert np.mean(gaps.min(axis=1) < 1e-6) > 0.9
 
 
 def test_the_least_distant_failure_of_a_ball_is_found_though_its_tangent_planes_lie_outside():

@@ -16,7 +16,7 @@ Preuss, Niching the CMA-ES via nearest-better clustering, GECCO 2010, for the or
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.normal_space import LimitState, scores_of, squared_distances
 from verifai_jax.estimation.towards_origin import BEYOND, come_in
@@ -33,6 +33,8 @@ STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
 NEWTON_STEPS = 8
 """Steps of a descent with gradients, at most."""
+SAME_FOOT, ENOUGH = 0.05, 8
+"""Distance of feet below which planes are one, and descents to one after which no more go on."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
 
@@ -57,6 +59,7 @@ class _Descents:
     z: Float[np.ndarray, "n d"]
     score: Float[np.ndarray, " n"]
     feet: Float[np.ndarray, "n d"]
+    given_up: Bool[np.ndarray, " n"]
 
 
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
@@ -75,17 +78,21 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     # Far out, where they lie, several regions overlap.
     points = [come_in(limit_state, z[hits])]
     feet = points.copy()
+    if limit_state.gradient is not None:
+        _, rho, gradient = limit_state.linearize(points[0])
+        feet = [_feet(points[0], rho, gradient)]
     count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
         now, others = others[:count], others[count:]
         if len(now):
-            descents = _Descents(z[now], score[now], z[now])
+            descents = _Descents(z[now], score[now], z[now], np.zeros(len(now), bool))
         else:
             start = draw_starts(limit_state, rng, count)
-            descents = _Descents(start, scores_of(limit_state, start), start)
+            nothing = np.zeros(len(start), bool)
+            descents = _Descents(start, scores_of(limit_state, start), start, nothing)
         if not len(descents.z):
             break
-        _descend(limit_state, rng, descents)
+        _descend(limit_state, rng, descents, np.concatenate(feet))
         fails = descents.score == -np.inf
         if limit_state.gradient is None:
             descents.z[fails] = come_in(limit_state, descents.z[fails])
@@ -123,17 +130,26 @@ def _worse_neighbours(
     return np.sum(gaps < nearest[:, None], axis=1)
 
 
-def _descend(limit_state: LimitState, rng: np.random.Generator, descents: _Descents) -> None:
-    """Lower the robustness of each point until it fails or its steps are used up."""
+def _descend(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    descents: _Descents,
+    known: Float[np.ndarray, "m d"],
+) -> None:
+    """Lower the robustness of each point until it fails or its steps are used up.
+
+    With gradients a descent ends at once where many before it have come to the same plane, `known`
+    by their feet.
+    """
     steps = STEPS
     if limit_state.gradient is not None:
         # Points without a usable gradient go on without.
-        _descend_by_gradient(limit_state, descents)
+        _descend_by_gradient(limit_state, descents, known)
         steps = FURTHER_STEPS
     z, score = descents.z, descents.score
     length, last = np.ones(len(z)), np.zeros_like(z)
     for _ in range(steps):
-        rows = np.flatnonzero(score > -np.inf)
+        rows = np.flatnonzero((score > -np.inf) & ~descents.given_up)
         if not len(rows):
             break
         # A step that was good is taken again, with some noise.
@@ -149,14 +165,20 @@ def _descend(limit_state: LimitState, rng: np.random.Generator, descents: _Desce
         length[rows] *= np.where(better, 1.2, np.where(repeats, 1.0, 0.85))
 
 
-def _descend_by_gradient(limit_state: LimitState, descents: _Descents) -> None:
+def _descend_by_gradient(
+    limit_state: LimitState, descents: _Descents, known: Float[np.ndarray, "m d"]
+) -> None:
     """Take Newton's steps to the limit state, halved where they do not lower the robustness."""
     z = descents.z
     score, rho, gradient = limit_state.linearize(z)
+    gaps = squared_distances(_feet(z, rho, gradient), known)
+    repeats = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
+    descents.given_up = repeats
     longest = np.full(len(z), LONGEST)
     for _ in range(NEWTON_STEPS):
         square = np.sum(gradient * gradient, axis=1)
-        rows = np.flatnonzero((score > -np.inf) & np.isfinite(score) & (square > 0))
+        usable = np.isfinite(score) & (square > 0) & ~repeats
+        rows = np.flatnonzero((score > -np.inf) & usable)
         if not len(rows):
             break
         step = -(1 + BEYOND) * (score[rows] / square[rows])[:, None] * gradient[rows]
@@ -172,8 +194,15 @@ def _descend_by_gradient(limit_state: LimitState, descents: _Descents) -> None:
         rho[took], gradient[took] = new.rho[better], new.gradient[better]
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
     descents.score = score
+    descents.feet = _feet(z, rho, gradient)
+
+
+def _feet(
+    z: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"], gradient: Float[np.ndarray, "n d"]
+) -> Float[np.ndarray, "n d"]:
+    """Return the points of the linearised limit state nearest to the origin, or `z` without one."""
     square = np.sum(gradient * gradient, axis=1)
     known = np.isfinite(rho) & (square > 0)
     inner = np.sum(gradient * z, axis=1) - np.where(known, rho, 0.0)
     foot = (inner / np.where(known, square, 1.0))[:, None] * gradient
-    descents.feet = np.where(known[:, None], foot, z)
+    return np.where(known[:, None], foot, z)
