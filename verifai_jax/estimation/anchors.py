@@ -15,15 +15,19 @@ from jaxtyping import Float, Int
 
 from verifai_jax.estimation.components import Component, Gaussian, Marginals, Prior, log_ratios
 from verifai_jax.estimation.exploration import Exploration
-from verifai_jax.estimation.fitting import effective_size, fit_diagonal, fit_gaussian, fit_marginals
+from verifai_jax.estimation.fitting import (
+    WIDER,
+    effective_size,
+    fit_diagonal,
+    fit_gaussian,
+    fit_marginals,
+)
 from verifai_jax.estimation.mixture import Mixture
 
 ONE = 0.25
 """Distance below which two least distant failures of different searches count as one."""
 MOST_CENTRES = 16
 """Regions that get components of their own, at most."""
-WIDER = 1.3
-"""Factor on the standard deviations of a region's own component."""
 CHAINS_WORTH = 1.5
 """Independent failures that the states of one chain are worth."""
 FAR_WIDER = 3.0

@@ -18,7 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of, squared_distances
+from verifai_jax.estimation.normal_space import (
+    LimitState,
+    Linearized,
+    scores_of,
+    squared_distances,
+)
 from verifai_jax.estimation.towards_origin import BEYOND, come_in
 
 WIDEST = 2.5
@@ -59,7 +64,6 @@ class _Descents:
     z: Float[np.ndarray, "n d"]
     score: Float[np.ndarray, " n"]
     feet: Float[np.ndarray, "n d"]
-    given_up: Bool[np.ndarray, " n"]
 
 
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
@@ -79,17 +83,15 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     points = [come_in(limit_state, z[hits])]
     feet = points.copy()
     if limit_state.gradient is not None:
-        _, rho, gradient = limit_state.linearize(points[0])
-        feet = [_feet(points[0], rho, gradient)]
+        feet = [_feet(points[0], limit_state.linearize(points[0]))]
     count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
         now, others = others[:count], others[count:]
         if len(now):
-            descents = _Descents(z[now], score[now], z[now], np.zeros(len(now), bool))
+            descents = _Descents(z[now], score[now], z[now])
         else:
             start = draw_starts(limit_state, rng, count)
-            nothing = np.zeros(len(start), bool)
-            descents = _Descents(start, scores_of(limit_state, start), start, nothing)
+            descents = _Descents(start, scores_of(limit_state, start), start)
         if not len(descents.z):
             break
         _descend(limit_state, rng, descents, np.concatenate(feet))
@@ -141,15 +143,15 @@ def _descend(
     With gradients a descent ends at once where many before it have come to the same plane, `known`
     by their feet.
     """
-    steps = STEPS
+    steps, given_up = STEPS, np.zeros(len(descents.z), bool)
     if limit_state.gradient is not None:
         # Points without a usable gradient go on without.
-        _descend_by_gradient(limit_state, descents, known)
+        given_up = _descend_by_gradient(limit_state, descents, known)
         steps = FURTHER_STEPS
     z, score = descents.z, descents.score
     length, last = np.ones(len(z)), np.zeros_like(z)
     for _ in range(steps):
-        rows = np.flatnonzero((score > -np.inf) & ~descents.given_up)
+        rows = np.flatnonzero((score > -np.inf) & ~given_up)
         if not len(rows):
             break
         # A step that was good is taken again, with some noise.
@@ -167,17 +169,20 @@ def _descend(
 
 def _descend_by_gradient(
     limit_state: LimitState, descents: _Descents, known: Float[np.ndarray, "m d"]
-) -> None:
-    """Take Newton's steps to the limit state, halved where they do not lower the robustness."""
+) -> Bool[np.ndarray, " n"]:
+    """Take Newton's steps to the limit state, halved where they do not lower the robustness.
+
+    **Returns:** which descents are given up, because many have come to the same plane.
+    """
     z = descents.z
-    score, rho, gradient = limit_state.linearize(z)
-    gaps = squared_distances(_feet(z, rho, gradient), known)
-    repeats = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
-    descents.given_up = repeats
+    # Its arrays are kept up to date as steps are taken.
+    score, rho, gradient = linearized = limit_state.linearize(z)
+    gaps = squared_distances(_feet(z, linearized), known)
+    given_up = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
     longest = np.full(len(z), LONGEST)
     for _ in range(NEWTON_STEPS):
         square = np.sum(gradient * gradient, axis=1)
-        usable = np.isfinite(score) & (square > 0) & ~repeats
+        usable = np.isfinite(score) & (square > 0) & ~given_up
         rows = np.flatnonzero((score > -np.inf) & usable)
         if not len(rows):
             break
@@ -194,13 +199,13 @@ def _descend_by_gradient(
         rho[took], gradient[took] = new.rho[better], new.gradient[better]
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
     descents.score = score
-    descents.feet = _feet(z, rho, gradient)
+    descents.feet = _feet(z, linearized)
+    return given_up
 
 
-def _feet(
-    z: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"], gradient: Float[np.ndarray, "n d"]
-) -> Float[np.ndarray, "n d"]:
+def _feet(z: Float[np.ndarray, "n d"], linearized: Linearized) -> Float[np.ndarray, "n d"]:
     """Return the points of the linearised limit state nearest to the origin, or `z` without one."""
+    _, rho, gradient = linearized
     square = np.sum(gradient * gradient, axis=1)
     known = np.isfinite(rho) & (square > 0)
     inner = np.sum(gradient * z, axis=1) - np.where(known, rho, 0.0)

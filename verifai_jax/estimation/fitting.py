@@ -24,7 +24,7 @@ from verifai_jax.estimation.components import (
 )
 
 WIDER = 1.3
-"""Factor on the standard deviations of a Gaussian without correlations."""
+"""Factor on the standard deviations of Gaussians fitted to a single region."""
 SWEEPS = 12
 """Iterations of expectation maximisation, at most."""
 KERNELS = 400

@@ -9,7 +9,7 @@ about the origin at the distances of its ends, which follows a region that lies 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.estimation.normal_space import LimitState, scores_of
 
 PLACES = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
 """Places of a path that are simulated, the middle first."""
@@ -32,10 +32,7 @@ def connected(
         for place in PLACES:
             if not len(rows):
                 break
-            z = path(a[rows], b[rows], place)
-            fails = np.zeros(len(rows), bool)
-            fits = limit_state.accepts(z)
-            fails[fits] = limit_state(z[fits]).failing
+            fails = scores_of(limit_state, path(a[rows], b[rows], place)) == -np.inf
             rows = rows[fails]
         joined[rows] = True
     return joined

@@ -18,7 +18,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import Ended, LimitState
+from verifai_jax.estimation.normal_space import Ended, LimitState, scores_of
 
 ACCEPTED = 0.44
 """Share of moves that the scale of the moves aims at (Papaioannou et al., section 4.3)."""
@@ -177,11 +177,8 @@ def _walk(
     for step in range(1, steps):
         s = np.minimum(scale * spread, 1.0)
         moved = np.sqrt(1 - s * s) * z + s * rng.standard_normal(z.shape)
-        fits = limit_state.accepts(moved)
-        new = np.full(len(z), np.inf)
-        if fits.any():
-            new[fits] = limit_state(moved[fits]).score
-        take = fits & (new <= level)
+        new = scores_of(limit_state, moved)
+        take = new <= level
         z, score = np.where(take[:, None], moved, z), np.where(take, new, score)
         states.append(z)
         all_scores.append(score)
