@@ -77,3 +77,11 @@ def test_levels_lead_down_and_their_product_is_about_right():
     assert np.all(np.diff(run.levels) < 0)
     assert run.estimate == pytest.approx(1e-4, rel=0.6)
     assert all(0.2 < rate < 0.8 for rate in run.accepted)
+
+
+def test_two_chains_of_one_feature_are_enough_for_a_proposal():
+    z = np.array([[-3.5], [-3.6], [-3.7], [-4.0]])
+    chains = np.array([0, 0, 1, 1])
+    fitted = mixture.fit_mixture(z, np.full(4, 0.25), chains, np.random.default_rng(0))
+    assert fitted.shares.sum() == pytest.approx(1.0)
+    assert np.all(fitted.ratio(z) > 1)

@@ -41,3 +41,24 @@ def test_a_region_of_one_point_is_as_wide_as_the_prior():
     assert regions.count == 2
     assert regions.assign(np.array([[5.0, 1.0], [-3.0, 1.0]])).tolist() == [0, 1]
     assert regions.design_points.tolist() == [[4.0, 0.0], [-4.0, 0.0]]
+
+
+def test_a_region_of_which_one_point_is_known_keeps_its_failures():
+    """Beside two narrow ones, for whose sake distances are in standard deviations."""
+    rng = np.random.default_rng(0)
+    one, other = ([0, 1, 2], np.array([1.0, -1.0, 0.5])), ([7, 8, 9], np.array([0.2, 0.3, -1.0]))
+    alone = np.zeros(20)
+    alone[12] = 4.5
+    points = np.concatenate([drawn(rng, 40, *one), drawn(rng, 40, *other), alone[None]])
+    regions = Regions(points, np.repeat([0, 1, 2], [40, 40, 1]))
+    beyond = rng.standard_normal((500, 20))
+    beyond[:, 12] = 4.5 + rng.exponential(0.2, 500)
+    assert np.all(regions.assign(beyond) == 2)
+    assert np.mean(regions.assign(drawn(rng, 500, *one)) == 0) > 0.99
+
+
+def test_standard_deviations_of_two_points_are_not_too_small_in_the_mean():
+    rng = np.random.default_rng(1)
+    sizes = np.repeat(np.arange(400), 2)
+    regions = Regions(rng.standard_normal((800, 20)), sizes)
+    assert abs(np.log(regions.standard_deviations()).mean()) < 0.02

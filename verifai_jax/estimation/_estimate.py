@@ -119,6 +119,7 @@ def estimate(
             report=bar.update,
             together=1 if executor is None else AT_ONCE,
             gradient=simulated.gradient if _differentiates(choice.problem) else None,
+            uniform=simulated.uniform,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:

@@ -18,18 +18,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import (
-    LimitState,
-    Linearized,
-    scores_of,
-    squared_distances,
-)
+from verifai_jax.estimation.natural_coordinates import move_naturally, natural_slopes
+from verifai_jax.estimation.normal_space import LimitState, scores_of, squared_distances
 from verifai_jax.estimation.towards_origin import BEYOND, come_in
 
 WIDEST = 2.5
 """Standard deviation of the starts that lie farthest out; that of the others is 0.5 at least."""
-DRAWN = 0.2
-"""Share of the simulations that score starts, of which the most promising descend first."""
+WHERE_RARE = 0.5
+"""Share of the starts that lie no farther out than rare failures do, `FAR` from the middle: little
+of the space farther out leads to a small region among them."""
+FAR = 4.0
+"""Standard deviations from the middle of the prior at which failures are rare."""
+DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.25
+"""Starts beside the simulations; those that are most promising descend first."""
 HITS = 0.02
 """Starts that fail themselves and count as ends, at most, in parts of the simulations."""
 FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
@@ -42,6 +43,8 @@ SAME_FOOT, ENOUGH = 0.05, 8
 """Distance of feet below which planes are one, and descents to one after which no more go on."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
+STRETCH = 1.5
+"""Factor of a step after one that lowered the robustness and was too short."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,30 @@ class Ends:
 
 @dataclass
 class _Descents:
-    """Descents side by side: their points, scores, and ends as far as they are known."""
+    """Descents side by side: their points, scores, and slopes where there are gradients."""
 
     z: Float[np.ndarray, "n d"]
     score: Float[np.ndarray, " n"]
-    feet: Float[np.ndarray, "n d"]
+    rho: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, "n d"]
+
+    @property
+    def feet(self) -> Float[np.ndarray, "n d"]:
+        """The points of the linearised limit state nearest to the origin, or `z` without one."""
+        square = np.sum(self.gradient * self.gradient, axis=1)
+        known = np.isfinite(self.rho) & (square > 0)
+        inner = np.sum(self.gradient * self.z, axis=1) - np.where(known, self.rho, 0.0)
+        foot = (inner / np.where(known, square, 1.0))[:, None] * self.gradient
+        return np.where(known[:, None], foot, self.z)
+
+    def of(self, rows: Int[np.ndarray, " m"]) -> "_Descents":
+        """Return some of them."""
+        return _Descents(self.z[rows], self.score[rows], self.rho[rows], self.gradient[rows])
+
+    def replace(self, rows: Int[np.ndarray, " m"], others: "_Descents") -> None:
+        """Put others in the place of some of them."""
+        self.z[rows], self.score[rows] = others.z, others.score
+        self.rho[rows], self.gradient[rows] = others.rho, others.gradient
 
 
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
@@ -74,39 +96,45 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations
-    z = draw_starts(limit_state, rng, max(FEWEST_AT_ONCE, round(DRAWN * simulations)))
-    score = scores_of(limit_state, z)
-    hits = np.flatnonzero(score == -np.inf)[: max(8, round(HITS * simulations))]
-    others = np.flatnonzero(score > -np.inf)
-    others = others[np.argsort(-_worse_neighbours(z, score)[others], kind="stable")]
+    drawn = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
+    starts = _begin(
+        limit_state, draw_starts(limit_state, rng, max(FEWEST_AT_ONCE, round(drawn * simulations)))
+    )
+    hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
+    others = np.flatnonzero(starts.score > -np.inf)
+    worse = _worse_neighbours(starts.z, starts.score)
+    others = others[np.argsort(-worse[others], kind="stable")]
     # Far out, where they lie, several regions overlap.
-    points = [come_in(limit_state, z[hits])]
-    feet = points.copy()
-    if limit_state.gradient is not None:
-        feet = [_feet(points[0], limit_state.linearize(points[0]))]
+    failing = _begin(limit_state, come_in(limit_state, starts.z[hits]))
+    points, feet = [failing.z], [failing.feet]
     count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
         now, others = others[:count], others[count:]
         if len(now):
-            descents = _Descents(z[now], score[now], z[now])
+            descents = starts.of(now)
         else:
-            start = draw_starts(limit_state, rng, count)
-            descents = _Descents(start, scores_of(limit_state, start), start)
+            descents = _begin(limit_state, draw_starts(limit_state, rng, count))
         if not len(descents.z):
             break
         _descend(limit_state, rng, descents, np.concatenate(feet))
-        fails = descents.score == -np.inf
+        ends = descents.of(np.flatnonzero(descents.score == -np.inf))
         if limit_state.gradient is None:
-            descents.z[fails] = come_in(limit_state, descents.z[fails])
-            descents.feet = descents.z
-        points.append(descents.z[fails])
-        feet.append(descents.feet[fails])
+            ends.z = come_in(limit_state, ends.z)
+        points.append(ends.z)
+        feet.append(ends.feet)
         # As many more as what is left allows, if they take as long as those so far.
         begun += len(descents.z)
         left = begin + simulations - limit_state.simulations
         count = left * begun // max(limit_state.simulations - before, 1)
         count = min(max(count, FEWEST_AT_ONCE), MOST_AT_ONCE)
     return Ends(np.concatenate(points), np.concatenate(feet))
+
+
+def _begin(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> _Descents:
+    """Simulate points that the constraint accepts, with their slopes where there are gradients."""
+    if limit_state.gradient is not None:
+        return _Descents(z, *limit_state.linearize(z))
+    return _Descents(z, limit_state(z).score, np.full(len(z), np.nan), np.zeros_like(z))
 
 
 def draw_starts(
@@ -116,6 +144,8 @@ def draw_starts(
     accepted = np.zeros((0, limit_state.dim))
     for _ in range(20):
         spread = rng.uniform(0.5, WIDEST, (count, 1))
+        near = np.maximum(1.0, rng.uniform(0.5, 1, (count, 1)) * FAR / np.sqrt(limit_state.dim))
+        spread = np.where(rng.random((count, 1)) < WHERE_RARE, near, spread)
         z = spread * rng.standard_normal((count, limit_state.dim))
         accepted = np.concatenate([accepted, z[limit_state.accepts(z)]])[:count]
         if len(accepted) == count:
@@ -158,11 +188,11 @@ def _descend(
         step = length[rows, None] * rng.standard_normal((len(rows), limit_state.dim))
         repeats = np.any(last[rows] != 0, axis=1)
         step[repeats] = 1.3 * last[rows[repeats]] + 0.3 * step[repeats]
-        moved = z[rows] + step
+        moved = move_naturally(z[rows], step, limit_state.uniform)
         new = scores_of(limit_state, moved)
         better = new < score[rows]
         took = rows[better]
-        z[took], score[took], descents.feet[took] = moved[better], new[better], moved[better]
+        z[took], score[took], descents.gradient[took] = moved[better], new[better], 0.0
         last[rows] = np.where(better[:, None], step, 0.0)
         length[rows] *= np.where(better, 1.2, np.where(repeats, 1.0, 0.85))
 
@@ -174,40 +204,28 @@ def _descend_by_gradient(
 
     **Returns:** which descents are given up, because many have come to the same plane.
     """
-    z = descents.z
-    # Its arrays are kept up to date as steps are taken.
-    score, rho, gradient = linearized = limit_state.linearize(z)
-    gaps = squared_distances(_feet(z, linearized), known)
+    gaps = squared_distances(descents.feet, known)
     given_up = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
-    longest = np.full(len(z), LONGEST)
+    longest, stretch = np.full(len(descents.z), LONGEST), np.ones(len(descents.z))
     for _ in range(NEWTON_STEPS):
-        square = np.sum(gradient * gradient, axis=1)
-        usable = np.isfinite(score) & (square > 0) & ~given_up
-        rows = np.flatnonzero((score > -np.inf) & usable)
+        slopes = natural_slopes(descents.z, descents.gradient, limit_state.uniform)
+        square = np.sum(slopes * slopes, axis=1)
+        usable = np.isfinite(descents.score) & (square > 0) & np.isfinite(square) & ~given_up
+        rows = np.flatnonzero((descents.score > -np.inf) & usable)
         if not len(rows):
             break
-        step = -(1 + BEYOND) * (score[rows] / square[rows])[:, None] * gradient[rows]
-        size = np.linalg.norm(step, axis=1)
+        norm = np.sqrt(square[rows])
+        size = (1 + BEYOND) * stretch[rows] * descents.score[rows] / norm
         # A robustness of zero is no failure yet: a small step goes beyond it.
-        direction = -gradient[rows] / np.sqrt(square[rows])[:, None]
-        moved = z[rows] + direction * np.clip(size, 1e-3, longest[rows])[:, None]
+        length = np.clip(size, 1e-3, longest[rows])
+        steps = -(length / norm)[:, None] * slopes[rows]
+        here = descents.z[rows]
+        moved = move_naturally(here, steps, limit_state.uniform)
         fits = limit_state.accepts(moved)
-        new = limit_state.linearize(np.where(fits[:, None], moved, z[rows]))
-        better = fits & (new.score < score[rows])
-        took = rows[better]
-        z[took], score[took] = moved[better], new.score[better]
-        rho[took], gradient[took] = new.rho[better], new.gradient[better]
+        new = _begin(limit_state, np.where(fits[:, None], moved, here))
+        better = fits & (new.score < descents.score[rows])
+        descents.replace(rows[better], new.of(np.flatnonzero(better)))
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
-    descents.score = score
-    descents.feet = _feet(z, linearized)
+        # Where the slope vanishes towards the limit state, steps that are longer get there.
+        stretch[rows] = np.where(better, STRETCH * stretch[rows], 1.0)
     return given_up
-
-
-def _feet(z: Float[np.ndarray, "n d"], linearized: Linearized) -> Float[np.ndarray, "n d"]:
-    """Return the points of the linearised limit state nearest to the origin, or `z` without one."""
-    _, rho, gradient = linearized
-    square = np.sum(gradient * gradient, axis=1)
-    known = np.isfinite(rho) & (square > 0)
-    inner = np.sum(gradient * z, axis=1) - np.where(known, rho, 0.0)
-    foot = (inner / np.where(known, square, 1.0))[:, None] * gradient
-    return np.where(known[:, None], foot, z)

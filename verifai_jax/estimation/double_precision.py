@@ -28,6 +28,8 @@ TEMPERATURE = 1e-3
 """Temperature of the smooth robustness that is differentiated."""
 BEYOND = (2.0**-27, 2.0**-32)
 """Two probabilities at which a distribution with an outermost value has the same value."""
+LINEAR = (0.05, 0.1, 0.3)
+"""Probabilities whose values lie in a line for a uniform feature, and for no symmetric other."""
 
 
 FLATTENED: Slot[str, Problem] = Slot("flattened features")
@@ -69,7 +71,8 @@ class DoublePrecisionEvaluator:
     """An evaluator of points in double precision; see the module's docstring.
 
     `clamped` is True at coordinates `[d]` whose domain ends in one outermost value, which hides
-    everything beyond it from a simulation.
+    everything beyond it from a simulation. `uniform` is True at those of which the features are
+    linear functions.
 
     **Arguments:**
 
@@ -106,6 +109,7 @@ class DoublePrecisionEvaluator:
         self._pullback = jax.jit(jax.vmap(lambda u, by_numbers: _pulled(space, u, by_numbers)))
         self._batch = batch
         self.clamped = self._clamped(space)
+        self.uniform = self._uniform(space)
 
     def __call__(
         self, u: Float[np.ndarray, "n d"]
@@ -161,13 +165,24 @@ class DoublePrecisionEvaluator:
     def _clamped(self, space: FeatureSpace) -> Bool[np.ndarray, " d"]:
         if not self._held:
             return np.ones(space.dim, bool)
-        points = np.full((2, space.dim, space.dim), 0.5)
-        for side, value in enumerate(BEYOND):
-            points[side, np.arange(space.dim), np.arange(space.dim)] = value
+        low, high = (self._moved(space, value) for value in BEYOND)
+        return np.all(low == high, axis=1) & (np.array(space.levels) == 0)
+
+    def _uniform(self, space: FeatureSpace) -> Bool[np.ndarray, " d"]:
+        if not self._held:
+            return np.zeros(space.dim, bool)
+        begin, between, end = (self._moved(space, value) for value in LINEAR)
+        share = (LINEAR[1] - LINEAR[0]) / (LINEAR[2] - LINEAR[0])
+        step = end - begin
+        straight = np.abs(between - begin - share * step) <= 1e-6 * np.abs(step)
+        return np.all(straight, axis=1) & np.any(step != 0, axis=1) & (np.array(space.levels) == 0)
+
+    def _moved(self, space: FeatureSpace, value: float) -> Float[np.ndarray, "d n"]:
+        """Return the plain numbers of points in the middle but for one coordinate each."""
+        points = np.full((space.dim, space.dim), 0.5)
+        np.fill_diagonal(points, value)
         with in_precision("float64"):
-            ends = np.stack([np.asarray(self._numbers(side)) for side in points])
-        same = np.all(ends[0] == ends[1], axis=1)
-        return same & (np.array(space.levels) == 0)
+            return np.asarray(self._numbers(points))
 
 
 def _flat(features: Any) -> Array:

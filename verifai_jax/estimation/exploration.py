@@ -34,7 +34,7 @@ from verifai_jax.estimation.towards_origin import (
 )
 from verifai_jax.estimation.walks import walk_among_failures
 
-DESCENTS = 0.5
+DESCENTS = 0.6
 """Share of the simulations for descents."""
 TELLING_APART = 0.1
 """Share of the simulations for points between ends, which tell regions apart."""

@@ -52,6 +52,9 @@ EXPLORATIONS = 2
 """Independent searches for failures beside splitting."""
 SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.12
 """Share of the budget for each of them."""
+PRECISE, SHARE_BEYOND = 20_000, 0.2
+"""Simulations that make an estimate precise, and the share of those beyond for each search with
+gradients: a region that none has found is the greater error then."""
 FEWEST_OF_EXPLORATION = 600
 """Simulations of a search, below which it says too little to be worth them."""
 SHARE_OF_PATHS = 0.03
@@ -228,8 +231,11 @@ def _without_samples(
 
 def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Exploration]:
     """Search for failures independently; return the searches that found some."""
-    share = SHARE_OF_EXPLORATION if limit_state.gradient is None else SHARE_WITH_GRADIENTS
-    simulations = round(share * limit_state.budget)
+    budget = limit_state.budget
+    simulations = round(SHARE_OF_EXPLORATION * budget)
+    if limit_state.gradient is not None:
+        beyond = SHARE_BEYOND * max(0, budget - PRECISE)
+        simulations = round(SHARE_WITH_GRADIENTS * min(budget, PRECISE) + beyond)
     if simulations < FEWEST_OF_EXPLORATION:
         return []
     found = [explore(limit_state, rng, simulations) for _ in range(EXPLORATIONS)]

@@ -189,7 +189,8 @@ def fit_components(
             break
         shares, gaussians, memberships = fit_gaussian_mixture(z, weight, modes, rng, worth)
         for share, gaussian, member in zip(shares, gaussians, memberships.T, strict=True):
-            if share * size < 3:
+            # Points too few for any component make one all the same, for there has to be one.
+            if share * size < 3 and components:
                 continue
             components.append(gaussian)
             components.append(Gaussian(gaussian.mean, gaussian.axes, 1.3 * gaussian.stds))

@@ -84,6 +84,7 @@ class LimitState:
     - `together`: batches that are simulated at a time, where there are several workers.
     - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
       out. A simulation with its gradient counts 2.
+    - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
     """
 
     def __init__(
@@ -97,11 +98,13 @@ class LimitState:
         report: Callable[[int, int, float], None] | None = None,
         together: int = 1,
         gradient: Differentiate | None = None,
+        uniform: Bool[np.ndarray, " dim"] | None = None,
     ) -> None:
         self.step = batch * together
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
         self.gradient = gradient
+        self.uniform = np.zeros(dim, bool) if uniform is None else uniform
         self.simulations = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""

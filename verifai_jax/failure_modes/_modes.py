@@ -52,8 +52,9 @@ from verifai_jax.mtl.formula import Predicate
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
-SHARE_OF_ESTIMATE = 0.75
-"""Share of the budget for the probability; the rest divides the failures."""
+DIVIDING, MOST_DIVIDING = 0.25, 6500
+"""Share of the budget that divides the failures, and most of these simulations; the rest is for the
+probability."""
 SHOWN = 200
 """Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
@@ -105,7 +106,8 @@ def modes(
     check_fraction("least_share", least_share)
     in_precision(precision)
     problem.space.check_where()
-    chains = chains_for(round(SHARE_OF_ESTIMATE * budget), SHARE_OF_LEVEL)
+    estimated = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
+    chains = chains_for(estimated, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     chosen.problem.check()
@@ -116,12 +118,13 @@ def modes(
         limit_state = LimitState(
             simulated,
             problem.space.dim,
-            round(SHARE_OF_ESTIMATE * budget),
+            estimated,
             batch,
             constraint=_constraint(problem.space),
             deadline=None if max_seconds is None else started + max_seconds,
             report=bar.update,
             gradient=simulated.gradient if _has_slopes(chosen.problem) else None,
+            uniform=simulated.uniform,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:

@@ -13,15 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import digamma
 
 from verifai_jax.estimation.normal_space import squared_distances
 
 NEIGHBOURS = 5
 """Regions whose nearest point a path is tried to, and further nearest points, at most."""
-PRIOR_POINTS = 4
-"""Points that the prior's standard deviations count as, beside those of a region."""
-LEAST_SCALE = 1e-4
-"""Least standard deviation of a region."""
+PRIOR_FREEDOM = 4
+"""Degrees of freedom that the prior's standard deviations count as, beside those of a region."""
+LEAST_SCALE, MOST_SCALE = 1e-4, 3.0
+"""Least and greatest standard deviation of a region."""
 
 
 @dataclass
@@ -66,15 +67,25 @@ class Regions:
         self.points = np.concatenate([self.points, points])
         self.region = np.append(self.region, np.broadcast_to(region, len(points)))
 
-    def _scales(self) -> Float[np.ndarray, "k d"]:
-        """Return the standard deviations that distances from each region are measured in."""
-        scales = np.ones((self.count, self.points.shape[1]))
-        own = scales.copy()
+    def standard_deviations(self) -> Float[np.ndarray, "k d"]:
+        """Return those of each region, the nearer to the prior's the fewer points it has."""
+        stds = np.ones((self.count, self.points.shape[1]))
         for k in range(self.count):
             points = self.points[self.region == k]
-            stds = np.clip(points.std(axis=0), LEAST_SCALE, 1.0)
-            own[k] = stds ** (len(points) / (len(points) + PRIOR_POINTS))
-        return own if self._mistaken(own) < self._mistaken(scales) else scales
+            freedom = len(points) - 1
+            if not freedom:
+                continue
+            # The logarithm of a standard deviation of few points is too low in the mean.
+            bias = (digamma(freedom / 2) - np.log(freedom / 2)) / 2
+            own = np.clip(points.std(axis=0, ddof=1) * np.exp(-bias), LEAST_SCALE, MOST_SCALE)
+            stds[k] = own ** (freedom / (freedom + PRIOR_FREEDOM))
+        return stds
+
+    def _scales(self) -> Float[np.ndarray, "k d"]:
+        """Return the standard deviations that distances from each region are measured in."""
+        own = self.standard_deviations()
+        ones = np.ones_like(own)
+        return own if self._mistaken(own) < self._mistaken(ones) else ones
 
     def _mistaken(self, scales: Float[np.ndarray, "k d"]) -> int:
         """Count the points nearer to another region than to the other points of their own."""

@@ -1,0 +1,56 @@
+"""Steps in the coordinates in which the features themselves move.
+
+    slopes = natural_slopes(z, gradient, uniform)   # by natural coordinates
+    z = move_naturally(z, steps, uniform)           # steps in natural coordinates
+
+A simulation depends on its features, and smoothly so. A normal feature is linear in normal space, a
+uniform one in the unit cube: there a line is a line, and a step of Newton's lands where the
+robustness promises. In normal space the same robustness bends, most of all near the ends of the
+interval, where a uniform feature hardly moves. So a natural coordinate is that of normal space, or,
+for a uniform feature, its place in the cube in units of its standard deviation.
+
+Source: Nocedal and Wright, Numerical Optimization (2006), section 19.2, for steps that go no more
+than a fraction of the way to a boundary.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import ndtr, ndtri
+
+WIDTH = np.sqrt(12.0)
+"""Width of the unit interval in standard deviations of the uniform distribution."""
+NEAREST_FACE = 0.01
+"""Part of the way to an end of the interval that a step leaves, at least."""
+_LEAST = 1e-300
+
+
+def natural_slopes(
+    z: Float[np.ndarray, "n d"], gradient: Float[np.ndarray, "n d"], uniform: Bool[np.ndarray, " d"]
+) -> Float[np.ndarray, "n d"]:
+    """Return derivatives by natural coordinates from those by coordinates of normal space.
+
+    **Arguments:**
+
+    - `z`: the points.
+    - `gradient`: at these points.
+    - `uniform`: True at coordinates of a uniform feature.
+    """
+    density = np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
+    return np.where(uniform, gradient / np.maximum(WIDTH * density, _LEAST), gradient)
+
+
+def move_naturally(
+    z: Float[np.ndarray, "n d"], steps: Float[np.ndarray, "n d"], uniform: Bool[np.ndarray, " d"]
+) -> Float[np.ndarray, "n d"]:
+    """Move points of normal space by steps in natural coordinates.
+
+    A uniform feature stays within its interval: a step leaves some of the way to the end.
+    """
+    if not uniform.any():
+        return z + steps
+    # Measured from the nearer end, where the distance is known to all digits.
+    side = np.where(z > 0, -1.0, 1.0)
+    begin = np.maximum(ndtr(-np.abs(z)), _LEAST)
+    end = begin + side * steps / WIDTH
+    end = np.clip(end, NEAREST_FACE * begin, 1 - NEAREST_FACE * (1 - begin))
+    return np.where(uniform, side * ndtri(end), z + steps)
