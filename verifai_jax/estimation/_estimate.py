@@ -38,7 +38,7 @@ from verifai_jax.falsification.validation import check_options
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
-GRADIENTS_FROM = 8
+GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
 
 
