@@ -5,14 +5,14 @@ import pytest
 from closed_forms import closed_form, normal
 from scipy.stats import norm
 
-from verifai_jax.estimation.anchors import anchors_of, join_explorations
+from verifai_jax.estimation.anchors import WeightedFailures, anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.descents import descend_from_many
 from verifai_jax.estimation.exploration import approach_origin, explore
 from verifai_jax.estimation.initial_proposal import compare_explorations
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
-from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.estimation.normal_space import LimitState, farthest_first
 from verifai_jax.estimation.paths import connected
 
 
@@ -207,7 +207,7 @@ def test_anchors_follow_the_failures_of_their_region():
     known, rng = limit_state(two_sides, 2, 20_000), np.random.default_rng(0)
     anchors = anchors_of([explore(known, rng, 2000)], 0.1)
     z = np.array([6.0, 1.0]) + 0.01 * rng.standard_normal((500, 2))
-    fitted = anchors.fit(z, np.full(500, 1e-300))
+    fitted = anchors.fit(WeightedFailures(z, np.full(500, 1e-300)))
     fits = [c for c in fitted.components if isinstance(c, Gaussian) and np.all(c.stds < 0.3)]
     assert any(np.linalg.norm(c.mean - [6.0, 1.0]) < 0.5 for c in fits)
     gaussians = [c for c in anchors.fit().components if isinstance(c, Gaussian)]
@@ -232,3 +232,16 @@ def test_intervals_cover_where_splitting_is_led_away(robustness, truth):
         assert answer.probability == pytest.approx(truth, rel=0.1)
     # Of 10 intervals with a coverage of 0.95, fewer than 8 hold with probability 0.012.
     assert covered >= 8
+
+
+def test_points_are_chosen_the_farthest_first():
+    points = np.random.default_rng(0).standard_normal((40, 3))
+    gaps = np.linalg.norm(points[:, None] - points, axis=2)
+    rows = farthest_first(7, lambda row: gaps[row], 10)
+    assert rows[0] == 7
+    for count in range(1, 10):
+        left = gaps[:, rows[:count]].min(axis=1)
+        assert left[rows[count]] == left.max()
+    near = farthest_first(7, lambda row: gaps[row], 40, least=2.0)
+    assert gaps[:, near].min(axis=1).max() <= 2.0
+    assert gaps[np.ix_(near, near)][np.triu_indices(len(near), 1)].min() > 2.0

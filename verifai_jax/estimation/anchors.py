@@ -2,25 +2,26 @@
 
 anchors = anchors_of(explorations, defensive=0.1)
 anchors.fit()                                   # a mixture, of about equal parts for all regions
-anchors.fit(failures, weights)                  # the same, fitted to samples as well
+anchors.fit(WeightedFailures(failures, weights))    # the same, fitted to samples as well
 anchors.owners(failures)                        # the region [n] of each
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.components import Component, Gaussian, Marginals, Prior, log_ratios
 from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.fitting import (
     WIDER,
-    effective_size,
     fit_diagonal,
     fit_gaussian,
     fit_marginals,
+    weigh_together,
 )
 from verifai_jax.estimation.mixture import Mixture
 
@@ -36,6 +37,17 @@ KINDS = 5
 """Components of a region."""
 LEAST_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
+
+
+class WeightedFailures(NamedTuple):
+    """Failures `z` `[n, d]`, and the part `[n]` of their distribution that each stands for."""
+
+    z: Float[np.ndarray, "n d"]
+    weight: Float[np.ndarray, " n"]
+
+    def of(self, rows: Bool[np.ndarray, " n"]) -> "WeightedFailures":
+        """Return some of them."""
+        return WeightedFailures(self.z[rows], self.weight[rows])
 
 
 @dataclass(frozen=True)
@@ -54,28 +66,18 @@ class Anchors:
     regions: tuple[Int[np.ndarray, " _"], ...]
     defensive: float
 
-    def fit(
-        self,
-        z: Float[np.ndarray, "n d"] | None = None,
-        weight: Float[np.ndarray, " n"] | None = None,
-    ) -> Mixture:
-        """Fit the components to the states of chains, and to weighted failures where given.
-
-        **Arguments:**
-
-        - `z`: failures `[n, d]`.
-        - `weight`: parts `[n]` of the failures' distribution that they stand for.
+    def fit(self, samples: WeightedFailures | None = None) -> Mixture:
+        """Fit the components to the states of chains, and to samples where there are any.
 
         **Returns:** the mixture; for every fit it has the same kinds of components in the same
         order, `KINDS` of each region.
         """
         d, of_chain = self.chains.nearest.shape[1], weigh_chains(self.chains)
         fitted = list(self._by_chains)
-        if z is not None and weight is not None and len(z):
-            owner = self.owners(z)
+        if samples is not None and len(samples.z):
+            owner = self.owners(samples.z)
             for number in np.unique(owner).tolist():
-                own = owner == number
-                fitted[number] = self._around(number, z[own], weight[own])
+                fitted[number] = self._around(number, samples.of(owner == number))
         components: list[Component] = []
         shares: list[float] = []
         for chains, around in zip(self.regions, fitted, strict=True):
@@ -98,12 +100,9 @@ class Anchors:
         return tuple(self._around(number) for number in range(len(self.regions)))
 
     def _around(
-        self,
-        number: int,
-        z: Float[np.ndarray, "n d"] | None = None,
-        weight: Float[np.ndarray, " n"] | None = None,
+        self, number: int, samples: WeightedFailures | None = None
     ) -> tuple[Gaussian, Gaussian, Marginals]:
-        """Fit components to a region's chains, and to weighted failures where given.
+        """Fit components to a region's chains, and to samples where there are any.
 
         In many dimensions a few chains know no correlations, but how each coordinate is spread.
         """
@@ -111,9 +110,10 @@ class Anchors:
         points = self.chains.points[np.isin(self.chains.chain_ids, chains)]
         worth = CHAINS_WORTH * len(chains)
         part, each = np.full(len(points), 1 / len(points)), min(1.0, worth / len(points))
-        if z is not None and weight is not None:
-            points, part = _together(points, worth, z, weight)
-            each = 1.0
+        if samples is not None:
+            # Of the greatest, since these densities may be tiny.
+            part = weigh_together(len(points), worth, samples.weight / samples.weight.max())
+            points, part, each = np.concatenate([points, samples.z]), part / part.sum(), 1.0
         gaussian = fit_gaussian(points, part)
         return (
             Gaussian(gaussian.mean, gaussian.axes, WIDER * gaussian.stds),
@@ -126,22 +126,6 @@ def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors
     """Return the anchors of explorations: their regions, the least distant ones if many."""
     joined = join_explorations(explorations)
     return Anchors(joined, tuple(_regions(joined)[:MOST_CENTRES]), defensive)
-
-
-def _together(
-    states: Float[np.ndarray, "m d"],
-    worth: float,
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, " k"]]:
-    """Return states of chains and weighted failures together, each for what they are worth."""
-    weight = weight / weight.max()
-    fresh = effective_size(weight)
-    worth *= worth / (worth + fresh)
-    part = np.concatenate(
-        [np.full(len(states), worth / len(states)), fresh * weight / weight.sum()]
-    )
-    return np.concatenate([states, z]), part / part.sum()
 
 
 def join_explorations(explorations: Sequence[Exploration]) -> Exploration:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.estimation.descents import Ends, descend_from_many
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
 from verifai_jax.estimation.towards_origin import (
     HALVINGS,
     NEAREST_STEPS,
@@ -180,12 +180,12 @@ def _joined(
 def _spread_out(ends: Ends, most: int) -> Int[np.ndarray, " k"]:
     """Return ends far from one another, the least distant first; no two that are one."""
     everything = np.arange(len(ends.points))
-    chosen = [int(np.linalg.norm(ends.points, axis=1).argmin())]
-    gap = _gaps(ends, everything, np.array(chosen))[:, 0]
-    while len(chosen) < min(most, len(everything)) and gap.max() > SAME:
-        chosen.append(int(gap.argmax()))
-        gap = np.minimum(gap, _gaps(ends, everything, np.array(chosen[-1:]))[:, 0])
-    return np.array(chosen)
+    nearest = int(np.linalg.norm(ends.points, axis=1).argmin())
+
+    def gaps_from(row: int) -> Float[np.ndarray, " n"]:
+        return _gaps(ends, everything, np.array([row]))[:, 0]
+
+    return farthest_first(nearest, gaps_from, most, SAME)
 
 
 def _squares(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:

@@ -45,6 +45,25 @@ def effective_size(weight: Float[np.ndarray, " n"]) -> float:
     return float(parts.sum() ** 2 / np.sum(parts * parts))
 
 
+def weigh_together(
+    states: int, worth: float, weight: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " k"]:
+    """Weigh states of chains and weighted samples of the same failures, each for its worth.
+
+    **Arguments:**
+
+    - `states`: number of states, which are alike and so worth less than they count.
+    - `worth`: independent points that all of them are worth.
+    - `weight`: of the samples.
+
+    **Returns:** weights of the states, then of the samples; the more the samples are worth, the
+    less the states count.
+    """
+    fresh = effective_size(weight)
+    worth *= worth / (worth + fresh)
+    return np.concatenate([np.full(states, worth / states), fresh * weight / weight.sum()])
+
+
 def fit_gaussian(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Gaussian:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.anchors import CHAINS_WORTH, Anchors
+from verifai_jax.estimation.anchors import CHAINS_WORTH, Anchors, WeightedFailures
 from verifai_jax.estimation.components import log_ratios
-from verifai_jax.estimation.fitting import effective_size
+from verifai_jax.estimation.fitting import effective_size, weigh_together
 from verifai_jax.estimation.intervals import (
     WeightedMean,
     skewed_interval,
@@ -174,14 +174,10 @@ def fit_proposal(
         new = np.concatenate([z[f] for z, f in zip(zs, failing, strict=True)])
         counts = np.array([len(z) for z in zs], float)
         density = np.stack([p.ratio(new) for p in proposals], axis=1) @ (counts / counts.sum())
-        # Failures of the splitting and of the stages stand for the same distribution, each for as
-        # much as they are worth; states of a chain are alike and worth less than they count.
-        worth = np.array([CHAINS_WORTH * len(np.unique(chain_ids)), effective_size(1 / density)])
-        worth[0] *= worth[0] / (worth[0] + worth[1])
+        # Failures of the splitting and of the stages stand for the same distribution.
         inverse = 1 / density
-        weight = np.concatenate(
-            [np.full(len(points), worth[0] / len(points)), worth[1] * inverse / inverse.sum()]
-        )
+        worth = CHAINS_WORTH * len(np.unique(chain_ids))
+        weight = weigh_together(len(points), worth, inverse)
         all_ids = np.append(chain_ids, chain_ids.max() + 1 + np.arange(len(new)))
         # The shares are those that were best for failures to which the last fit was not fitted.
         before_it = mixture
@@ -189,7 +185,7 @@ def fit_proposal(
         proposal = mixture
         if anchors is not None and anchored is not None:
             shares = _share_out(before_it, anchored, anchors, z[scores.failing], w, defensive)
-            anchored = anchors.fit(new, inverse)
+            anchored = anchors.fit(WeightedFailures(new, inverse))
             best = anchored.with_shares(shares)
             proposal = mixture.join(best, float(shares.sum())).join(anchored, ANCHORED)
         proposal = proposal.join(proposals[-1], KEPT)

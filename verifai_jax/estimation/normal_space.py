@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 Evaluate: TypeAlias = Callable[
     [Float[np.ndarray, "n d"]],
@@ -248,3 +248,22 @@ def squared_distances(
 ) -> Float[np.ndarray, "n m"]:
     """Return the squared distance of each point `z` from each of the others."""
     return np.sum(points**2, axis=1)[None] - 2 * z @ points.T + np.sum(z * z, axis=1)[:, None]
+
+
+def farthest_first(
+    first: int, gaps_from: Callable[[int], Float[np.ndarray, " n"]], most: int, least: float = -1.0
+) -> Int[np.ndarray, " chosen"]:
+    """Choose points that are far from one another.
+
+    **Arguments:**
+
+    - `first`: the point that is chosen first.
+    - `gaps_from`: the distances `[n]` of all points from one.
+    - `most`: number of points, at most.
+    - `least`: distance from the chosen ones at which no other point is chosen.
+    """
+    chosen, gaps = [first], gaps_from(first)
+    while len(chosen) < min(most, len(gaps)) and gaps.max() > least:
+        chosen.append(int(gaps.argmax()))
+        gaps = np.minimum(gaps, gaps_from(chosen[-1]))
+    return np.array(chosen)

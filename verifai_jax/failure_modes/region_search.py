@@ -15,7 +15,7 @@ Structural Safety 20 (1998).
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
 from verifai_jax.estimation.paths import connected
 from verifai_jax.estimation.towards_origin import approach_origin, come_in_by_parts
 from verifai_jax.failure_modes.regions import Regions
@@ -94,12 +94,9 @@ def _spread(points: Float[np.ndarray, "m d"], most: int) -> Float[np.ndarray, "_
     """Choose points that are far from one another, beginning with the least distant one."""
     if len(points) <= most:
         return points
-    chosen = [int(np.sum(points**2, axis=1).argmin())]
-    gaps = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < most:
-        chosen.append(int(gaps.argmax()))
-        gaps = np.minimum(gaps, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return points[chosen]
+    nearest = int(np.sum(points**2, axis=1).argmin())
+    rows = farthest_first(nearest, lambda row: np.linalg.norm(points - points[row], axis=1), most)
+    return points[rows]
 
 
 def _look(
