@@ -4,12 +4,13 @@ python benchmarks/modes.py                          # everything, 20 seeds: one 
 python benchmarks/modes.py --seeds 3 --dims 2 10 --shapes half-spaces
 
 Half-spaces in directions at right angles, balls in normal space, balls inside a box of uniform
-features, which no corner and no tail leads to, and cells: failures that need three of the features
-near certain values, other ones in every mode, and any values of the rest. The robustness falls to
-them at different speeds, so that a population that follows it gathers in few of them. Masses and
-distances are known. A line says in how many runs every mode of at least 0.5 % of the probability
-was found, how many 95 % intervals hold the true mass, and the greatest ratio of the distance of a
-likeliest point to the true one, which uniform features do not have.
+features, which no corner and no tail leads to, cells: failures that need three of the features
+near certain values, other ones in every mode, and any values of the rest; and slabs, which are
+narrow in two directions oblique to the features. The robustness falls to them at different speeds,
+so that a population that follows it gathers in few of them. Masses and distances are known. A line
+says in how many runs every mode of at least 0.5 % of the probability was found, how many 95 %
+intervals hold the true mass, and the greatest ratio of the distance of a likeliest point to the
+true one, which uniform features do not have.
 """
 
 import argparse
@@ -131,14 +132,43 @@ def cells(dim: int, count: int) -> Planted:
     return Planted(problem, masses, None, lambda x: np.max(np.abs(x - centres) - reach, axis=1))
 
 
+def slabs(dim: int, count: int) -> Planted:
+    """Normal features within an interval in two directions oblique to them, other ones each."""
+    random = np.random.default_rng(5000 * dim + count)
+    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T[: 2 * count]
+    axes = axes.reshape(count, 2, dim)
+    centres = random.uniform(2.2, 3.0, (count, 2)) * random.choice([-1, 1], (count, 2))
+    reach = random.uniform(0.15, 0.4, (count, 2))
+    masses = np.prod(norm.cdf(centres + reach) - norm.cdf(centres - reach), axis=1)
+    directions, middles, widths = (jnp.asarray(a, jnp.float32) for a in (axes, centres, reach))
+    factors = jnp.asarray(np.exp(random.uniform(-0.7, 0.7, count)), jnp.float32)
+    problem = posed(
+        f"slabs_{dim}_{count}",
+        vj.Normal(0.0, 1.0),
+        dim,
+        lambda x: jnp.min(jnp.max(jnp.abs(directions @ x - middles) - widths, axis=1) * factors),
+    )
+    distances = np.linalg.norm(np.abs(centres) - reach, axis=1)
+    return Planted(
+        problem, masses, distances, lambda x: np.max(np.abs(axes @ x - centres) - reach, axis=1)
+    )
+
+
 SHAPES = {
     "half-spaces": half_spaces,
     "balls": balls,
     "balls in a box": balls_in_a_box,
     "cells": cells,
+    "slabs": slabs,
 }
 
-DIMENSIONS = {"half-spaces": (2, 50), "balls": (2, 10), "balls in a box": (2, 5), "cells": (5, 50)}
+DIMENSIONS = {
+    "half-spaces": (2, 50),
+    "balls": (2, 10),
+    "balls in a box": (2, 5),
+    "cells": (5, 50),
+    "slabs": (5, 20),
+}
 """Least and most of a shape: in more dimensions nothing but luck finds a ball."""
 
 
@@ -188,7 +218,7 @@ def main() -> None:
         for dim in options.dims:
             for count in options.counts:
                 least, most = DIMENSIONS[shape]
-                if count <= 2 * dim and least <= dim <= most:
+                if count <= dim * (0.5 if shape == "slabs" else 2) and least <= dim <= most:
                     print(measure(shape, dim, count, options.budget, options.seeds), flush=True)
 
 

@@ -1,19 +1,26 @@
 """The methods on closed forms, without a simulation: right, and as sure as they say."""
 
+import resource
+
 import numpy as np
 import pytest
-from closed_forms import CASES, closed_form, half_space, normal
+from closed_forms import CASES, Cells, closed_form, half_space, normal
 
 from verifai_jax.estimation._estimate import one_thread
+from verifai_jax.estimation.descents import descend_from_many
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
+    Answer,
     Plan,
     chains_for,
+    check_by_splitting,
     estimate_automatically,
     estimate_by_monte_carlo,
     estimate_by_splitting,
 )
+from verifai_jax.estimation.monte_carlo import Counts
+from verifai_jax.estimation.splitting import SplittingRun
 
 
 def answered(
@@ -158,3 +165,37 @@ def test_interruption_keeps_what_is_finished():
     assert limit_state.ended == "interrupted"
     assert answer.prior.simulations == 3000
     assert answer.low < 0.01 < answer.high
+
+
+@pytest.mark.parametrize(
+    ("splitting", "reached", "tail", "widened"),
+    [
+        (1e-4, 1.0, 0.1, False),
+        (2e-4, 1.0, 0.1, True),  # more than there is
+        (8e-5, 0.1, 0.1, False),  # it may have reached more than it is known to have
+        (8e-5, 0.1, 0.6, True),  # unless the weights are not steady
+        (1e-6, 1.0, 0.1, False),  # chains that hardly any lead to a region say too little
+        (1e-6, 1.0, 0.6, True),
+    ],
+)
+def test_an_interval_holds_what_splitting_gave_where_they_cannot_both_be_right(
+    splitting, reached, tail, widened
+):
+    interval = (9.6e-5, 1.05e-4)
+    answer = Answer(Counts(1000, 0, 0), 1e-4, *interval, "importance", 1000.0, 0.02)
+    answer.diagnostics = {"tail_index": tail}
+    run = SplittingRun(fractions=[splitting], cv2=[0.05**2])
+    plan = Plan(0.95, 32, np.zeros(2, bool))
+    check_by_splitting(answer, run, reached, interval, plan)
+    assert widened == any("does not agree" in note for note in answer.notes)
+    assert ((answer.low, answer.high) != interval) == widened
+    assert not widened or answer.low <= splitting <= answer.high
+
+
+def test_many_simulations_need_little_memory():
+    """All starts, and all ends, are compared with one another: so there is a limit to them."""
+    limit_state = Cells(6, 3, 2).limit_state(2_000_000)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    ends = descend_from_many(limit_state, np.random.default_rng(0), 60_000)
+    assert len(ends.points) > 1000
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kilobytes

@@ -30,7 +30,9 @@ of the space farther out leads to a small region among them."""
 FAR = 4.0
 """Standard deviations from the middle of the prior at which failures are rare."""
 DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.25
-"""Starts beside the simulations; those that are most promising descend first."""
+"""Starts that are drawn together, in parts of the simulations; the most promising descend first."""
+MOST_DRAWN = 2048
+"""Starts that are drawn together, at most, since all are compared with one another."""
 HITS = 0.02
 """Starts that fail themselves and count as ends, at most, in parts of the simulations."""
 FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
@@ -96,10 +98,9 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     **Raises:** `Ended` where time is over.
     """
     begin = limit_state.simulations
-    drawn = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
-    starts = _begin(
-        limit_state, draw_starts(limit_state, rng, max(FEWEST_AT_ONCE, round(drawn * simulations)))
-    )
+    share = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
+    drawn = min(max(FEWEST_AT_ONCE, round(share * simulations)), MOST_DRAWN)
+    starts = _begin(limit_state, draw_starts(limit_state, rng, drawn))
     hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(starts.score > -np.inf)
     worse = _worse_neighbours(starts.z, starts.score)

@@ -23,7 +23,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.estimation.descents import Ends, descend_from_many
-from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
+from verifai_jax.estimation.normal_space import (
+    LimitState,
+    farthest_first,
+    scores_of,
+    squared_distances,
+)
 from verifai_jax.estimation.towards_origin import (
     HALVINGS,
     NEAREST_STEPS,
@@ -52,8 +57,10 @@ A_PART = 4
 """Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
 """Logarithm of the prior's density beside the greatest, below which a region is left out."""
-FEWEST_CHAINS = 8
-"""Chains, at least, where there are as many ends."""
+FEWEST_CHAINS, MOST_CHAINS = 8, 256
+"""Chains, at least, where there are as many ends, and at most."""
+MOST_COMPARED = 512
+"""Ends that are compared with one another, at most."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS)) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
-    chains = min(max(FEWEST_CHAINS, left // cost), len(ends.points))
+    chains = min(max(FEWEST_CHAINS, left // cost), MOST_CHAINS, len(ends.points))
     rows, groups = _choose_ends(limit_state, ends, chains, telling)
     z = ends.points[rows]
     if differentiates:
@@ -123,7 +130,7 @@ def _choose_ends(
 
     **Returns:** rows of ends, and the region of each.
     """
-    rows = _spread_out(ends, max(chains, simulations // LINKS))
+    rows = _spread_out(ends, min(max(chains, simulations // LINKS), MOST_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
@@ -149,10 +156,10 @@ def _regions_of(
     """
     order = np.argsort(np.linalg.norm(nearest, axis=1))
     z = nearest[order]
-    gaps = np.linalg.norm(z[:, None] - z[None], axis=2)
+    gaps = squared_distances(z, z)
     gaps[np.triu_indices(len(z))] = np.inf
     others = np.argsort(gaps, axis=1)[:, :LINKS]
-    near = np.take_along_axis(gaps, others, axis=1) < APART
+    near = np.take_along_axis(gaps, others, axis=1) < APART**2
     own = np.arange(len(z))[:, None]
     region = np.empty(len(z), int)
     links = np.where(near, others, own)
@@ -198,7 +205,6 @@ def _gaps(
 ) -> Float[np.ndarray, "n m"]:
     """Return distances of ends: of the points or of the feet, whichever is less."""
     points, feet = (
-        np.linalg.norm(part[rows][:, None] - part[others][None], axis=2)
-        for part in (ends.points, ends.feet)
+        squared_distances(part[rows], part[others]) for part in (ends.points, ends.feet)
     )
-    return np.minimum(points, feet)
+    return np.sqrt(np.maximum(np.minimum(points, feet), 0.0))

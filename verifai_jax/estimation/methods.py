@@ -290,7 +290,7 @@ def _importance_answer(
     }
     answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
     if run.stopped is None:
-        _check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)
+        check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)
     else:
         answer.notes.append(
             "splitting reached no failure; the estimate rests on the failures that independent "
@@ -315,7 +315,7 @@ def _importance_answer(
     return answer
 
 
-def _check_by_splitting(
+def check_by_splitting(
     answer: Answer,
     run: SplittingRun,
     reached: float,
@@ -329,10 +329,15 @@ def _check_by_splitting(
             f"splitting alone reached {format_percent(reached)} of the probability; independent "
             "searches found the rest"
         )
-    apart = np.log(answer.probability * max(reached, 1e-6) / run.estimate)
+    # What splitting is known to have reached may be less than what it has, which steady weights
+    # leave open: then anything up to the whole agrees.
+    steady = answer.diagnostics["tail_index"] < STEADY
+    known = answer.probability * max(reached, 1e-6)
+    nearest = np.clip(run.estimate, known, answer.probability if steady else known)
+    apart = np.log(nearest / run.estimate)
     if abs(apart) <= 3.5 * np.hypot(UNDERSTATED * run.cv, answer.relative_error):
         return
-    if apart > 0 and answer.diagnostics["tail_index"] < STEADY:
+    if apart > 0 and steady:
         # Weighted samples are as likely to be too high as too low; chains that few of them lead to
         # a region, or none, are too low. So steady weights need no wider interval below.
         return
