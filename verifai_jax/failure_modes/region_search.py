@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
 from verifai_jax.estimation.paths import connected
 from verifai_jax.estimation.towards_origin import approach_origin, come_in_by_parts
+from verifai_jax.failure_modes.design_points import MOST_OF_CORNER, approach_corner
 from verifai_jax.failure_modes.regions import Regions
 
 CANDIDATES = 40
@@ -68,6 +69,8 @@ def find_regions(
             break
         _extend(limit_state, rng, regions, z[rows[~joined]][: _scaled(limit_state, CANDIDATES)])
     _merge(limit_state, regions)
+    if limit_state.gradient is not None:
+        _approach_corners(limit_state, regions)
     return regions
 
 
@@ -85,9 +88,13 @@ def share_explained(
 
 
 def _scaled(limit_state: LimitState, most: int) -> int:
-    """Return how many to look at, at least two; those that share_explained looks at are kept."""
-    left = limit_state.left - min(A_LOOK * LOOKED_AT, limit_state.left // 4)
-    return max(2, round(most * min(1.0, left / WHOLE_EFFORT)))
+    """Return how many to look at, at least two."""
+    return max(2, round(most * min(1.0, _left(limit_state) / WHOLE_EFFORT)))
+
+
+def _left(limit_state: LimitState) -> int:
+    """Return the simulations that are left but for those that share_explained takes."""
+    return limit_state.left - min(A_LOOK * LOOKED_AT, limit_state.left // 4)
 
 
 def _spread(points: Float[np.ndarray, "m d"], most: int) -> Float[np.ndarray, "_ d"]:
@@ -167,6 +174,14 @@ def _merge(limit_state: LimitState, regions: Regions) -> None:
     for i, j in zip(one[joined], other[joined], strict=True):
         number[number == number[j]] = number[i]
     regions.region = np.unique(number, return_inverse=True)[1][regions.region]
+
+
+def _approach_corners(limit_state: LimitState, regions: Regions) -> None:
+    """Move likeliest failures on to where several limits meet, as far as simulations are left."""
+    ends = regions.design_points
+    likeliest = np.argsort(np.sum(ends**2, axis=1), kind="stable")
+    rows = likeliest[: max(0, _left(limit_state)) // MOST_OF_CORNER]
+    regions.add(approach_corner(limit_state, ends[rows]), rows)
 
 
 def _shrink(
