@@ -39,14 +39,14 @@ FEWEST_AT_ONCE, MOST_AT_ONCE = 16, 128
 """Descents that are side by side."""
 STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
-NEWTON_STEPS = 8
-"""Steps of a descent with gradients, at most."""
+NEWTON_STEPS, MISSES = 24, 4
+"""Steps of a descent with gradients, and those that do not lower the robustness, at most."""
 SAME_FOOT, ENOUGH = 0.05, 8
 """Distance of feet below which planes are one, and descents to one after which no more go on."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
-STRETCH = 1.5
-"""Factor of a step after one that lowered the robustness and was too short."""
+STRETCH, STRAIGHT = 1.5, 0.9
+"""Factor of a step after one that was too short, and cosine from which it goes the same way."""
 
 
 @dataclass(frozen=True)
@@ -208,25 +208,32 @@ def _descend_by_gradient(
     gaps = squared_distances(descents.feet, known)
     given_up = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
     longest, stretch = np.full(len(descents.z), LONGEST), np.ones(len(descents.z))
+    # The direction of the last step, for those that it left short of the limit state.
+    short_of = np.zeros_like(descents.z)
+    misses = np.zeros(len(descents.z), int)
     for _ in range(NEWTON_STEPS):
         slopes = natural_slopes(descents.z, descents.gradient, limit_state.uniform)
         square = np.sum(slopes * slopes, axis=1)
         usable = np.isfinite(descents.score) & (square > 0) & np.isfinite(square) & ~given_up
-        rows = np.flatnonzero((descents.score > -np.inf) & usable)
+        rows = np.flatnonzero((descents.score > -np.inf) & usable & (misses < MISSES))
         if not len(rows):
             break
         norm = np.sqrt(square[rows])
+        direction = -slopes[rows] / norm[:, None]
+        # Where the slope vanishes towards the limit state, steps that are longer get there.
+        straight_on = np.sum(direction * short_of[rows], axis=1) > STRAIGHT
+        stretch[rows] = np.where(straight_on, STRETCH * stretch[rows], 1.0)
         size = (1 + BEYOND) * stretch[rows] * descents.score[rows] / norm
         # A robustness of zero is no failure yet: a small step goes beyond it.
         length = np.clip(size, 1e-3, longest[rows])
-        steps = -(length / norm)[:, None] * slopes[rows]
         here = descents.z[rows]
-        moved = move_naturally(here, steps, limit_state.uniform)
+        moved = move_naturally(here, length[:, None] * direction, limit_state.uniform)
         fits = limit_state.accepts(moved)
         new = _begin(limit_state, np.where(fits[:, None], moved, here))
         better = fits & (new.score < descents.score[rows])
         descents.replace(rows[better], new.of(np.flatnonzero(better)))
+        misses[rows[~better]] += 1
+        short = better & (size <= longest[rows])
+        short_of[rows] = np.where(short[:, None], direction, 0.0)
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
-        # Where the slope vanishes towards the limit state, steps that are longer get there.
-        stretch[rows] = np.where(better, STRETCH * stretch[rows], 1.0)
     return given_up
