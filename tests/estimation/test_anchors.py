@@ -10,6 +10,7 @@ from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import explore
 from verifai_jax.estimation.fitting import fit_diagonal
 from verifai_jax.estimation.importance import fit_proposal
+from verifai_jax.estimation.initial_proposal import proposal_from
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
 
@@ -56,9 +57,8 @@ def test_a_region_a_hundred_times_less_probable_has_samples():
         cells.masses[row] = mass
     known = cells.limit_state(50_000)
     found = explore(known, rng, 5000)
-    fitted = fit_proposal(
-        known, rng, found.points, found.chain_ids, 30_000, anchors=anchors_of([found], 0.1)
-    )
+    initial, anchors = proposal_from(found, rng, 0.1), anchors_of([found], 0.1)
+    fitted = fit_proposal(known, rng, found.points, found.chain_ids, 30_000, initial, anchors)
     z, _ = fitted.proposal.sample(rng, 10_000)
     fails = known(z).failing
     weight = 1 / fitted.proposal.ratio(z[fails])
