@@ -52,7 +52,7 @@ EXPLORATIONS = 2
 """Independent searches for failures beside splitting."""
 SHARE_OF_EXPLORATION, SHARE_WITH_GRADIENTS = 0.08, 0.12
 """Share of the budget for each of them."""
-PRECISE, SHARE_BEYOND = 20_000, 0.2
+PRECISE, SHARE_BEYOND = 20_000, 0.25
 """Simulations that make an estimate precise, and the share of those beyond for each search with
 gradients: a region that none has found is the greater error then."""
 FEWEST_OF_EXPLORATION = 600
