@@ -59,8 +59,10 @@ IMPROBABLE = 20.0
 """Logarithm of the prior's density beside the greatest, below which a region is left out."""
 FEWEST_CHAINS, MOST_CHAINS = 8, 256
 """Chains, at least, where there are as many ends, and at most."""
-MOST_COMPARED = 512
-"""Ends that are compared with one another, at most."""
+MERGES, NEIGHBOURS = 3, 4
+"""Times that groups of ends are compared, and others with which each is, the nearest first."""
+COMPARED, MOST_COMPARED = 0.4, 512
+"""Ends that are compared with one another, in parts of the simulations for that, and at most."""
 
 
 @dataclass(frozen=True)
@@ -130,10 +132,12 @@ def _choose_ends(
 
     **Returns:** rows of ends, and the region of each.
     """
-    rows = _spread_out(ends, min(max(chains, simulations // LINKS), MOST_COMPARED))
+    most = max(chains, round(COMPARED * simulations))
+    rows = _spread_out(ends, min(most, MOST_COMPARED))
     gaps = _gaps(ends, rows, rows)
     gaps[np.triu_indices(len(rows))] = np.inf
     group = _joined(limit_state, ends.points[rows], np.argsort(gaps, axis=1)[:, :LINKS])
+    group = _merge(limit_state, ends.points[rows], group)
     # The nearest to the origin comes first, then those far apart, should there be several regions.
     norms = np.linalg.norm(ends.points[rows], axis=1)
     members = []
@@ -143,6 +147,32 @@ def _choose_ends(
     members.sort(key=lambda own: norms[own[0]])
     turns = [own[turn % len(own)] for turn in range(chains) for own in members]
     return rows[np.array(turns[:chains])], np.arange(chains) % len(members)
+
+
+def _merge(
+    limit_state: LimitState, z: Float[np.ndarray, "k d"], group: Int[np.ndarray, " k"]
+) -> Int[np.ndarray, " k"]:
+    """Join groups `[k]` of failures where the middle between their least distant ones fails.
+
+    The nearest of others may all be of other regions; so each group is compared with several.
+    """
+    norms = np.linalg.norm(z, axis=1)
+    for _ in range(MERGES):
+        count = group.max() + 1
+        if count < 2:
+            break
+        ends = np.array(
+            [np.flatnonzero(group == k)[norms[group == k].argmin()] for k in range(count)]
+        )
+        gaps = squared_distances(z[ends], z[ends])
+        # Each pair once.
+        gaps[np.triu_indices(count)] = np.inf
+        others = np.argsort(gaps, axis=1)[:, :NEIGHBOURS]
+        joined = _joined(limit_state, z[ends], others)
+        if joined.max() + 1 == count:
+            break
+        group = joined[group]
+    return group
 
 
 def _regions_of(
