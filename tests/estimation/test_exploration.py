@@ -245,3 +245,15 @@ def test_points_are_chosen_the_farthest_first():
     near = farthest_first(7, lambda row: gaps[row], 40, least=2.0)
     assert gaps[:, near].min(axis=1).max() <= 2.0
     assert gaps[np.ix_(near, near)][np.triu_indices(len(near), 1)].min() > 2.0
+
+
+def test_each_ball_of_ten_dimensions_has_as_many_chains_as_any_other():
+    """The two ends nearest to one of a ball are often of other balls, whose ends are many."""
+    far, radii = np.array([3.5, 3.6, 3.7, 3.4]), np.array([1.6, 1.5, 1.7, 1.3])
+    centres = far[:, None] * np.eye(10)[:4]
+    robustness, gradient = islands(centres, radii, np.array([0.7, 1.0, 1.2, 1.5]))
+    known = with_gradient(robustness, gradient, 10, 20_000)
+    found = explore(known, np.random.default_rng(0), 6000)
+    ball = (np.linalg.norm(found.nearest[:, None] - centres, axis=2) - radii).argmin(axis=1)
+    chains = np.bincount(ball, minlength=4)
+    assert chains.max() <= chains.min() + 1
