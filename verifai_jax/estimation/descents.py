@@ -6,7 +6,8 @@
 
 Starts lie anywhere from the middle of the prior to far outside of it. A region of which little
 leads to it is found only where many descents begin, so they end at the first failure, and those
-that begin at a local minimum of the starts go first.
+that begin at a local minimum of the starts go first. Where there are gradients, starts are near
+one another if their slopes lead to the same place.
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the regions that a population is led away from;
@@ -29,7 +30,7 @@ WHERE_RARE = 0.5
 of the space farther out leads to a small region among them."""
 FAR = 4.0
 """Standard deviations from the middle of the prior at which failures are rare."""
-DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.25
+DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.33
 """Starts that are drawn together, in parts of the simulations; the most promising descend first."""
 MOST_DRAWN = 2048
 """Starts that are drawn together, at most, since all are compared with one another."""
@@ -103,10 +104,13 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
     starts = _begin(limit_state, draw_starts(limit_state, rng, drawn))
     hits = np.flatnonzero(starts.score == -np.inf)[: max(8, round(HITS * simulations))]
     others = np.flatnonzero(starts.score > -np.inf)
-    worse = _worse_neighbours(starts.z, starts.score)
+    worse = _worse_neighbours(_places_ahead(limit_state, starts), starts.score)
     others = others[np.argsort(-worse[others], kind="stable")]
     # Far out, where they lie, several regions overlap.
-    failing = _begin(limit_state, come_in(limit_state, starts.z[hits]))
+    failing = starts.of(hits)
+    failing.z = come_in(limit_state, failing.z)
+    if limit_state.gradient is not None:
+        failing = _begin(limit_state, failing.z)
     points, feet = [failing.z], [failing.feet]
     count, before, begun = FEWEST_AT_ONCE, limit_state.simulations, 0
     while limit_state.simulations - begin < simulations:
@@ -152,6 +156,29 @@ def draw_starts(
         if len(accepted) == count:
             break
     return accepted
+
+
+def _places_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
+    """Return where the slope at each point says that the limit state is; the point without one.
+
+    Farther than one step is not looked.
+    """
+    direction, norm, rows = _downhill(limit_state, descents)
+    steps = np.zeros_like(descents.z)
+    length = np.minimum(descents.score[rows] / norm[rows], LONGEST)
+    steps[rows] = length[:, None] * direction[rows]
+    return move_naturally(descents.z, steps, limit_state.uniform)
+
+
+def _downhill(
+    limit_state: LimitState, descents: _Descents
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"], Int[np.ndarray, " m"]]:
+    """Return directions in natural coordinates, slopes along them, and the rows that have one."""
+    slopes = natural_slopes(descents.z, descents.gradient, limit_state.uniform)
+    norm = np.sqrt(np.sum(slopes * slopes, axis=1))
+    usable = np.isfinite(descents.score) & (norm > 0) & np.isfinite(norm)
+    direction = np.where(usable[:, None], -slopes, 0.0) / np.where(usable, norm, 1.0)[:, None]
+    return direction, norm, np.flatnonzero(usable)
 
 
 def _worse_neighbours(
@@ -212,14 +239,11 @@ def _descend_by_gradient(
     short_of = np.zeros_like(descents.z)
     misses = np.zeros(len(descents.z), int)
     for _ in range(NEWTON_STEPS):
-        slopes = natural_slopes(descents.z, descents.gradient, limit_state.uniform)
-        square = np.sum(slopes * slopes, axis=1)
-        usable = np.isfinite(descents.score) & (square > 0) & np.isfinite(square) & ~given_up
-        rows = np.flatnonzero((descents.score > -np.inf) & usable & (misses < MISSES))
+        direction, norm, rows = _downhill(limit_state, descents)
+        rows = rows[~given_up[rows] & (misses[rows] < MISSES)]
         if not len(rows):
             break
-        norm = np.sqrt(square[rows])
-        direction = -slopes[rows] / norm[:, None]
+        direction, norm = direction[rows], norm[rows]
         # Where the slope vanishes towards the limit state, steps that are longer get there.
         straight_on = np.sum(direction * short_of[rows], axis=1) > STRAIGHT
         stretch[rows] = np.where(straight_on, STRETCH * stretch[rows], 1.0)

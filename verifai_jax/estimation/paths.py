@@ -1,6 +1,7 @@
-"""Paths of failures: whether two failing points belong to one failing region.
+"""Paths of failures: whether two failing points belong to one failing region, and where one ends.
 
     connected(limit_state, a, b)                    # [n], for points a [n, d] and b [n, d]
+    last, beyond = halve(limit_state, a, b, 10)     # about the end of the failures on the way to b
 
 Two paths are tried: the straight one, which stays inside a convex region, and the arc that turns
 about the origin at the distances of its ends, which follows a region that lies around the prior.
@@ -38,8 +39,35 @@ def connected(
     return joined
 
 
+def halve(
+    limit_state: LimitState,
+    begin: Float[np.ndarray, "n d"],
+    end: Float[np.ndarray, "n d"],
+    halvings: int,
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    """Follow straight ways as far as they fail, by halving.
+
+    **Arguments:**
+
+    - `begin`: failures.
+    - `end`: points that are taken not to fail; they are not simulated.
+
+    **Returns:** the last failure found on each way, and a point just beyond it.
+
+    **Raises:** `Ended` where time is over.
+    """
+    low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))
+    for _ in range(halvings):
+        middle = (low + high) / 2
+        fails = (scores_of(limit_state, _straight(begin, end, middle)) == -np.inf)[:, None]
+        low, high = np.where(fails, middle, low), np.where(fails, high, middle)
+    return _straight(begin, end, low), _straight(begin, end, high)
+
+
 def _straight(
-    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], place: float
+    a: Float[np.ndarray, "n d"],
+    b: Float[np.ndarray, "n d"],
+    place: float | Float[np.ndarray, "n 1"],
 ) -> Float[np.ndarray, "n d"]:
     return (1 - place) * a + place * b
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.paths import halve
 
 HALVINGS = 5
 """Halvings of the way in towards the origin."""
@@ -31,12 +32,7 @@ SHORTEST = 0.05
 
 def come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """Halve the way to the origin as far as the points still fail."""
-    low, high = np.zeros(len(z)), np.ones(len(z))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        fails = scores_of(limit_state, middle[:, None] * z) == -np.inf
-        low, high = np.where(fails, low, middle), np.where(fails, middle, high)
-    return high[:, None] * z
+    return halve(limit_state, z, np.zeros_like(z), HALVINGS)[0]
 
 
 def approach_origin(

@@ -13,9 +13,10 @@ Industrial and Applied Mathematics 8 (1960); Lawson and Hanson, Solving Least Sq
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.paths import halve
 
 PLANES = 6
 """Planes of a failure, at most."""
@@ -57,33 +58,13 @@ def approach_corner(
         rows = np.flatnonzero(np.sum(target**2, axis=1) < np.sum(best**2, axis=1))
         if not len(rows):
             break
-        fails, low, high = _last_failing(limit_state, best[rows], target[rows])
-        best[rows], beyond[rows] = low, high
+        fails = scores_of(limit_state, target[rows]) == -np.inf
+        best[rows[fails]] = target[rows[fails]]
         rows = rows[~fails]
+        last, beyond[rows] = halve(limit_state, best[rows], target[rows], HALVINGS)
+        nearer = np.sum(last**2, axis=1) < np.sum(best[rows] ** 2, axis=1)
+        best[rows] = np.where(nearer[:, None], last, best[rows])
     return best
-
-
-def _last_failing(
-    limit_state: LimitState, begin: Float[np.ndarray, "n d"], end: Float[np.ndarray, "n d"]
-) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """Follow ways from failures, and return which fail at their end, and the points about the last.
-
-    **Returns:** which ways fail at their end; the last failure found, nearer to the origin than the
-    beginning; and a point just beyond it.
-    """
-    low = np.zeros(len(begin))
-    fails = scores_of(limit_state, end) == -np.inf
-    low[fails], high = 1.0, np.ones(len(begin))
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        open_ones = np.flatnonzero(~fails)
-        points = begin + middle[:, None] * (end - begin)
-        inside = np.zeros(len(begin), bool)
-        inside[open_ones] = scores_of(limit_state, points[open_ones]) == -np.inf
-        low, high = np.where(inside, middle, low), np.where(inside | fails, high, middle)
-    last, first = (begin + share[:, None] * (end - begin) for share in (low, high))
-    nearer = np.sum(last**2, axis=1) < np.sum(begin**2, axis=1)
-    return fails, np.where(nearer[:, None], last, begin), first
 
 
 def _least_distant(
