@@ -42,6 +42,34 @@ def two_modes(dim, p, share):
     return lambda u: np.minimum(near - normal(u) @ a, far + normal(u) @ a)
 
 
+def with_gradient(robustness, gradient, dim, budget):
+    """A limit state of a closed form in normal space, with its gradient there."""
+
+    def evaluate(u):
+        rho = robustness(normal(u))
+        return rho, rho < 0, np.isfinite(rho)
+
+    def differentiate(u):
+        z = normal(u)
+        return *evaluate(u), gradient(z) / norm.pdf(z)
+
+    return LimitState(evaluate, dim, budget, batch=10_000, gradient=differentiate)
+
+
+def islands(centres, radii, speeds):
+    """Robustness and gradient of balls that fail, to which it falls at different speeds."""
+
+    def both(z):
+        away = z[:, None] - centres
+        far = np.linalg.norm(away, axis=2)
+        margins = (far - radii) * speeds
+        own, rows = margins.argmin(axis=1), np.arange(len(z))
+        slopes = away[rows, own] / far[rows, own][:, None] * speeds[own][:, None]
+        return margins[rows, own], slopes
+
+    return lambda z: both(z)[0], lambda z: both(z)[1]
+
+
 class Cells:
     """Failures that need some of the features near certain values, and any values of the others.
 

@@ -2,17 +2,16 @@
 
 import numpy as np
 import pytest
-from closed_forms import closed_form, normal
+from closed_forms import closed_form, islands, normal, with_gradient
 from scipy.stats import norm
 
 from verifai_jax.estimation.anchors import WeightedFailures, anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
-from verifai_jax.estimation.descents import descend_from_many
 from verifai_jax.estimation.exploration import approach_origin, explore
 from verifai_jax.estimation.initial_proposal import compare_explorations
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
-from verifai_jax.estimation.normal_space import LimitState, farthest_first
+from verifai_jax.estimation.normal_space import farthest_first
 from verifai_jax.estimation.paths import connected
 
 
@@ -36,18 +35,6 @@ def two_sides(z):
 
 def limit_state(robustness, dim, budget):
     return closed_form(lambda u: robustness(normal(u)), dim, budget)
-
-
-def with_gradient(robustness, gradient, dim, budget):
-    def evaluate(u):
-        rho = robustness(normal(u))
-        return rho, rho < 0, np.isfinite(rho)
-
-    def differentiate(u):
-        z = normal(u)
-        return *evaluate(u), gradient(z) / norm.pdf(z)
-
-    return LimitState(evaluate, dim, budget, batch=10_000, gradient=differentiate)
 
 
 def test_chains_fail_and_the_nearest_failures_are_those_of_every_region():
@@ -126,20 +113,6 @@ def test_every_region_keeps_a_part_of_the_anchors():
     assert np.sum(fails & (z[:, 0] < 0)) > 50
 
 
-def islands(centres, radii, speeds):
-    """Robustness and gradient of balls that fail, to which it falls at different speeds."""
-
-    def both(z):
-        away = z[:, None] - centres
-        far = np.linalg.norm(away, axis=2)
-        margins = (far - radii) * speeds
-        own, rows = margins.argmin(axis=1), np.arange(len(z))
-        slopes = away[rows, own] / far[rows, own][:, None] * speeds[own][:, None]
-        return margins[rows, own], slopes
-
-    return lambda z: both(z)[0], lambda z: both(z)[1]
-
-
 CENTRES = np.array([[3.5, 0, 0], [-3.6, 0, 0], [0, 3.7, 0], [0, -3.8, 0], [0, 0, 4.0]])
 RADII = np.array([0.6, 0.3, 0.4, 0.5, 0.3])
 SPEEDS = np.array([0.5, 4.0, 1.0, 3.0, 0.8])
@@ -167,28 +140,6 @@ def test_small_islands_beside_one_another_are_two_regions():
     gaps = np.linalg.norm(found.nearest[:, None] - centres, axis=2).argmin(axis=1)
     assert set(gaps) == {0, 1}
     assert not set(found.regions[gaps == 0]) & set(found.regions[gaps == 1])
-
-
-def test_few_descents_go_on_to_a_plane_that_many_have_come_to():
-    """Four half-spaces; the robustness falls to the first over most of the space."""
-    normals, distances = np.eye(30)[:4], np.array([4.0, 4.1, 4.2, 4.3])
-    speeds = np.array([0.1, 1.0, 3.0, 4.0])
-
-    def robustness(z):
-        return np.min((distances - z @ normals.T) * speeds, axis=1)
-
-    def gradient(z):
-        own = np.argmin((distances - z @ normals.T) * speeds, axis=1)
-        return -normals[own] * speeds[own][:, None]
-
-    known = with_gradient(robustness, gradient, 30, 10_000)
-    ends = descend_from_many(known, np.random.default_rng(0), 2000)
-    planes = np.bincount(np.argmin(distances - ends.points @ normals.T, axis=1), minlength=4)
-    assert planes.min() >= 3
-    assert planes[0] < 100
-    # Ends of a plane share its foot, starts that fail themselves too; not those of random steps.
-    gaps = np.linalg.norm(ends.feet[:, None] - distances[:, None] * normals, axis=2)
-    assert np.mean(gaps.min(axis=1) < 1e-6) > 0.9
 
 
 def test_the_least_distant_failure_of_a_ball_is_found_though_its_tangent_planes_lie_outside():

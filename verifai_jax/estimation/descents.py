@@ -11,10 +11,13 @@ one another if their slopes lead to the same place.
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the regions that a population is led away from;
-Preuss, Niching the CMA-ES via nearest-better clustering, GECCO 2010, for the order of the starts.
+Preuss, Niching the CMA-ES via nearest-better clustering, GECCO 2010, for the order of the starts;
+Schroeder, Ueber unendlich viele Algorithmen zur Aufloesung der Gleichungen, Mathematische Annalen
+2 (1870), for Newton's steps where the slope vanishes.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -42,12 +45,15 @@ STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
 NEWTON_STEPS, MISSES = 24, 4
 """Steps of a descent with gradients, and those that do not lower the robustness, at most."""
-SAME_FOOT, ENOUGH = 0.05, 8
-"""Distance of feet below which planes are one, and descents to one after which no more go on."""
+SAME_PLANE, ENOUGH = 0.07, 8
+"""Distance of planes below which they are one, and descents to one after which no more go on."""
 LONGEST = 3.0
 """Length of a step with gradients, at most."""
-STRETCH, STRAIGHT = 1.5, 0.9
-"""Factor of a step after one that was too short, and cosine from which it goes the same way."""
+MOST_POWER = 4.0
+"""Power of the way that is left like which the robustness falls, at most."""
+FELL, STRAIGHT = 0.9, 0.9
+"""Part to which a step has lowered the robustness that says something of the power, and the cosine
+from which the next one goes the same way."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,11 @@ class Ends:
 
     points: Float[np.ndarray, "n d"]
     feet: Float[np.ndarray, "n d"]
+
+    @cached_property
+    def planes(self) -> Float[np.ndarray, "n coordinates"]:
+        """Points as near to one another as the tangent planes are alike."""
+        return _planes(self.feet)
 
 
 @dataclass
@@ -158,6 +169,15 @@ def draw_starts(
     return accepted
 
 
+def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"]:
+    """Return points that tell planes apart: the feet and the directions.
+
+    Where planes pass near the origin their feet lie together, wherever their regions are.
+    """
+    norms = np.linalg.norm(feet, axis=1, keepdims=True)
+    return np.concatenate([feet, FAR * feet / np.maximum(norms, 1e-9)], axis=1)
+
+
 def _places_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
     """Return where the slope at each point says that the limit state is; the point without one.
 
@@ -230,34 +250,40 @@ def _descend_by_gradient(
 ) -> Bool[np.ndarray, " n"]:
     """Take Newton's steps to the limit state, halved where they do not lower the robustness.
 
+    Where the robustness falls like a power of the way that is left, Newton's step is that power too
+    short (Schroeder, 1870). Its slope is a power of it then, which two points tell.
+
     **Returns:** which descents are given up, because many have come to the same plane.
     """
-    gaps = squared_distances(descents.feet, known)
-    given_up = np.sum(gaps < SAME_FOOT**2, axis=1) >= ENOUGH
-    longest, stretch = np.full(len(descents.z), LONGEST), np.ones(len(descents.z))
-    # The direction of the last step, for those that it left short of the limit state.
-    short_of = np.zeros_like(descents.z)
+    gaps = squared_distances(_planes(descents.feet), _planes(known))
+    given_up = np.sum(gaps < SAME_PLANE**2, axis=1) >= ENOUGH
+    longest, power = np.full(len(descents.z), LONGEST), np.ones(len(descents.z))
     misses = np.zeros(len(descents.z), int)
+    directions, slopes, rows = _downhill(limit_state, descents)
     for _ in range(NEWTON_STEPS):
-        direction, norm, rows = _downhill(limit_state, descents)
         rows = rows[~given_up[rows] & (misses[rows] < MISSES)]
         if not len(rows):
             break
-        direction, norm = direction[rows], norm[rows]
-        # Where the slope vanishes towards the limit state, steps that are longer get there.
-        straight_on = np.sum(direction * short_of[rows], axis=1) > STRAIGHT
-        stretch[rows] = np.where(straight_on, STRETCH * stretch[rows], 1.0)
-        size = (1 + BEYOND) * stretch[rows] * descents.score[rows] / norm
+        direction, slope, score = directions[rows], slopes[rows], descents.score[rows]
+        size = (1 + BEYOND) * power[rows] * score / slope
         # A robustness of zero is no failure yet: a small step goes beyond it.
         length = np.clip(size, 1e-3, longest[rows])
         here = descents.z[rows]
         moved = move_naturally(here, length[:, None] * direction, limit_state.uniform)
         fits = limit_state.accepts(moved)
         new = _begin(limit_state, np.where(fits[:, None], moved, here))
-        better = fits & (new.score < descents.score[rows])
+        better = fits & (new.score < score)
         descents.replace(rows[better], new.of(np.flatnonzero(better)))
         misses[rows[~better]] += 1
-        short = better & (size <= longest[rows])
-        short_of[rows] = np.where(short[:, None], direction, 0.0)
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
+        before, (directions, slopes, usable) = rows, _downhill(limit_state, descents)
+        fell = better & np.isin(before, usable)
+        fell &= (new.score > 0) & (new.score < FELL * score)
+        rows = before[fell]
+        exponent = np.log(slopes[rows] / slope[fell]) / np.log(new.score[fell] / score[fell])
+        estimate = 1 / np.clip(1 - exponent, 1 / MOST_POWER, 1.0)
+        # Where the way turns, another part of the system may have a slope of its own.
+        straight_on = np.sum(directions[rows] * direction[fell], axis=1) > STRAIGHT
+        power[rows] = np.where(straight_on, estimate, np.sqrt(power[rows] * estimate))
+        rows = usable
     return given_up

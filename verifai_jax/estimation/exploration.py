@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.estimation.descents import FAR, Ends, descend_from_many
+from verifai_jax.estimation.descents import Ends, descend_from_many
 from verifai_jax.estimation.normal_space import (
     LimitState,
     farthest_first,
@@ -233,12 +233,7 @@ def _squares(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n 1"]:
 def _gaps(
     ends: Ends, rows: Int[np.ndarray, " n"], others: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n m"]:
-    """Return distances of ends: of the points or of the feet, whichever is less.
-
-    The feet of planes that pass near the origin lie together wherever their regions are, so all are
-    taken at least as far out as failures are rare.
-    """
-    norms = np.linalg.norm(ends.feet, axis=1, keepdims=True)
-    feet = ends.feet * np.maximum(1.0, FAR / np.maximum(norms, 1e-9))
-    points, planes = (squared_distances(part[rows], part[others]) for part in (ends.points, feet))
-    return np.sqrt(np.maximum(np.minimum(points, planes), 0.0))
+    """Return distances of ends: of the points or of the planes, whichever is less."""
+    parts = (ends.points, ends.planes)
+    gaps = (squared_distances(part[rows], part[others]) for part in parts)
+    return np.sqrt(np.maximum(np.minimum(*gaps), 0.0))
