@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.estimation.corners import approach_corner
 from verifai_jax.estimation.descents import Ends, descend_from_many
 from verifai_jax.estimation.normal_space import (
     LimitState,
@@ -53,6 +54,8 @@ WALK = 24
 """Steps of a walk among the failures; the second half of its states is kept."""
 FIRST_STEPS = 2
 """Steps to the least distant failure before it is known which coordinates decide."""
+CORNERS = (4, 5)
+"""Planes of a chain where limits meet, at most, and halvings of the ways to where they do."""
 A_PART = 4
 """Simulations for each doubling of the coordinates, about, to find those that decide."""
 IMPROBABLE = 20.0
@@ -107,6 +110,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     z = ends.points[rows]
     if differentiates:
         z = approach_origin(limit_state, come_in(limit_state, z), FIRST_STEPS)
+        z = approach_corner(limit_state, z, *CORNERS)
     z = come_in_by_parts(limit_state, rng, z)
     groups = _regions_of(limit_state, z, groups)
     redrawn, deciding = redraw_by_parts(limit_state, rng, z)

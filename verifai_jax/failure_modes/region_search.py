@@ -15,10 +15,10 @@ Structural Safety 20 (1998).
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.estimation.corners import approach_corner, cost_of_corner
 from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
 from verifai_jax.estimation.paths import connected
 from verifai_jax.estimation.towards_origin import approach_origin, come_in_by_parts
-from verifai_jax.failure_modes.design_points import MOST_OF_CORNER, approach_corner
 from verifai_jax.failure_modes.regions import Regions
 
 CANDIDATES = 40
@@ -180,7 +180,7 @@ def _approach_corners(limit_state: LimitState, regions: Regions) -> None:
     """Move likeliest failures on to where several limits meet, as far as simulations are left."""
     ends = regions.design_points
     likeliest = np.argsort(np.sum(ends**2, axis=1), kind="stable")
-    rows = likeliest[: max(0, _left(limit_state)) // MOST_OF_CORNER]
+    rows = likeliest[: max(0, _left(limit_state)) // cost_of_corner()]
     regions.add(approach_corner(limit_state, ends[rows]), rows)
 
 

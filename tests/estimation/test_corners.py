@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from verifai_jax.estimation.corners import approach_corner
 from verifai_jax.estimation.normal_space import LimitState
-from verifai_jax.failure_modes.design_points import approach_corner
 
 
 def polytope(normals, offsets, elsewhere=None):

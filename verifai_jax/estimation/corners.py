@@ -18,18 +18,17 @@ from jaxtyping import Float
 from verifai_jax.estimation.normal_space import LimitState, scores_of
 from verifai_jax.estimation.paths import halve
 
-PLANES = 6
-"""Planes of a failure, at most."""
-HALVINGS = 10
-"""Halvings of the way to the nearest point within the planes."""
-MOST_OF_CORNER = PLANES * (HALVINGS + 3)
-"""Simulations that a failure takes, at most."""
+PLANES, HALVINGS = 6, 10
+"""Planes of a failure, at most, and halvings of the way to the nearest point within them."""
 INSIDE = 3e-4
 """Part of its distance from the origin by which a point lies within a plane."""
 
 
 def approach_corner(
-    limit_state: LimitState, z: Float[np.ndarray, "n d"]
+    limit_state: LimitState,
+    z: Float[np.ndarray, "n d"],
+    planes: int = PLANES,
+    halvings: int = HALVINGS,
 ) -> Float[np.ndarray, "n d"]:
     """Move failures to the least distant ones near them, by all their tangent planes together.
 
@@ -40,20 +39,22 @@ def approach_corner(
 
     - `limit_state`: one with gradients.
     - `z`: failures.
+    - `planes`: planes of a failure, at most.
+    - `halvings`: halvings of each way.
 
     **Returns:** failures, none farther from the origin than its start.
     """
     best, beyond, rows = z.copy(), z.copy(), np.arange(len(z))
-    planes: list[list[tuple[Float[np.ndarray, " d"], float]]] = [[] for _ in z]
-    for _ in range(PLANES):
+    touching: list[list[tuple[Float[np.ndarray, " d"], float]]] = [[] for _ in z]
+    for _ in range(planes):
         _, rho, gradient = limit_state.linearize(beyond[rows])
         target = best.copy()
         for row, value, slope in zip(rows, rho, gradient, strict=True):
             size = float(np.linalg.norm(slope))
             if size and np.isfinite(value):
                 offset = (float(slope @ beyond[row]) - float(value)) / size
-                planes[row].append((slope / size, offset))
-                within = _least_distant(planes[row])
+                touching[row].append((slope / size, offset))
+                within = _least_distant(touching[row])
                 target[row] = best[row] if within is None else within
         rows = np.flatnonzero(np.sum(target**2, axis=1) < np.sum(best**2, axis=1))
         if not len(rows):
@@ -61,10 +62,15 @@ def approach_corner(
         fails = scores_of(limit_state, target[rows]) == -np.inf
         best[rows[fails]] = target[rows[fails]]
         rows = rows[~fails]
-        last, beyond[rows] = halve(limit_state, best[rows], target[rows], HALVINGS)
+        last, beyond[rows] = halve(limit_state, best[rows], target[rows], halvings)
         nearer = np.sum(last**2, axis=1) < np.sum(best[rows] ** 2, axis=1)
         best[rows] = np.where(nearer[:, None], last, best[rows])
     return best
+
+
+def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:
+    """Return the simulations that a failure takes, at most."""
+    return planes * (halvings + 3)
 
 
 def _least_distant(
