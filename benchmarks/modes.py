@@ -5,12 +5,12 @@ python benchmarks/modes.py --seeds 3 --dims 2 10 --shapes half-spaces
 
 Half-spaces in directions at right angles, balls in normal space, balls inside a box of uniform
 features, which no corner and no tail leads to, cells: failures that need three of the features
-near certain values, other ones in every mode, and any values of the rest; and slabs, which are
-narrow in two directions oblique to the features. The robustness falls to them at different speeds,
-so that a population that follows it gathers in few of them. Masses and distances are known. A line
-says in how many runs every mode of at least 0.5 % of the probability was found, how many 95 %
-intervals hold the true mass, and the greatest ratio of the distance of a likeliest point to the
-true one, which uniform features do not have.
+near certain values, other ones in every mode, and any values of the rest; slabs, which are narrow
+in two directions oblique to the features, and corners, which lie beyond limits in two of them. The
+robustness falls to them at different speeds, so that a population that follows it gathers in few of
+them. Masses and distances are known. A line says in how many runs every mode of at least 0.5 % of
+the probability was found, how many 95 % intervals hold the true mass, and the greatest ratio of the
+distance of a likeliest point to the true one, which uniform features do not have.
 """
 
 import argparse
@@ -154,12 +154,31 @@ def slabs(dim: int, count: int) -> Planted:
     )
 
 
+def corners(dim: int, count: int) -> Planted:
+    """Normal features beyond limits in two directions oblique to them at once, other ones each."""
+    random = np.random.default_rng(6000 * dim + count)
+    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T[: 2 * count]
+    axes = axes.reshape(count, 2, dim)
+    limits = random.uniform(2.0, 2.7, (count, 2))
+    directions, offsets = jnp.asarray(axes, jnp.float32), jnp.asarray(limits, jnp.float32)
+    factors = jnp.asarray(np.exp(random.uniform(-0.7, 0.7, count)), jnp.float32)
+    problem = posed(
+        f"corners_{dim}_{count}",
+        vj.Normal(0.0, 1.0),
+        dim,
+        lambda x: jnp.min(jnp.max(offsets - directions @ x, axis=1) * factors),
+    )
+    masses, distances = np.prod(norm.sf(limits), axis=1), np.linalg.norm(limits, axis=1)
+    return Planted(problem, masses, distances, lambda x: np.max(limits - axes @ x, axis=1))
+
+
 SHAPES = {
     "half-spaces": half_spaces,
     "balls": balls,
     "balls in a box": balls_in_a_box,
     "cells": cells,
     "slabs": slabs,
+    "corners": corners,
 }
 
 DIMENSIONS = {
@@ -167,8 +186,12 @@ DIMENSIONS = {
     "balls": (2, 10),
     "balls in a box": (2, 5),
     "cells": (5, 50),
-    "slabs": (5, 20),
+    "slabs": (10, 50),
+    "corners": (10, 50),
 }
+OBLIQUE = ("slabs", "corners")
+"""Shapes of which a mode takes two dimensions, so that at most half as many fit."""
+
 """Least and most of a shape: in more dimensions nothing but luck finds a ball."""
 
 
@@ -218,7 +241,7 @@ def main() -> None:
         for dim in options.dims:
             for count in options.counts:
                 least, most = DIMENSIONS[shape]
-                if count <= dim * (0.5 if shape == "slabs" else 2) and least <= dim <= most:
+                if count <= dim * (0.5 if shape in OBLIQUE else 2) and least <= dim <= most:
                     print(measure(shape, dim, count, options.budget, options.seeds), flush=True)
 
 

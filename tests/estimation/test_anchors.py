@@ -1,14 +1,17 @@
 """Regions keep the part of a proposal that their probability is known by."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from closed_forms import Cells
+from closed_forms import Cells, with_gradient
+from scipy.stats import norm
 
 from verifai_jax.estimation._estimate import one_thread
-from verifai_jax.estimation.anchors import KINDS, anchors_of
+from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.components import Gaussian, Prior
 from verifai_jax.estimation.exploration import explore
-from verifai_jax.estimation.fitting import fit_diagonal
+from verifai_jax.estimation.fitting import fit_across, fit_diagonal
 from verifai_jax.estimation.importance import fit_proposal
 from verifai_jax.estimation.initial_proposal import proposal_from
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
@@ -27,6 +30,75 @@ def test_coordinates_like_the_priors_are_the_priors():
     assert 0.01 < fitted.stds[3] < 0.02
 
 
+def test_across_the_directions_that_decide_a_fit_is_the_prior():
+    rng = np.random.default_rng(0)
+    directions = np.linalg.qr(rng.standard_normal((40, 2)))[0]
+    z = rng.standard_normal((30, 40))
+    inside = np.array([2.5, -2.0]) + np.array([0.1, 0.3]) * rng.standard_normal((30, 2))
+    z += (inside - z @ directions) @ directions.T
+    fitted = fit_across(z, np.full(30, 1 / 30), directions)
+    drawn, _ = Mixture((fitted,), np.ones(1)).sample(rng, 20_000)
+    assert (drawn @ directions).mean(axis=0) == pytest.approx([2.5, -2.0], abs=0.2)
+    assert (drawn @ directions).std(axis=0) == pytest.approx([0.13, 0.39], rel=0.35)
+    others = drawn - (drawn @ directions) @ directions.T
+    assert others.mean(axis=0) == pytest.approx(np.zeros(40), abs=0.04)
+    assert np.sum(others**2, axis=1).mean() == pytest.approx(38, rel=0.02)
+
+
+def oblique_slabs(dim, budget):
+    """Failures within an interval in each of two oblique directions, for each of three modes."""
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.standard_normal((dim, dim)))[0].T[:6].reshape(3, 2, dim)
+    centres = np.array([[2.4, 2.6], [-2.5, 2.2], [2.7, -2.3]])
+    reach = np.array([[0.2, 0.3], [0.25, 0.2], [0.3, 0.35]])
+
+    def parts(z):
+        away = np.einsum("kmd,nd->nkm", axes, z) - centres
+        margins = np.abs(away) - reach
+        mode = margins.max(axis=2).argmin(axis=1)
+        rows, side = np.arange(len(z)), margins[np.arange(len(z)), mode].argmax(axis=1)
+        slope = np.sign(away[rows, mode, side])[:, None] * axes[mode, side]
+        return margins[rows, mode, side], slope
+
+    masses = np.prod(norm.cdf(centres + reach) - norm.cdf(centres - reach), axis=1)
+    return with_gradient(lambda z: parts(z)[0], lambda z: parts(z)[1], dim, budget), masses.sum()
+
+
+def test_failures_that_need_two_oblique_conditions_are_hit():
+    known, _ = oblique_slabs(40, 100_000)
+    found = explore(known, np.random.default_rng(0), 3000)
+    hits = {}
+    for normals in (True, False):
+        of = found if normals else replace(found, normals=())
+        drawn, _ = anchors_of([of], 0.1).fit().sample(np.random.default_rng(1), 10_000)
+        hits[normals] = known(drawn).failing.mean()
+    assert hits[True] > 0.1
+    assert hits[True] > 1.3 * hits[False]
+
+
+def test_explorations_together_have_all_normals():
+    known, _ = oblique_slabs(20, 100_000)
+    found = [explore(known, np.random.default_rng(seed), 1500) for seed in range(2)]
+    together = join_explorations(found)
+    assert len(together.normals) == len(together.nearest)
+    last = together.normals[-1]
+    assert np.array_equal(last, found[1].normals[-1])
+    assert np.linalg.norm(last, axis=1) == pytest.approx(1.0)
+
+
+@pytest.mark.thorough
+def test_failures_that_need_two_oblique_conditions_have_their_probability():
+    for seed in range(3):
+        known, truth = oblique_slabs(40, 50_000)
+        plan = Plan(0.95, chains_for(50_000, 0.06), np.zeros(40, bool))
+        with one_thread():
+            answer = estimate_automatically(known, np.random.default_rng(seed), plan)
+        assert answer.method == "importance"
+        assert answer.probability == pytest.approx(truth, rel=0.15)
+        assert answer.low <= 1.02 * truth
+        assert answer.high >= 0.98 * truth
+
+
 def test_other_shares_leave_the_priors():
     mixture = Mixture(
         (Prior(2), *(Gaussian(np.full(2, k), np.eye(2), np.ones(2)) for k in (1.0, 2.0))),
@@ -40,7 +112,8 @@ def test_failures_belong_to_the_region_that_they_are_in_whatever_is_nearest():
     known = cells.limit_state(50_000)
     anchors = anchors_of([explore(known, rng, 5000)], 0.1)
     mixture = anchors.fit()
-    assert len(mixture.components) == 1 + KINDS * len(anchors.regions)
+    # The prior, five components of each region, and one in the directions that decide.
+    assert len(mixture.components) == 1 + 6 * len(anchors.regions)
     z, _ = mixture.sample(rng, 20_000)
     z = z[known(z).failing]
     owner, cell = anchors.owners(z), cells.of(z)

@@ -60,7 +60,7 @@ def test_the_corner_is_that_of_a_quadratic_program(dim, count, seed):
         options={"ftol": 1e-12},
     )
     known = polytope(normals, offsets)
-    found = approach_corner(known, start[None])
+    found, _ = approach_corner(known, start[None])
     assert known(found).failing.all()
     assert np.linalg.norm(found) == pytest.approx(np.linalg.norm(solved.x), rel=3e-3)
 
@@ -70,9 +70,12 @@ def test_another_region_on_the_way_is_no_limit_of_this_one():
     normals, offsets = np.eye(3)[:2], np.array([2.5, 2.5])
     known = polytope(normals, offsets, lambda z: 0.5 + np.abs(z).sum(axis=1) / 3)
     start = np.array([[3.5, 2.6, 0.7], [2.6, 4.0, -0.5]])
-    found = approach_corner(known, start)
+    found, planes = approach_corner(known, start)
     assert known(found).failing.all()
     assert np.linalg.norm(found, axis=1) == pytest.approx(np.hypot(2.5, 2.5), rel=1e-3)
+    # The planes that meet there are told, those of the other region among them if any.
+    for own in planes:
+        assert np.abs(own @ normals.T).max(axis=0) == pytest.approx([1.0, 1.0])
 
 
 def test_a_failure_without_a_slope_stays():
@@ -85,4 +88,4 @@ def test_a_failure_without_a_slope_stays():
         gradient=lambda u: (*known.evaluate(u), np.full_like(u, np.nan)),
     )
     start = np.array([[1.5, 2.0]])
-    assert np.array_equal(approach_corner(flat, start), start)
+    assert np.array_equal(approach_corner(flat, start)[0], start)

@@ -9,7 +9,7 @@ anchors.owners(failures)                        # the region [n] of each
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +18,7 @@ from verifai_jax.estimation.components import Component, Gaussian, Marginals, Pr
 from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.fitting import (
     WIDER,
+    fit_across,
     fit_diagonal,
     fit_gaussian,
     fit_marginals,
@@ -33,10 +34,15 @@ CHAINS_WORTH = 1.5
 """Independent failures that the states of one chain are worth."""
 FAR_WIDER = 3.0
 """Factor on those of a component for what few chains have not seen of a region."""
-KINDS = 5
-"""Components of a region."""
+FEW = 8
+"""Directions that decide in a region, at most; with more of them it is bounded on all sides."""
+DIRECTION = 0.3
+"""Part of the greatest singular value of the normals from which a direction counts."""
 LEAST_WEIGHT = 0.02
 """Least weight of a chain or a centre, in parts of the greatest."""
+
+Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
+"""Components fitted to the failures of a region: the second without correlations."""
 
 
 class WeightedFailures(NamedTuple):
@@ -70,7 +76,7 @@ class Anchors:
         """Fit the components to the states of chains, and to samples where there are any.
 
         **Returns:** the mixture; for every fit it has the same kinds of components in the same
-        order, `KINDS` of each region.
+        order.
         """
         d, of_chain = self.chains.nearest.shape[1], weigh_chains(self.chains)
         fitted = list(self._by_chains)
@@ -85,9 +91,8 @@ class Anchors:
             # chains may know a part of the region only.
             row = chains[np.linalg.norm(self.chains.nearest[chains], axis=1).argmin()]
             components.append(Gaussian(self.chains.nearest[row], np.eye(d), np.ones(d)))
-            components.append(around[1].widened(FAR_WIDER))
-            components += around
-            shares += [float(of_chain[row]) ** 0.5] * KINDS
+            components += [around[1].widened(FAR_WIDER), *around]
+            shares += [float(of_chain[row]) ** 0.5] * (2 + len(around))
         share = np.array(shares) / sum(shares) * (1 - self.defensive)
         return Mixture((Prior(d), *components), np.append(self.defensive, share))
 
@@ -96,12 +101,20 @@ class Anchors:
         return np.argmax([log_ratios(each, z).max(axis=1) for each in self._by_chains], axis=0)
 
     @cached_property
-    def _by_chains(self) -> tuple[tuple[Gaussian, Gaussian, Marginals], ...]:
+    def _directions(self) -> tuple[Float[np.ndarray, "d p"] | None, ...]:
+        """Orthonormal directions that decide in each region; None where there are many, or none."""
+        if not self.chains.normals:
+            return (None,) * len(self.regions)
+        return tuple(
+            _span(np.concatenate([self.chains.normals[chain] for chain in chains]))
+            for chains in self.regions
+        )
+
+    @cached_property
+    def _by_chains(self) -> tuple[Around, ...]:
         return tuple(self._around(number) for number in range(len(self.regions)))
 
-    def _around(
-        self, number: int, samples: WeightedFailures | None = None
-    ) -> tuple[Gaussian, Gaussian, Marginals]:
+    def _around(self, number: int, samples: WeightedFailures | None = None) -> Around:
         """Fit components to a region's chains, and to samples where there are any.
 
         In many dimensions a few chains know no correlations, but how each coordinate is spread.
@@ -115,11 +128,20 @@ class Anchors:
             part = weigh_together(len(points), worth, samples.weight / samples.weight.max())
             points, part, each = np.concatenate([points, samples.z]), part / part.sum(), 1.0
         gaussian = fit_gaussian(points, part)
+        directions = self._directions[number]
         return (
             Gaussian(gaussian.mean, gaussian.axes, WIDER * gaussian.stds),
             fit_diagonal(points, part, each),
             fit_marginals(points, part, worth=each),
+            *(() if directions is None else (fit_across(points, part, directions, each),)),
         )
+
+
+def _span(normals: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "d p"] | None:
+    """Return orthonormal directions that span normals; None where they are many, or none."""
+    _, size, rows = np.linalg.svd(normals, full_matrices=False)
+    rank = int(np.sum(size > DIRECTION * size.max(initial=0.0)))
+    return rows[:rank].T if 0 < rank <= min(FEW, normals.shape[1] - 1) else None
 
 
 def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors:
@@ -138,6 +160,7 @@ def join_explorations(explorations: Sequence[Exploration]) -> Exploration:
         np.concatenate([one.nearest for one in explorations]),
         # A chain's number is above its region's, so regions stay apart as well.
         np.concatenate([one.regions + k for one, k in zip(explorations, first, strict=True)]),
+        tuple(normals for one in explorations for normals in one.normals),
     )
 
 

@@ -1,6 +1,6 @@
 """Likeliest failures where several limits meet, such as at the corner of a failing region.
 
-    nearest = approach_corner(limit_state, failures)
+    nearest, normals = approach_corner(limit_state, failures)
 
 One gradient says how a failing region ends in one direction. A step by it towards the middle of the
 prior stops at the first limit, and slides along it only as far as the next one. So the planes that
@@ -29,7 +29,7 @@ def approach_corner(
     z: Float[np.ndarray, "n d"],
     planes: int = PLANES,
     halvings: int = HALVINGS,
-) -> Float[np.ndarray, "n d"]:
+) -> tuple[Float[np.ndarray, "n d"], list[Float[np.ndarray, "_ d"]]]:
     """Move failures to the least distant ones near them, by all their tangent planes together.
 
     The way to the point that all planes allow is followed as far as it fails. What ends it there is
@@ -42,7 +42,8 @@ def approach_corner(
     - `planes`: planes of a failure, at most.
     - `halvings`: halvings of each way.
 
-    **Returns:** failures, none farther from the origin than its start.
+    **Returns:** failures, none farther from the origin than its start, and the unit normals of the
+    planes of each.
     """
     best, beyond, rows = z.copy(), z.copy(), np.arange(len(z))
     touching: list[list[tuple[Float[np.ndarray, " d"], float]]] = [[] for _ in z]
@@ -65,7 +66,8 @@ def approach_corner(
         last, beyond[rows] = halve(limit_state, best[rows], target[rows], halvings)
         nearer = np.sum(last**2, axis=1) < np.sum(best[rows] ** 2, axis=1)
         best[rows] = np.where(nearer[:, None], last, best[rows])
-    return best
+    none = np.zeros((0, z.shape[1]))
+    return best, [np.array([n for n, _ in own]) if own else none for own in touching]
 
 
 def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from verifai_jax.estimation.corners import approach_corner
+from verifai_jax.estimation.corners import approach_corner, cost_of_corner
 from verifai_jax.estimation.descents import Ends, descend_from_many
 from verifai_jax.estimation.normal_space import (
     LimitState,
@@ -76,12 +76,15 @@ class Exploration:
     - `chain_ids`: the chain `[n]` of each.
     - `nearest`: for each chain the failure `[m, d]` nearest to the origin.
     - `regions`: for each chain the number `[m]` of its region.
+    - `normals`: for each chain the unit normals `[_, d]` of planes that touch its region near its
+      least distant failure; empty without gradients.
     """
 
     points: Float[np.ndarray, "n d"]
     chain_ids: Int[np.ndarray, " n"]
     nearest: Float[np.ndarray, "m d"]
     regions: Int[np.ndarray, " m"]
+    normals: tuple[Float[np.ndarray, "_ d"], ...] = ()
 
 
 def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Exploration:
@@ -102,7 +105,9 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
         return Exploration(none, no_chain, none, no_chain)
     differentiates = limit_state.gradient is not None
     cost = WALK + round(A_PART * np.log2(1 + limit_state.dim))
-    cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS)) * differentiates
+    # A corner ends as soon as no plane is new, mostly after one.
+    corners = 2 * cost_of_corner(1, CORNERS[1])
+    cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS) + corners) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
     chains = min(max(FEWEST_CHAINS, left // cost), MOST_CHAINS, len(ends.points))
@@ -110,20 +115,22 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     z = ends.points[rows]
     if differentiates:
         z = approach_origin(limit_state, come_in(limit_state, z), FIRST_STEPS)
-        z = approach_corner(limit_state, z, *CORNERS)
+        z, _ = approach_corner(limit_state, z, *CORNERS)
     z = come_in_by_parts(limit_state, rng, z)
     groups = _regions_of(limit_state, z, groups)
     redrawn, deciding = redraw_by_parts(limit_state, rng, z)
     states, walked = walk_among_failures(limit_state, rng, redrawn, deciding, groups, WALK)
-    nearest = np.where(_squares(walked) < _squares(z), walked, z)
+    nearest, normals = np.where(_squares(walked) < _squares(z), walked, z), []
     if differentiates:
         nearest = approach_origin(limit_state, nearest)
+        nearest, normals = approach_corner(limit_state, nearest, *CORNERS)
     square = _squares(nearest)[:, 0]
     probable = square < square.min() + 2 * IMPROBABLE
     nearest, states = nearest[probable], [state[probable] for state in states]
+    normals = tuple(own for own, kept in zip(normals, probable, strict=False) if kept)
     chain_ids = np.tile(np.arange(len(nearest)), len(states))
     regions = _regions_of(limit_state, nearest)
-    return Exploration(np.concatenate(states), chain_ids, nearest, regions)
+    return Exploration(np.concatenate(states), chain_ids, nearest, regions, normals)
 
 
 def _choose_ends(

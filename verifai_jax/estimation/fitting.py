@@ -1,6 +1,7 @@
 """Components fitted to weighted failures, each in its own way.
 
     fit_gaussian(z, weight)
+    fit_across(z, weight, directions)
     marginals = fit_marginals(z, weight)
     fit_copula(z, weight, marginals)
     fit_shell(z, weight)
@@ -111,6 +112,20 @@ def fit_diagonal(
     free = (np.abs(mean) < noise) & (np.abs(np.log(stds)) < noise / np.sqrt(2))
     mean, stds = np.where(free, 0.0, mean), np.where(free, 1.0, WIDER * stds)
     return Gaussian(mean, np.eye(z.shape[1]), np.clip(stds, 1e-4, 5.0))
+
+
+def fit_across(
+    z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"],
+    directions: Float[np.ndarray, "d p"],
+    worth: float = 1.0,
+) -> Gaussian:
+    """Fit a Gaussian in orthonormal directions, a little wider; across them it is the prior."""
+    within = fit_gaussian(z @ directions, weight, worth)
+    others = np.linalg.qr(directions, mode="complete")[0][:, directions.shape[1] :]
+    axes = np.concatenate([directions @ within.axes, others], axis=1)
+    stds = np.append(WIDER * within.stds, np.ones(others.shape[1]))
+    return Gaussian(directions @ within.mean, axes, stds)
 
 
 def fit_gaussian_mixture(

@@ -181,7 +181,7 @@ def _approach_corners(limit_state: LimitState, regions: Regions) -> None:
     ends = regions.design_points
     likeliest = np.argsort(np.sum(ends**2, axis=1), kind="stable")
     rows = likeliest[: max(0, _left(limit_state)) // cost_of_corner()]
-    regions.add(approach_corner(limit_state, ends[rows]), rows)
+    regions.add(approach_corner(limit_state, ends[rows])[0], rows)
 
 
 def _shrink(
