@@ -34,7 +34,7 @@ CHAINS_WORTH = 1.5
 """Independent failures that the states of one chain are worth."""
 FAR_WIDER = 3.0
 """Factor on those of a component for what few chains have not seen of a region."""
-FEW = 8
+MOST_DIRECTIONS = 8
 """Directions that decide in a region, at most; with more of them it is bounded on all sides."""
 DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
@@ -141,7 +141,7 @@ def _span(normals: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "d p"] | None:
     """Return orthonormal directions that span normals; None where they are many, or none."""
     _, size, rows = np.linalg.svd(normals, full_matrices=False)
     rank = int(np.sum(size > DIRECTION * size.max(initial=0.0)))
-    return rows[:rank].T if 0 < rank <= min(FEW, normals.shape[1] - 1) else None
+    return rows[:rank].T if 0 < rank <= min(MOST_DIRECTIONS, normals.shape[1] - 1) else None
 
 
 def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors:
