@@ -106,7 +106,7 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     differentiates = limit_state.gradient is not None
     cost = WALK + round(A_PART * np.log2(1 + limit_state.dim))
     # A corner ends as soon as no plane is new, mostly after one.
-    corners = 2 * cost_of_corner(1, CORNERS[1])
+    corners = cost_of_corner(1, CORNERS[1])
     cost += (HALVINGS + 3 * (FIRST_STEPS + NEAREST_STEPS) + corners) * differentiates
     telling = round(TELLING_APART * simulations)
     left = simulations - telling - (limit_state.simulations - begin)
@@ -115,7 +115,6 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     z = ends.points[rows]
     if differentiates:
         z = approach_origin(limit_state, come_in(limit_state, z), FIRST_STEPS)
-        z, _ = approach_corner(limit_state, z, *CORNERS)
     z = come_in_by_parts(limit_state, rng, z)
     groups = _regions_of(limit_state, z, groups)
     redrawn, deciding = redraw_by_parts(limit_state, rng, z)
