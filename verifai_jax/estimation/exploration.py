@@ -118,6 +118,13 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     z = come_in_by_parts(limit_state, rng, z)
     groups = _regions_of(limit_state, z, groups)
     redrawn, deciding = redraw_by_parts(limit_state, rng, z)
+    whole = deciding.all(axis=1)
+    if differentiates and whole.any():
+        # Oblique to the features all of them decide, far out as well; walks begin on the way in.
+        z[whole], _ = approach_corner(limit_state, z[whole], *CORNERS)
+        middle = (z[whole] + redrawn[whole]) / 2
+        fails = scores_of(limit_state, middle) == -np.inf
+        redrawn[whole] = np.where(fails[:, None], middle, redrawn[whole])
     states, walked = walk_among_failures(limit_state, rng, redrawn, deciding, groups, WALK)
     nearest, normals = np.where(_squares(walked) < _squares(z), walked, z), []
     if differentiates:
