@@ -12,7 +12,7 @@ from verifai_jax.estimation.initial_proposal import compare_explorations
 from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatically
 from verifai_jax.estimation.mixture import Mixture
 from verifai_jax.estimation.normal_space import farthest_first
-from verifai_jax.estimation.paths import connected
+from verifai_jax.estimation.paths import connected, halve
 
 
 def metaballs(z):
@@ -74,6 +74,16 @@ def test_paths_join_points_of_one_region_only():
     # Around a circle only the arc leads.
     outside = limit_state(lambda z: 4.0 - np.linalg.norm(z, axis=1), 2, 1000)
     assert connected(outside, np.array([[4.1, 0.0]]), np.array([[-1.0, 4.0]])).tolist() == [True]
+
+
+def test_a_way_is_followed_to_where_failures_end():
+    known = limit_state(lambda z: 2.0 - z[:, 0], 2, 1000)
+    begin, end = np.array([[4.0, 1.0], [3.0, -5.0]]), np.array([[0.0, 0.0], [1.0, 5.0]])
+    last, beyond = halve(known, begin, end, 12)
+    assert known(last).failing.all()
+    assert not known(beyond).failing.any()
+    assert last == pytest.approx(np.array([[2.0, 0.5], [2.0, 0.0]]), abs=0.01)
+    assert beyond == pytest.approx(last, abs=0.01)
 
 
 def gaussian(*mean):

@@ -181,7 +181,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
 def _places_ahead(limit_state: LimitState, descents: _Descents) -> Float[np.ndarray, "n d"]:
     """Return where the slope at each point says that the limit state is; the point without one.
 
-    Farther than one step is not looked.
+    It is looked for no farther than one step leads.
     """
     direction, norm, rows = _downhill(limit_state, descents)
     steps = np.zeros_like(descents.z)
