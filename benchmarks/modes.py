@@ -132,11 +132,16 @@ def cells(dim: int, count: int) -> Planted:
     return Planted(problem, masses, None, lambda x: np.max(np.abs(x - centres) - reach, axis=1))
 
 
+def pairs_of_axes(random: np.random.Generator, dim: int, count: int) -> np.ndarray:
+    """Two oblique directions `[count, 2, dim]` for each mode, all of them at right angles."""
+    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T[: 2 * count]
+    return axes.reshape(count, 2, dim)
+
+
 def slabs(dim: int, count: int) -> Planted:
     """Normal features within an interval in two directions oblique to them, other ones each."""
     random = np.random.default_rng(5000 * dim + count)
-    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T[: 2 * count]
-    axes = axes.reshape(count, 2, dim)
+    axes = pairs_of_axes(random, dim, count)
     centres = random.uniform(2.2, 3.0, (count, 2)) * random.choice([-1, 1], (count, 2))
     reach = random.uniform(0.15, 0.4, (count, 2))
     masses = np.prod(norm.cdf(centres + reach) - norm.cdf(centres - reach), axis=1)
@@ -157,8 +162,7 @@ def slabs(dim: int, count: int) -> Planted:
 def corners(dim: int, count: int) -> Planted:
     """Normal features beyond limits in two directions oblique to them at once, other ones each."""
     random = np.random.default_rng(6000 * dim + count)
-    axes = np.linalg.qr(random.standard_normal((dim, dim)))[0].T[: 2 * count]
-    axes = axes.reshape(count, 2, dim)
+    axes = pairs_of_axes(random, dim, count)
     limits = random.uniform(2.0, 2.7, (count, 2))
     directions, offsets = jnp.asarray(axes, jnp.float32), jnp.asarray(limits, jnp.float32)
     factors = jnp.asarray(np.exp(random.uniform(-0.7, 0.7, count)), jnp.float32)
@@ -189,10 +193,9 @@ DIMENSIONS = {
     "slabs": (10, 50),
     "corners": (10, 50),
 }
+"""Least and most of a shape: in more dimensions nothing but luck finds a ball."""
 OBLIQUE = ("slabs", "corners")
 """Shapes of which a mode takes two dimensions, so that at most half as many fit."""
-
-"""Least and most of a shape: in more dimensions nothing but luck finds a ball."""
 
 
 def measure(shape: str, dim: int, count: int, budget: int, seeds: int) -> str:

@@ -18,6 +18,13 @@ from verifai_jax.estimation.methods import Plan, chains_for, estimate_automatica
 from verifai_jax.estimation.mixture import Mixture
 
 
+def estimated(known, seed):
+    """The answer of `estimate` with a budget of 50 000."""
+    plan = Plan(0.95, chains_for(50_000, 0.06), np.zeros(known.dim, bool))
+    with one_thread():
+        return estimate_automatically(known, np.random.default_rng(seed), plan)
+
+
 def test_coordinates_like_the_priors_are_the_priors():
     rng = np.random.default_rng(0)
     z = rng.standard_normal((60, 10))
@@ -90,9 +97,7 @@ def test_explorations_together_have_all_normals():
 def test_failures_that_need_two_oblique_conditions_have_their_probability():
     for seed in range(3):
         known, truth = oblique_slabs(40, 50_000)
-        plan = Plan(0.95, chains_for(50_000, 0.06), np.zeros(40, bool))
-        with one_thread():
-            answer = estimate_automatically(known, np.random.default_rng(seed), plan)
+        answer = estimated(known, seed)
         assert answer.method == "importance"
         assert answer.probability == pytest.approx(truth, rel=0.15)
         assert answer.low <= 1.02 * truth
@@ -149,9 +154,7 @@ def test_failures_that_need_a_few_of_many_features_have_their_probability(gradie
     truth = cells.masses.sum()
     for seed in range(2):
         known = cells.limit_state(50_000, gradient)
-        plan = Plan(0.95, chains_for(50_000, 0.06), np.zeros(20, bool))
-        with one_thread():
-            answer = estimate_automatically(known, np.random.default_rng(seed), plan)
+        answer = estimated(known, seed)
         assert answer.method == "importance"
         assert answer.probability == pytest.approx(truth, rel=0.1)
         assert answer.low <= 1.01 * truth

@@ -15,7 +15,7 @@ Industrial and Applied Mathematics 8 (1960); Lawson and Hanson, Solving Least Sq
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, fails_at
 from verifai_jax.estimation.paths import halve
 
 PLANES, HALVINGS = 6, 10
@@ -60,7 +60,7 @@ def approach_corner(
         rows = np.flatnonzero(np.sum(target**2, axis=1) < np.sum(best**2, axis=1))
         if not len(rows):
             break
-        fails = scores_of(limit_state, target[rows]) == -np.inf
+        fails = fails_at(limit_state, target[rows])
         best[rows[fails]] = target[rows[fails]]
         rows = rows[~fails]
         last, beyond[rows] = halve(limit_state, best[rows], target[rows], halvings)

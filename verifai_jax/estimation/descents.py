@@ -276,14 +276,14 @@ def _descend_by_gradient(
         descents.replace(rows[better], new.of(np.flatnonzero(better)))
         misses[rows[~better]] += 1
         longest[rows] = np.where(better, longest[rows], np.minimum(longest[rows], size) / 2)
-        before, (directions, slopes, usable) = rows, _downhill(limit_state, descents)
-        fell = better & np.isin(before, usable)
+        directions, slopes, usable = _downhill(limit_state, descents)
+        fell = better & np.isin(rows, usable)
         fell &= (new.score > 0) & (new.score < FELL * score)
-        rows = before[fell]
-        exponent = np.log(slopes[rows] / slope[fell]) / np.log(new.score[fell] / score[fell])
+        lower = rows[fell]
+        exponent = np.log(slopes[lower] / slope[fell]) / np.log(new.score[fell] / score[fell])
         estimate = 1 / np.clip(1 - exponent, 1 / MOST_POWER, 1.0)
         # Where the way turns, another part of the system may have a slope of its own.
-        straight_on = np.sum(directions[rows] * direction[fell], axis=1) > STRAIGHT
-        power[rows] = np.where(straight_on, estimate, np.sqrt(power[rows] * estimate))
+        straight_on = np.sum(directions[lower] * direction[fell], axis=1) > STRAIGHT
+        power[lower] = np.where(straight_on, estimate, np.sqrt(power[lower] * estimate))
         rows = usable
     return given_up

@@ -18,6 +18,7 @@ Lind, Exact and invariant second-moment code format, Journal of the Engineering 
 """
 
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,8 +27,8 @@ from verifai_jax.estimation.corners import approach_corner, cost_of_corner
 from verifai_jax.estimation.descents import Ends, descend_from_many
 from verifai_jax.estimation.normal_space import (
     LimitState,
+    fails_at,
     farthest_first,
-    scores_of,
     squared_distances,
 )
 from verifai_jax.estimation.towards_origin import (
@@ -123,8 +124,8 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
         # Oblique to the features all of them decide, far out as well; walks begin on the way in.
         z[whole], _ = approach_corner(limit_state, z[whole], *CORNERS)
         middle = (z[whole] + redrawn[whole]) / 2
-        fails = scores_of(limit_state, middle) == -np.inf
-        redrawn[whole] = np.where(fails[:, None], middle, redrawn[whole])
+        fails = fails_at(limit_state, middle)[:, None]
+        redrawn[whole] = np.where(fails, middle, redrawn[whole])
     states, walked = walk_among_failures(limit_state, rng, redrawn, deciding, groups, WALK)
     nearest, normals = np.where(_squares(walked) < _squares(z), walked, z), []
     if differentiates:
@@ -133,10 +134,10 @@ def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int)
     square = _squares(nearest)[:, 0]
     probable = square < square.min() + 2 * IMPROBABLE
     nearest, states = nearest[probable], [state[probable] for state in states]
-    normals = tuple(own for own, kept in zip(normals, probable, strict=False) if kept)
     chain_ids = np.tile(np.arange(len(nearest)), len(states))
     regions = _regions_of(limit_state, nearest)
-    return Exploration(np.concatenate(states), chain_ids, nearest, regions, normals)
+    touching = tuple(compress(normals, probable))
+    return Exploration(np.concatenate(states), chain_ids, nearest, regions, touching)
 
 
 def _choose_ends(
@@ -226,7 +227,7 @@ def _joined(
     for other in others.T:
         tried = np.flatnonzero((other < places) & (group[other] != group))
         middle = (z[tried] + z[other[tried]]) / 2
-        for row in tried[scores_of(limit_state, middle) == -np.inf]:
+        for row in tried[fails_at(limit_state, middle)]:
             group[group == group[row]] = group[other[row]]
     return np.unique(group, return_inverse=True)[1]
 

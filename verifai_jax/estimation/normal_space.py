@@ -243,6 +243,11 @@ def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.
     return score
 
 
+def fails_at(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
+    """Simulate points, and return which fail; none does where the constraint refuses it."""
+    return scores_of(limit_state, z) == -np.inf
+
+
 def squared_distances(
     z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
 ) -> Float[np.ndarray, "n m"]:

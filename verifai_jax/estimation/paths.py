@@ -10,7 +10,7 @@ about the origin at the distances of its ends, which follows a region that lies 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, fails_at
 
 PLACES = np.array([0.5, 0.25, 0.75, 0.1, 0.9])
 """Places of a path that are simulated, the middle first."""
@@ -33,7 +33,7 @@ def connected(
         for place in PLACES:
             if not len(rows):
                 break
-            fails = scores_of(limit_state, path(a[rows], b[rows], place)) == -np.inf
+            fails = fails_at(limit_state, path(a[rows], b[rows], place))
             rows = rows[fails]
         joined[rows] = True
     return joined
@@ -59,7 +59,7 @@ def halve(
     low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))
     for _ in range(halvings):
         middle = (low + high) / 2
-        fails = (scores_of(limit_state, _straight(begin, end, middle)) == -np.inf)[:, None]
+        fails = fails_at(limit_state, _straight(begin, end, middle))[:, None]
         low, high = np.where(fails, middle, low), np.where(fails, high, middle)
     return _straight(begin, end, low), _straight(begin, end, high)
 

@@ -17,7 +17,7 @@ Engineering 28 (2002), for the order of the parts.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, fails_at, scores_of
 from verifai_jax.estimation.paths import halve
 
 HALVINGS = 5
@@ -113,11 +113,11 @@ def _replace_by_parts(
         end = np.minimum(begin[rows] + size[rows], count[rows])[:, None]
         part = (place[rows] >= begin[rows, None]) & (place[rows] < end)
         moved = np.where(part, values[rows], z[rows])
-        fails = scores_of(limit_state, moved) == -np.inf
+        fails = fails_at(limit_state, moved)
         # Another region may fail there too: in the same one the middle of the way fails as well.
         tried = np.flatnonzero(fails)
         middle = (moved[tried] + z[rows[tried]]) / 2
-        fails[tried] = scores_of(limit_state, middle) == -np.inf
+        fails[tried] = fails_at(limit_state, middle)
         z[rows] = np.where(fails[:, None], moved, z[rows])
         kept[rows] &= ~(part & fails[:, None])
         begin[rows] += size[rows]

@@ -13,7 +13,7 @@ Probabilistic Engineering Mechanics 41 (2015), for the moves and their adaptatio
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.estimation.normal_space import LimitState, scores_of
+from verifai_jax.estimation.normal_space import LimitState, fails_at
 from verifai_jax.estimation.splitting import ACCEPTED
 
 FIRST, WIDEST = 0.5, 0.98
@@ -53,7 +53,7 @@ def walk_among_failures(
         part = deciding == (kind == 1)[:, None]
         scale = scales[groups, kind][:, None] * part
         moved = np.sqrt(1 - scale**2) * z + scale * rng.standard_normal(z.shape)
-        take = scores_of(limit_state, moved) == -np.inf
+        take = fails_at(limit_state, moved)
         z = np.where(take[:, None], moved, z)
         tried, taken = np.zeros(scales.shape), np.zeros(scales.shape)
         np.add.at(tried, (groups, kind), 1)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.corners import approach_corner, cost_of_corner
-from verifai_jax.estimation.normal_space import LimitState, farthest_first, scores_of
+from verifai_jax.estimation.normal_space import LimitState, fails_at, farthest_first
 from verifai_jax.estimation.paths import connected
 from verifai_jax.estimation.towards_origin import approach_origin, come_in_by_parts
 from verifai_jax.failure_modes.regions import Regions
@@ -201,7 +201,7 @@ def _shrink(
         turned = z + rng.standard_normal(z.shape) * length[:, None] * deciding
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
         moved = turned * size * (1 - 0.3 * length[:, None] * rng.random((len(z), 1)))
-        fails = scores_of(limit_state, moved) == -np.inf
+        fails = fails_at(limit_state, moved)
         z = np.where(fails[:, None], moved, z)
         length = np.clip(length * np.where(fails, 1.3, 0.85), 1e-4, 1.0)
     return z
