@@ -6,6 +6,7 @@ After a deliberate change, write the list anew and read its difference:
 """
 
 import ast
+import enum
 import importlib
 import inspect
 import re
@@ -37,7 +38,25 @@ ROOMS = (
 def annotation_text(annotation: Any) -> str:
     """Return an annotation without the modules that its names come from."""
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
-    return re.sub(r"\b(?:[A-Za-z_]\w*\.)+([A-Za-z_]\w*)", r"\1", text.replace("~", ""))
+    text = re.sub(r"\b(?:[A-Za-z_]\w*\.)+([A-Za-z_]\w*)", r"\1", text.replace("~", ""))
+    return alternatives(re.sub(r"ForwardRef\('(\w+)'\)", r"\1", text))
+
+
+def alternatives(text: str) -> str:
+    """Write every `Union[A, B, NoneType]` as `A | B | None`: versions print either."""
+    while (start := text.find("Union[")) >= 0:
+        parts, depth, position = [""], 0, start + len("Union[")
+        while depth or text[position] != "]":
+            character = text[position]
+            depth += (character in "[(") - (character in ")]")
+            if character == "," and not depth:
+                parts.append("")
+            else:
+                parts[-1] += character
+            position += 1
+        names = ["None" if part.strip() == "NoneType" else part.strip() for part in parts]
+        text = text[:start] + " | ".join(names) + text[position + 1 :]
+    return text
 
 
 def default_text(default: Any) -> str:
@@ -45,7 +64,9 @@ def default_text(default: Any) -> str:
 
 
 def signature_text(function: Callable[..., Any]) -> str:
-    """Return a signature: names, kinds, annotations and defaults."""
+    """Return a signature: names, kinds, annotations and defaults; none of an enumeration."""
+    if isinstance(function, enum.EnumType):
+        return ""
     try:
         signature = inspect.signature(function)
     except (ValueError, TypeError):

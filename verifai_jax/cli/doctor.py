@@ -29,12 +29,36 @@ EXTRAS = {
 """Optional packages, and the extra of verifai_jax that installs each."""
 
 
+class Tested(NamedTuple):
+    """Versions with which all tests of this version of the package have passed.
+
+    - `python`, `jax`, `numpy`: versions.
+    - `platform`: operating system and processor, as `platform` names them.
+    """
+
+    python: str
+    jax: str
+    numpy: str
+    platform: str
+
+    def __str__(self) -> str:
+        """Write them in one line."""
+        return f"Python {self.python}, jax {self.jax}, numpy {self.numpy} on {self.platform}"
+
+
+TESTED = (
+    Tested("3.11", "0.10.2", "2.4.6", "Linux x86_64"),
+    Tested("3.13", "0.12.0.1", "2.5.5", "Linux x86_64"),
+)
+"""What has been tested: the versions of constraints.txt."""
+
+
 class BadPair(NamedTuple):
-    """Versions of two packages that are known not to work together.
+    """Versions of two packages that are known not to work together, or of one that has a defect.
 
     - `package`, `versions`: one package, and its versions `[least, below)`; None is no bound.
-    - `other`, `others`: the other package, likewise.
-    - `problem`: a sentence on what goes wrong, and the remedy.
+    - `other`, `others`: the other package, likewise; the same package again for a defect of one.
+    - `problem`: a sentence on what goes wrong, what it means for a verdict, and the remedy.
     """
 
     package: str
@@ -46,18 +70,29 @@ class BadPair(NamedTuple):
 
 BAD_PAIRS = (
     BadPair(
+        "mujoco",
+        ("4.0.0", "4.0.1"),
+        "mujoco",
+        (None, None),
+        "with a sparse constraint Jacobian the Newton solver may give wrong accelerations "
+        "(MuJoCo's issue 3767), so verdicts of native simulations may be wrong; MJX has a solver "
+        "of its own. MuJoCo takes a sparse one from 60 degrees of freedom on. Write <option "
+        "jacobian='dense'/> into the model, or install mujoco 4.0.1 or newer",
+    ),
+    BadPair(
         "brax",
         (None, "0.15"),
         "mujoco",
         ("4.0", None),
-        "its swimmer does not work on any backend; the other environments do",
+        "its swimmer does not work on any backend, so every simulation of it is an error and none "
+        "a verdict; the other environments work",
     ),
     BadPair(
         "gymnax",
         (None, "1.0"),
         "jax",
         ("0.5", None),
-        "pip fell back to an old gymnax, whose step returns other values; "
+        "pip fell back to an old gymnax, whose step returns other values, so verdicts are wrong; "
         "pip install 'gymnax>=1.0.1'",
     ),
     BadPair(
@@ -65,8 +100,9 @@ BAD_PAIRS = (
         ("1.0", "1.1"),
         "jax",
         ("0.12", None),
-        "gymnax asks for jax below 0.12: environments may not import; use Python 3.11 with "
-        "jax 0.10",
+        "gymnax asks for jax below 0.12, so pip does not install the two together. Its "
+        "environments pass our tests with jax 0.12.0 all the same, so verdicts stand; gymnax "
+        "itself promises to work with pip install 'jax<0.12'",
     ),
 )
 """Known bad pairs."""
@@ -81,6 +117,7 @@ def doctor() -> None:
         packages={package: _version(package) for package in (*PACKAGES, *EXTRAS)},
         python=platform.python_version(),
         cores=available_cores(),
+        tested=[each._asdict() for each in TESTED],
         report=text.splitlines(),
     )
 
@@ -101,6 +138,7 @@ def report() -> str:
         missing = f"not installed: pip install 'verifai_jax[{extra}]'"
         lines.append(f"{package:<12}{installed[package] or missing}")
     lines += [f"  advice: {problem}" for problem in bad_pairs(installed)]
+    lines += _tested(installed)
     devices = jax.devices()
     lines.append(f"devices     {len(devices)} x {devices[0].platform}")
     cores = available_cores()
@@ -118,13 +156,30 @@ def report() -> str:
 
 def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
     """List known problems between installed versions, given by package name."""
-    return [
-        f"{pair.package} {installed[pair.package]} with {pair.other} {installed[pair.other]}: "
-        f"{pair.problem}"
-        for pair in BAD_PAIRS
-        if _within(installed.get(pair.package), *pair.versions)
-        and _within(installed.get(pair.other), *pair.others)
-    ]
+    found = []
+    for pair in BAD_PAIRS:
+        one, other = installed.get(pair.package), installed.get(pair.other)
+        if _within(one, *pair.versions) and _within(other, *pair.others):
+            alongside = "" if pair.other == pair.package else f" with {pair.other} {other}"
+            found.append(f"{pair.package} {one}{alongside}: {pair.problem}")
+    return found
+
+
+def _tested(installed: Mapping[str, str | None]) -> list[str]:
+    """Say which versions have been tested, and whether those of this process are among them."""
+    here = Tested(
+        ".".join(platform.python_version_tuple()[:2]),
+        installed["jax"] or "missing",
+        installed["numpy"] or "missing",
+        f"{platform.system()} {platform.machine()}",
+    )
+    lines = [f"tested      {each}" for each in TESTED]
+    if here not in TESTED:
+        lines.append(
+            f"  advice: {here} has not been tested as a whole; a verdict that matters is worth a "
+            "replay with versions that have (constraints.txt of the source has all of them)"
+        )
+    return lines
 
 
 def _version(package: str) -> str | None:

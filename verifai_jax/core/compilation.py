@@ -14,7 +14,7 @@ with less of that (`Effort`): it is compiled in a half to a fifth of the time.
 import gc
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from functools import cache
@@ -190,9 +190,26 @@ def options_of(effort: Effort) -> dict[str, Any] | None:
         return None
     if jax.config.read("jax_disable_most_optimizations"):
         return None  # The user of this switch wants the least of all programs.
+    return known_options(options) or None
+
+
+def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of XLA's compile options that the XLA of this process knows.
+
+    XLA adds options and drops them from one version to the next, refuses a program with one that
+    it does not know, and ends a process that gets it in `XLA_FLAGS`.
+
+    **Arguments:**
+
+    - `options`: values by their names.
+    """
     nothing = jax.jit(lambda: np.float32(0)).lower()
-    try:
-        nothing.compile(compiler_options=options)
-    except jax.errors.JaxRuntimeError:
-        return None  # Other versions of XLA do not know them.
-    return options
+
+    def is_known(name: str) -> bool:
+        try:
+            nothing.compile(compiler_options={name: options[name]})
+        except jax.errors.JaxRuntimeError:
+            return False
+        return True
+
+    return {name: options[name] for name in options if is_known(name)}

@@ -23,8 +23,8 @@ from verifai_jax.core.steps import as_function, of_some
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
-_NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device")
-"""Classes of JAX whose text says all of them."""
+_NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device", "FTTuple")
+"""Classes of JAX whose text says all of them; the last one groups the operands of a loop (0.12)."""
 
 
 class _Unknown(Exception):

@@ -86,7 +86,8 @@ TRACING_BY_WORDS = {
         f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "
         "length there can be, and jnp.where(jnp.arange(most) < length, values, other)"
     ),
-    "Slice entries must be static": (
+    # The first are the words of JAX 0.10, the second of 0.12.
+    "Slice entries must be static|Array slice indices must have static": (
         f"it cuts out a piece whose ends are values, and {ONCE_FOR_ALL}. Use "
         "jax.lax.dynamic_slice for a piece of one length, or jnp.where over all entries"
     ),

@@ -84,9 +84,9 @@ def _results(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> li
     if name in _CALLS and _CALLS[name] in options:
         return _sweep(_program(options[_CALLS[name]]), moved)
     if name == "scan":
-        count = options["num_consts"]
-        fixed, carry = moved[:count], moved[count : count + options["num_carry"]]
-        rows = moved[count + options["num_carry"] :]
+        constants, carried = _operands_of_scan(options)
+        fixed, carry = moved[:constants], moved[constants : constants + carried]
+        rows = moved[constants + carried :]
         return _repeated(_program(options["jaxpr"]), fixed, carry, rows)
     if name == "while":
         test, count = options["cond_nconsts"], options["body_nconsts"]
@@ -98,6 +98,14 @@ def _results(program: jax.extend.core.Jaxpr, step: Any, moved: list[bool]) -> li
     if name.startswith("scatter") or (step.primitive in ad.primitive_jvps and not _nested(step)):
         return [name not in _FLAT] * len(step.outvars)
     return _differentiated(program, step, moved)
+
+
+def _operands_of_scan(options: dict[str, Any]) -> tuple[int, int]:
+    """Return how many operands of a scan are constants and how many are carried."""
+    if "ft_in" in options:  # JAX 0.12 groups the operands, versions before it count them.
+        constants, carried, _ = options["ft_in"].unpack()
+        return len(constants), len(carried)
+    return options["num_consts"], options["num_carry"]
 
 
 def _nested(step: Any) -> bool:

@@ -210,15 +210,14 @@ def difference(one: Program, other: Program) -> tuple[bool, str | None]:
 
     Operations, the constants among their operands, and plain parameters are compared.
     """
-    if isinstance(one, Jaxpr) or isinstance(other, Jaxpr):
-        pair = [each.jaxpr if isinstance(each, ClosedJaxpr) else each for each in (one, other)]
-        return _difference(*pair)
-    for a, b in zip(one.consts, other.consts, strict=False):
+    # From JAX 0.12 on both are one class; before, a program inside an operation has no constants.
+    constants, others = (getattr(each, "consts", ()) for each in (one, other))
+    for a, b in zip(constants, others, strict=False):
         if not _same_value(a, b):
             return True, _line_of_constant(one, a)
-    if len(one.consts) != len(other.consts):
+    if len(constants) != len(others):
         return True, None
-    return _difference(one.jaxpr, other.jaxpr)
+    return _difference(*(getattr(each, "jaxpr", each) for each in (one, other)))
 
 
 def _difference(one: Jaxpr, other: Jaxpr) -> tuple[bool, str | None]:
@@ -270,7 +269,7 @@ def _same_value(one: object, other: object) -> bool:
         return True
 
 
-def _line_of_constant(program: ClosedJaxpr, constant: object) -> str | None:
+def _line_of_constant(program: Any, constant: object) -> str | None:
     """Return the line of the first operation on a constant."""
     place = next(i for i, value in enumerate(program.consts) if value is constant)
     variable = program.jaxpr.constvars[place]
