@@ -2,18 +2,23 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help falsify test test-slow test-all lint notebooks notebooks-update bench policy wheel docs clean
+.PHONY: help falsify test test-slow test-all test-changed prove lint notebooks notebooks-update bench \
+  policy wheel docs constraints clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
 	@echo "make test       set up, then run the quick tests of every room"
-	@echo "make test-all   these and the slow ones: parity, statistics, training"
+	@echo "make test-slow  the slower ones, which compile more; .ci/run has them, too"
+	@echo "make test-changed  all tests of what differs from main: BASE=REVISION for another one"
+	@echo "make prove      what proves a number over many seeds: rates, coverage, learning curves"
+	@echo "make test-all   all of these"
 	@echo "make lint       ruff and pyright"
 	@echo "make notebooks  execute the notebooks; their text must be what is stored"
 	@echo "make notebooks-update  execute the notebooks and store what they show"
 	@echo "make docs       build the documentation as a site, out/site/index.html"
 	@echo "make bench      measure; see benchmarks/RESULTS.md"
 	@echo "make policy     train the networks again from their seeds (the hopper: 7 minutes)"
+	@echo "make constraints  write constraints.txt anew; VERSIONS=--newest for the newest of everything"
 
 # Debian splits venv's pip into a package of its own; where it is missing, the pip of the system
 # fills the environment.
@@ -50,21 +55,27 @@ falsify: .venv/installed
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
 # Tests of one file share what they compile, so a file stays with one worker; long files begin.
-AS_A_USER := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
-# With XLA's older emitters of loops tests take a quarter to a third less processor time.
-PYTEST := XLA_FLAGS="--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1" \
-  $(AS_A_USER)
+AS_A_USER := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10
+# Programs of tests run for moments, so they are compiled in a hurry. Which flags do that depends on
+# the version of XLA, which ends a process that gets one it does not know.
+PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$$($(BIN)/python tests/xla_flags.py)" $(AS_A_USER)
 
 test: .venv/installed
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST)
+	$(PYTEST)
 
-# What a training ends with depends on every rounding, so slow tests of it compile as a user does.
 test-slow: .venv/extras
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(PYTEST) -m "thorough and not slow"
-	$(PYTEST) -m slow --ignore tests/rl
-	$(AS_A_USER) -m slow tests/rl
+	$(PYTEST) -m "(thorough or slow) and not proves"
 
-test-all: test test-slow
+# What a training ends with depends on every rounding, so these compile as a user does.
+prove: .venv/extras
+	$(AS_A_USER) -m proves
+
+test-all: test test-slow prove
+
+BASE ?= main
+test-changed: .venv/extras
+	@tests="$$($(BIN)/python tests/changed.py $(BASE))" && if [ -n "$$tests" ]; then \
+	  $(PYTEST) -m "" $$tests; fi
 
 lint: .venv/lint
 	$(BIN)/ruff check .
@@ -113,6 +124,11 @@ wheel: .venv/lint
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/python -m twine check --strict dist/*
 	sh tests/wheel_smoke.sh dist/*.whl
+
+# For Pythons that are not here, too; then `.ci/run` on each.
+constraints: .venv/lint
+	$(BIN)/python -m pip install -q --disable-pip-version-check uv
+	$(BIN)/python .ci/constraints.py $(VERSIONS)
 
 clean:
 	rm -rf .venv .venv-bench dist build .pytest_cache .ruff_cache

@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "verifai_jax"
 
@@ -123,7 +121,6 @@ def test_a_circle_would_be_found():
     assert circles(edges) == [names]
 
 
-@pytest.mark.thorough
 def test_imports_point_downwards():
     level = {room: height for height, layer in enumerate(LAYERS) for room in layer}
     wrong = []

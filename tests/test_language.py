@@ -82,7 +82,6 @@ def test_first_words_are_noticed():
     assert list(questioning(ast.parse(source))) == [(1, "Whether it holds."), (2, "How.")]
 
 
-@pytest.mark.thorough
 def test_arguments_have_types():
     annotations = [
         text for file in FILES for text in argument_annotations(ast.parse(file.read_text()))

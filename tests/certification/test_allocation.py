@@ -48,7 +48,7 @@ def test_names_the_safest_with_a_fifth_of_uniform_samples(rates, uniform):
     assert np.mean([cost for _, cost in runs]) <= uniform / 5
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize("rates", [FACTS, ONE_CLEAR, NEAR_TIES], ids=["facts", "clear", "ties"])
 def test_names_the_safest_in_200_runs(rates):
     runs = [raced(rates, run) for run in range(200)]
@@ -107,7 +107,7 @@ HARD = np.concatenate([np.full(8, P), [0.0, 0.01, 0.02, 0.03, 0.08, 0.1, 0.2, 0.
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("runs", "budget"), [(15, 12_000), pytest.param(120, 40_000, marks=pytest.mark.slow)]
+    ("runs", "budget"), [(15, 12_000), pytest.param(120, 40_000, marks=pytest.mark.proves)]
 )
 def test_verdicts_are_wrong_in_few_of_many_runs(runs, budget):
     found = [certified(HARD, run, P, budget)[0] for run in range(runs)]

@@ -62,7 +62,7 @@ def certificates(memo):
     return certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=remember)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_verdicts_of_known_rates(certificates):
     verdicts = [row.verdict for row in certificates.rows]
     assert verdicts == ["safe@0.1", "safe@0.1", "unsafe", "safe@0.1", "unsafe"]

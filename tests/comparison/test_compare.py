@@ -125,7 +125,7 @@ def test_verdicts_of_intervals():
     assert judge(at(0.0, 0.0), 0.0) == "undecided"
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize(("first", "second"), [(0.001, 0.006), (0.01, 0.01), (0.0, 0.02)])
 def test_intervals_hold_at_all_times(first, second):
     rng = np.random.default_rng(7)

@@ -67,7 +67,7 @@ def test_a_program_with_an_adaptive_solver():
         assert trace["F"][round((i + 1) * dt * 100)] == pytest.approx(state[3], abs=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_many_pieces_break_it_and_twenty_do_not():
     """The steepest input of n pieces at the best instant, by linear responses, then simulated."""
     system = model.steam_condenser()

@@ -103,7 +103,7 @@ def test_one_look_is_what_the_loop_saw_there_and_late_is_too_late():
     assert wrong.max() < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize("problem", PERFECT, ids=lambda p: p.name)
 def test_nothing_fails_that_sees_perfectly(problem):
     run = vj.falsify(problem, "uniform", budget=10_000, seed=1)
@@ -113,7 +113,7 @@ def test_nothing_fails_that_sees_perfectly(problem):
     assert not len(searched.table.counterexamples)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_the_narrow_network_does_not_see_cones_before_an_orange_car():
     run = vj.falsify(specs.narrow, "uniform", budget=2048, seed=1, confirm=False)
     table = run.table.all
@@ -126,7 +126,7 @@ def test_the_narrow_network_does_not_see_cones_before_an_orange_car():
     assert all("car_hue <= 0." in str(rule) for rule in rules)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_the_wide_network_collides_after_few_images():
     collisions = replace(specs.wide, spec=specs.SAFE, priority=None)
     result = vj.perception.abstract(

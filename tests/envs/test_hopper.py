@@ -137,7 +137,7 @@ def test_the_task_starts_as_it_says():
     np.testing.assert_array_equal(seen[:5], states.qpos[0, 1:])
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_the_policy_earns_in_mjx_what_its_notes_say():
     returns = evaluate(h.HopperTask(), load_policy(h.POLICY_FILE), seed=11, episodes=128)
     assert returns.mean() == pytest.approx(policy_notes(h.POLICY_FILE)["mean_return"], rel=0.08)

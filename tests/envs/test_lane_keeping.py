@@ -217,7 +217,7 @@ def test_controllers_refuse_what_they_cannot_use():
     "name",
     # Each compiles a problem of its own; two stand for all where time is short.
     [
-        name if name in ("lane", "learned") else pytest.param(name, marks=pytest.mark.slow)
+        name if name in ("lane", "learned") else pytest.param(name, marks=pytest.mark.proves)
         for name in PROBLEMS
     ],
 )

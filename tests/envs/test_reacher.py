@@ -51,7 +51,7 @@ def test_reacher_refuses_what_it_does_not_have():
     assert reach_with(Policy(layers, None, None, None, Continuous(-1.0, 1.0, 2))).name == reach.name
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_a_policy_learns_to_reach_and_is_tested_in_one_program():
     task = rc.reacher_task()
     ppo = PPO(

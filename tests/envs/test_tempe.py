@@ -146,7 +146,7 @@ def test_fewer_collisions_with_more_notice_and_none_with_enough():
     assert (curve.loc[[2.0, 4.0], "worst_gap"] > 0.2).all()
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_a_search_needs_more_notice_than_samples_do_and_finds_none_beyond():
     found = specs.failing_notices(floor=1.7, step=0.05)
     longest = found["longest"].max()
@@ -156,7 +156,7 @@ def test_a_search_needs_more_notice_than_samples_do_and_finds_none_beyond():
     assert specs.collisions([longest], samples=10_000, seed=3)["share"].iloc[0] < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_the_scenes_of_the_scenic_program_have_the_same_curve():
     pytest.importorskip("scenic")
     notices = [0.0, 0.5, 1.0, 1.5, 2.0]

@@ -47,7 +47,7 @@ def test_one_in_a_million_within_a_factor_of_1_3(name, dim):
     assert answer.effective > 300
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize(
     ("dim", "p", "budget", "seeds", "least"),
     [

@@ -177,7 +177,7 @@ def test_anchors_follow_the_failures_of_their_region():
     assert np.sum(two_sides(fitted.sample(rng, 2000)[0]) < 0) > 100
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize(
     ("robustness", "truth"),
     # By a grid of step 0.002; the second is exact.

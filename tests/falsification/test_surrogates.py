@@ -38,7 +38,7 @@ def first_failure(run):
     return int(failing[0]) + 1 if len(failing) else len(run.table.all) + 1
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_needs_half_of_the_simulations_of_others():
     rare = problem()
     needed = {

@@ -185,7 +185,7 @@ def test_cells_of_a_behaviour():
     np.testing.assert_array_equal(none, -1)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_a_fault_that_needs_three_events_is_found_many_times_sooner():
     from specs.handover import MODES, handover
 

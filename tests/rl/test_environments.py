@@ -249,7 +249,7 @@ def test_brax_task_refuses_what_does_not_fit(brax):
         brax_task(slide(brax), time_limit=0)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_an_environment_of_brax_is_its_own_rollout_and_can_be_learnt(brax):
     task = brax_task("inverted_pendulum", backend="generalized")
     assert task == brax_task("inverted_pendulum", backend="generalized")

@@ -14,7 +14,7 @@ UNSTEADY = {"Pendulum ppo"}
 STEADY = [curve for curve in CURVES if curve.name not in UNSTEADY]
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize("curve", STEADY, ids=lambda curve: curve.name)
 def test_five_seeds_reach_the_known_return(curve):
     got = returns(curve, seeds=5)
@@ -24,7 +24,7 @@ def test_five_seeds_reach_the_known_return(curve):
     assert got.min() >= curve.wanted - 0.2 * abs(curve.wanted), got
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_most_of_ten_seeds_reach_the_known_return():
     # What a seed learns depends on the last digits of the processor, so one that stays behind on
     # one machine is another on the next.

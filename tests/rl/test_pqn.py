@@ -96,7 +96,7 @@ def test_exploration_takes_its_part_of_the_steps_and_holds_on():
     assert np.sum(exploring) / np.sum(new) == pytest.approx(5.0, rel=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_learns_the_corridor_and_the_same_from_the_same_seed():
     trained, again = (train(Corridor(), SMALL, seed=0, steps=8_000) for _ in range(2))
     np.testing.assert_allclose(evaluate(Corridor(), trained.policy, episodes=3), 0.7, rtol=1e-5)

@@ -174,7 +174,7 @@ def test_each_loss_has_a_gradient_for_its_own_weights():
     assert float(first.log_temperature) == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_learns_from_observations_of_another_scale_and_the_same_from_the_same_seed():
     trained, again = (train(Aim(), SMALL, seed=0, steps=8_000) for _ in range(2))
     # Always the middle would lose 3 * 0.75 on average.

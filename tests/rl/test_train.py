@@ -53,7 +53,7 @@ class Aim:
 SMALL = PPO(learning_rate=1e-2, hidden=(16,), value_hidden=(16,), environments=8, horizon=16)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_learns_discrete_actions():
     trained = train(Recall(), SMALL, seed=0, steps=8_000)
     assert np.nanmean(trained.mean_return[:3]) < 0.75
@@ -62,7 +62,7 @@ def test_learns_discrete_actions():
     assert trained.steps[-1] >= 8_000
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_learns_continuous_actions_from_observations_of_another_scale():
     ppo = PPO(
         learning_rate=1e-2,
@@ -114,7 +114,7 @@ def test_tasks_are_recognised_by_their_members():
     assert not isinstance(object(), Task)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_episodes_are_cut_off_and_counted():
     ppo = PPO(hidden=(4,), value_hidden=(4,), environments=2, horizon=7, minibatches=1)
     training = ppo.init(Aim(time_limit=3), jax.random.key(0), updates=2)
@@ -154,7 +154,7 @@ def test_no_steps_are_refused():
         train(Recall(), SMALL, steps=0)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_solves_cartpole():
     ppo = PPO(learning_rate=5e-4, hidden=(16, 16))
     task, returns = CartPoleTask(), []

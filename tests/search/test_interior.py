@@ -66,7 +66,7 @@ def histories():
     return play(Portfolio()), without
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_what_comes_early_is_what_came_without_them(histories):
     (u, _, cost), (same, _, _) = histories
     before = cost < interior.BEGINS
@@ -75,7 +75,7 @@ def test_what_comes_early_is_what_came_without_them(histories):
     assert all(np.any(u[i] != same[i]) for i in range(SEEDS))
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_failures_inside_the_space_are_found(histories):
     found, without = ((value < 0).any(axis=1).sum() for _, value, _ in histories)
     assert found >= without + 2

@@ -42,7 +42,7 @@ POINTLESS = {(Descent, "ripples"), (Gradient, "ripples"), (Gradient, "mixed"), (
 LARGE = (Portfolio, CMAES)
 EACH = pytest.mark.parametrize(
     "search",
-    [pytest.param(s, marks=pytest.mark.slow if isinstance(s, LARGE) else ()) for s in GAIN],
+    [pytest.param(s, marks=pytest.mark.proves if isinstance(s, LARGE) else ()) for s in GAIN],
     ids=lambda search: type(search).__name__,
 )
 
@@ -60,7 +60,7 @@ def test_the_failure_rates_are_as_stated(name):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in MIXED else ())
+        pytest.param(name, marks=pytest.mark.proves if name in MIXED else ())
         for name in FLAT + MIXED
         if name != "needle"
     ],
@@ -72,7 +72,7 @@ def test_beats_uniform(search, name):
     assert gain(name, played(search, name)[1]) > GAIN[search]
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize("name", WIDE)
 @EACH
 def test_beats_uniform_in_fifty_dimensions(search, name):
@@ -120,7 +120,7 @@ def test_cross_entropy_explores_evenly():
     assert np.all(np.abs(late.mean(axis=1) - 0.5) < 0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 @pytest.mark.parametrize("search", [CrossEntropy(), CMAES()], ids=["cross_entropy", "cmaes"])
 def test_learns_in_large_batches_too(search):
     _, (value,) = play(search, ("ball",), 512, 6, 4)

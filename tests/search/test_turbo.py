@@ -46,7 +46,7 @@ def corner(u):
     return 0.72 * weights.sum() - towards @ weights
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_needs_fewer_simulations_in_forty_dimensions():
     # Uniform sampling meets one of these failures in thousands; cmaes needs some 75 points.
     first = {}

@@ -61,7 +61,7 @@ def planted():
     return hyperparameter_importance(table, list(SPACE.domains), SPACE, name="planted", repeats=3)
 
 
-@pytest.mark.slow
+@pytest.mark.proves
 def test_what_was_planted_is_found(planted):
     failing = planted.table["failure_rate"].sort_values(ascending=False)
     assert list(failing.index[:2]) == ["learning_rate", "algorithm"]

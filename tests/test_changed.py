@@ -1,0 +1,46 @@
+"""The choice of tests by what has changed, as `make test-changed` makes it."""
+
+import pytest
+from changed import importers, paths_for
+
+LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_public_names.py"]
+
+
+def test_a_file_calls_for_its_room_and_for_those_that_import_it():
+    found = paths_for(["verifai_jax/plotting/replay.py"])
+    assert found == ["tests/cli", "tests/plotting", "tests/reports", *LAWS]
+
+
+def test_importers_go_through_others():
+    found = importers(["verifai_jax.statistics.rates"])
+    assert {"verifai_jax.statistics.rates", "verifai_jax.falsification.summary"} <= found
+    assert "verifai_jax.core.trace" not in found
+
+
+def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
+    gone = set(paths_for(["verifai_jax/comparison/gone.py"]))
+    assert {"tests/comparison", "tests/cli"} <= gone
+    assert "tests/mtl" not in gone
+
+
+@pytest.mark.parametrize(
+    ("file", "tests"),
+    [
+        ("tests/mtl/test_text.py", ["tests/mtl/test_text.py"]),
+        ("tests/mtl/mtl_oracle.py", ["tests/mtl"]),
+        ("tests/mtl/test_gone.py", []),
+        ("tests/conftest.py", ["tests"]),
+        ("pyproject.toml", ["tests"]),
+        ("docs/formulas.md", ["tests/test_documents.py"]),
+        ("README.md", ["tests/test_documents.py"]),
+        ("specs/cartpole.py", ["tests/envs", "tests/rl"]),
+        ("verifai_jax/remote_client.py", ["tests/systems/remote", *LAWS]),
+        ("LICENSE", []),
+    ],
+)
+def test_other_files(file, tests):
+    assert paths_for([file]) == tests
+
+
+def test_a_folder_stands_for_its_files():
+    assert paths_for(["tests/mtl/test_text.py", "tests/mtl/mtl_oracle.py"]) == ["tests/mtl"]
