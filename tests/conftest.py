@@ -89,6 +89,12 @@ LONG_FILES = (
 """Test files that take longest, the longest first: what begins last must be short."""
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leave what is imported out of garbage collections: nothing of it goes before the end."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, so that two workers end at nearly the same time."""
     order = {name: place for place, name in enumerate(LONG_FILES)}
@@ -140,6 +146,12 @@ def pytest_testnodedown(node: Any, error: Any) -> None:
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Print the peak memory, in GB, of the process that ran tests and needed most."""
     terminalreporter.write_line(f"peak memory of a worker: {max(PEAKS or [peak_memory()]):.1f} GB")
+
+
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of other processes that compile the same: they share what is compiled."""
+    return {**os.environ, "VERIFAI_JAX_CACHE": str(tmp_path_factory.mktemp("cache"))}
 
 
 @pytest.fixture

@@ -39,8 +39,9 @@ vj_budget = 128
 
 
 @pytest.fixture
-def project(pytester):
+def project(pytester, shared_cache, monkeypatch):
     (pytester.path / "specs").mkdir()
+    monkeypatch.setenv("VERIFAI_JAX_CACHE", shared_cache["VERIFAI_JAX_CACHE"])
     return pytester
 
 

@@ -20,8 +20,9 @@ from verifai_jax.mtl import (
     smoothing_error,
 )
 
-# Every example is another program: compiling them would take far longer than running them.
-UNCOMPILED = settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+# Every example is another program: compiling them would take far longer than running them, and to
+# run one operation by operation takes half a second. Each run of the tests draws other examples.
+UNCOMPILED = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -87,7 +88,7 @@ def test_rewriting_keeps_the_value(formula, recording):
 
 @pytest.mark.thorough
 @given(formulas(3), recordings(sizes=(6,)), st.sampled_from([0.05, 0.5]))
-@settings(UNCOMPILED, max_examples=30)
+@settings(UNCOMPILED, max_examples=15)
 def test_gradient_equals_finite_differences(formula, recording, tau):
     base = trace_of(recording)
     # Off the grid, because |x| and == have corners on it.
