@@ -30,7 +30,8 @@ def main() -> None:
     revision = sys.argv[1] if len(sys.argv) > 1 else "main"
     files = changed_files(revision)
     paths = paths_for(files)
-    print(f"{len(files)} files differ from {revision}; tests of: {' '.join(paths)}", file=sys.stderr)
+    chosen = " ".join(paths)
+    print(f"{len(files)} files differ from {revision}; tests: {chosen}", file=sys.stderr)
     print(*paths, sep="\n")
 
 
@@ -45,9 +46,7 @@ def changed_files(revision: str) -> list[str]:
 
 
 def _git(*words: str) -> list[str]:
-    done = subprocess.run(
-        ["git", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-    )
+    done = subprocess.run(["git", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout.splitlines()
 
 
@@ -77,7 +76,7 @@ def paths_for(files: Iterable[str]) -> list[str]:
     rooms: set[str] = set()
     for name in files:
         path = Path(name)
-        if path.name in SHARED and path.parts[0] == "tests" or name in EVERYTHING:
+        if (path.name in SHARED and path.parts[0] == "tests") or name in EVERYTHING:
             return ["tests"]
         if path.parts[0] == PACKAGE.name:
             chosen.update(f"tests/{law}" for law in LAWS)

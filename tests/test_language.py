@@ -4,8 +4,6 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 
