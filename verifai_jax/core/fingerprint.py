@@ -19,7 +19,7 @@ import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.core.steps import as_function, of_some
+from verifai_jax.core.steps import PROGRAM, as_function, of_some
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
@@ -31,12 +31,12 @@ class _Unknown(Exception):
     """Something of which it cannot be said what it does."""
 
 
-def fingerprint(program: jax.extend.core.ClosedJaxpr, derivatives: bool = True) -> str | None:
+def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     """Return a hash of all that a traced function computes, with its constants.
 
     **Arguments:**
 
-    - `program`: what JAX traced.
+    - `program`: what JAX traced, with its constants.
     - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
       programs that differentiate this one depend on them.
 
@@ -85,7 +85,7 @@ class _Reader:
         add = self._texts.append
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             add(f"{type(value).__name__} {value!r}")
-        elif isinstance(value, jax.extend.core.ClosedJaxpr):
+        elif isinstance(value, PROGRAM):
             self._program(value.jaxpr, value.consts)
         elif isinstance(value, jax.extend.core.Jaxpr):
             self._program(value, ())

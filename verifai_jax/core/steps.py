@@ -13,6 +13,9 @@ import jax
 import jax.extend.core
 import jax.numpy as jnp
 
+PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
+"""The class of a program with its constants; newer versions of JAX have one class of programs."""
+
 
 def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
     """Return what was traced as a function of pytrees: no code of a user's runs again."""
@@ -38,7 +41,7 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
         constvars=[], invars=inputs, outvars=step.outvars, eqns=[step], effects=step.effects,
         debug_info=program.debug_info.with_unknown_names(),
     )  # fmt: skip
-    return jax.extend.core.jaxpr_as_fun(jax.extend.core.ClosedJaxpr(alone, [])), inputs
+    return jax.extend.core.jaxpr_as_fun(PROGRAM(alone, [])), inputs
 
 
 def of_some(

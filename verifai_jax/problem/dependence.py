@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import as_function, of_some
+from verifai_jax.core.steps import PROGRAM, as_function, of_some
 from verifai_jax.problem.problem import Problem
 
 DEPENDENCE: Slot[None, bool] = Slot("dependence")
@@ -110,7 +110,7 @@ def _operands_of_scan(options: dict[str, Any]) -> tuple[int, int]:
 
 def _nested(step: Any) -> bool:
     """Return whether a step has programs among its parameters."""
-    kinds = (jax.extend.core.Jaxpr, jax.extend.core.ClosedJaxpr)
+    kinds = (jax.extend.core.Jaxpr, PROGRAM)
     leaves = jax.tree.leaves(
         list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
     )

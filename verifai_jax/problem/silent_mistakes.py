@@ -14,12 +14,13 @@ from typing import Any, TypeAlias
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from jax.interpreters import partial_eval
 from jaxtyping import PyTree
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.steps import PROGRAM
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.features import Categorical, Domain
 from verifai_jax.features.compound import Struct
@@ -45,6 +46,10 @@ MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
 
 SECONDS: Slot[None, float] = Slot("seconds of tracing")
 """Seconds that one tracing of a problem's system takes."""
+
+
+Program: TypeAlias = Any
+"""A program with its constants, or one inside an operation, whose constants are operands of it."""
 
 
 def silent_mistakes(problem: Problem) -> tuple[str, ...]:
@@ -138,7 +143,7 @@ def is_quick(problem: Problem) -> bool:
 
 
 @truncate_silently()
-def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
+def _program(problem: Problem, features: PyTree, key: Any) -> Program:
     """Trace from features to the monitored signals, and the length of what counts of them."""
 
     def signals(features: PyTree, key: Any) -> Any:
@@ -148,7 +153,7 @@ def _program(problem: Problem, features: PyTree, key: Any) -> ClosedJaxpr:
     return jax.make_jaxpr(signals)(features, key)
 
 
-def _unread(problem: Problem, program: ClosedJaxpr, features: PyTree) -> Iterator[str]:
+def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[str]:
     """Yield the features that neither a monitored signal nor the constraint depends on."""
     used = _used_inputs(program)
     where = problem.space.where
@@ -173,7 +178,7 @@ def _unread(problem: Problem, program: ClosedJaxpr, features: PyTree) -> Iterato
         )
 
 
-def _used_inputs(program: ClosedJaxpr) -> list[bool]:
+def _used_inputs(program: Program) -> list[bool]:
     outputs = [True] * len(program.jaxpr.outvars)
     return partial_eval.dce_jaxpr(program.jaxpr, outputs)[1]
 
@@ -199,10 +204,6 @@ def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
             yield names
 
     return below((), problem.space.root)
-
-
-Program: TypeAlias = ClosedJaxpr | Jaxpr
-"""A program with its constants, or one inside an operation, whose constants are operands of it."""
 
 
 def difference(one: Program, other: Program) -> tuple[bool, str | None]:
@@ -250,7 +251,7 @@ def _programs(parameters: dict[str, Any]) -> Iterator[Program]:
     """Yield the programs inside an operation, such as the body of a loop."""
     for value in parameters.values():
         for part in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(part, ClosedJaxpr | Jaxpr):
+            if isinstance(part, (Jaxpr, PROGRAM)):
                 yield part
 
 
@@ -269,7 +270,7 @@ def _same_value(one: object, other: object) -> bool:
         return True
 
 
-def _line_of_constant(program: Any, constant: object) -> str | None:
+def _line_of_constant(program: Program, constant: object) -> str | None:
     """Return the line of the first operation on a constant."""
     place = next(i for i, value in enumerate(program.consts) if value is constant)
     variable = program.jaxpr.constvars[place]

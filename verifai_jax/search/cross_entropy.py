@@ -152,7 +152,7 @@ class CrossEntropy(Search[CrossEntropyState]):
         for row, j in zip(prior, narrow, strict=True):
             row[: len(cube.probabilities[j])] = cube.probabilities[j]
         elite_cells = cube.cells(state.elite)[:, narrow]
-        counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(elite_cells, levels.max()))
+        counts = jnp.einsum("k,kcl->cl", weight, jax.nn.one_hot(elite_cells, int(levels.max())))
         # With one pseudo-count of the prior, so that no choice dies out.
         limits = jnp.cumsum((counts + prior) / (count + 1), axis=1)
         drawn = jnp.sum(draw[:, :, None] > limits, axis=-1)

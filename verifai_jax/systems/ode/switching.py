@@ -260,7 +260,7 @@ def _length(
     """Count the operations of the dynamics."""
     traced = jax.make_jaxpr(lambda now, state: dynamics(now, state, inputs))(time, state)
     inner = [step.params.get("jaxpr") for step in traced.jaxpr.eqns]
-    return sum(len(program.eqns) if hasattr(program, "eqns") else 1 for program in inner)
+    return sum(len(getattr(program, "eqns", (None,))) for program in inner)
 
 
 def _chosen(first: Bool[Array, " switches"], guards: Float[Array, " switches"]) -> Any:
