@@ -25,6 +25,7 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
+from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
@@ -251,10 +252,14 @@ def _doubt(source: Source) -> str:
     if not isinstance(source, Run):
         return "the rows may not be samples of the prior"
     if not source.prior:
-        return "this search does not sample the prior"
-    if source.stopped == "stop_after":
-        return "the run was stopped by its own counterexamples"
-    return ""
+        if source.origin in ("learned", "coverage"):
+            return "this search does not sample the prior"
+        return why_no_rate(source)
+    return {
+        "stop_after": "the run was stopped by its own counterexamples",
+        "stop_when": "the run was stopped by its own outcomes",
+        "interrupted": "a person ended the run, who may have seen its outcomes",
+    }.get(source.stopped, "")
 
 
 def check_both(samples: Samples, purpose: str) -> None:
