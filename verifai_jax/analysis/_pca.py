@@ -228,8 +228,8 @@ class Components:
             lines.append("  the rows do not vary")
         elif not self.telling:
             lines.append(
-                "  no direction explains more than chance: as far as these rows show, the columns "
-                "vary independently"
+                "  no direction explains more than chance: as far as these rows show, no columns "
+                "vary together"
             )
         return "\n".join(lines)
 
