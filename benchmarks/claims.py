@@ -163,8 +163,12 @@ MEASURES: dict[str, Callable[[], float]] = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and compare; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[[], *MEASURES])
+    parser.add_argument("names", nargs="*", help=f"some of {', '.join(MEASURES)}")
     chosen = parser.parse_args(arguments)
+    if unknown := set(chosen.names) - set(MEASURES):
+        parser.error(
+            f"unknown claims {', '.join(sorted(unknown))}; there are {', '.join(MEASURES)}"
+        )
     claims = [claim for claim in read_claims(CLAIMS.read_text()) if claim.name is not None]
     wrong = 0
     for claim in claims:
