@@ -54,19 +54,25 @@ PUBLISHED = {
     "at53": "50/50 3.8 SOAR 2019",
     "at6a": "50/50 42.9 zlscheck 2020",
     "at6b": "10/10 600 FalCAuN 2023, instance 1",
-    "at6c": "10/10 898 FalCAuN 2024, instance 1",
+    "at6c": "449 FalCAuN 2026, instance 1",
+    "at6abc": "616 FalCAuN 2026, instance 1",
     "cc1": "50/50 8.8 zlscheck 2020",
     "cc2": "50/50 4.7 zlscheck 2020",
     "cc3": "50/50 23.4 zlscheck 2020",
-    "cc4": "32/50 125 zlscheck 2020",
+    "cc4": "10/10 474 FalCAuN 2026",
     "cc5": "50/50 2.0 zlscheck 2020",
+    "ccx": "0/10 FalCAuN 2026",
     "nn": "10/10 48 Moonlight and TuRBO 2024",
     "f16a": "10/10 21 Moonlight and TuRBO 2024",
     "afc27": "29/50 39 S-TaLiRo 2017, of at most 100",
 }
-PUBLISHED_1 = {"sc": "50/50 2.1 zlscheck 2020", "nn": "10/10 26.8 Moonlight and TuRBO 2024"}
+PUBLISHED_1 = {
+    "sc": "50/50 2.1 zlscheck 2020",
+    "nn": "10/10 26.8 Moonlight and TuRBO 2024",
+    "nnx": "9/10 142.7 Moonlight and TuRBO 2024",
+}
 BUDGETS = {"cc4": 1500, "pm": 300}
-INSTANCE_2 = (*PUBLISHED, "afc29", "afc33", "at54", "at6abc", "ccx", "nnx", "sc", "pm")
+INSTANCE_2 = (*PUBLISHED, "afc29", "afc33", "at54", "nnx", "sc", "pm")
 
 
 def requirements() -> dict[str, vj.Problem]:

@@ -189,3 +189,24 @@ def test_tells_and_draws(tmp_path):
     assert "+0.68 speed, +0.6" in str(found)
     found.plot(tmp_path / "pca.png")
     assert (tmp_path / "pca.png").stat().st_size > 1000
+
+
+def test_a_component_that_explains_no_more_than_chance_is_said_to():
+    rng = np.random.default_rng(0)
+    names = list("abcde")
+    for n in (20, 200, 5000):
+        alone = pd.DataFrame(rng.uniform(size=(n, 5)), columns=names)
+        found = pca(alone)
+        assert found.telling == 0
+        assert str(found).count("of variance, no more than chance") == 5
+        assert "no direction explains more than chance" in str(found)
+    # Different spreads of unrelated columns are no relation either.
+    wide = alone * [1.0, 0.5, 0.2, 0.2, 0.1]
+    assert pca(wide, scale="raw").telling == 0
+    related = alone.assign(b=0.7 * alone["a"] + 0.3 * alone["b"])
+    found = pca(related)
+    assert found.telling == 1
+    first, second = str(found).splitlines()[1:3]
+    assert "chance" not in first
+    assert "chance" in second
+    assert "no direction" not in str(found)

@@ -265,3 +265,45 @@ def test_pictures(tmp_path):
         rules(table[["same", "violated"]]).plot(tmp_path / f"{i}.png")
         with Image.open(tmp_path / f"{i}.png") as image:
             assert image.size[0] > 300
+
+
+def planted(seed, rows=2000):
+    """Return a table whose failures depend on `turn` alone: 53 % above 5, 19 % elsewhere."""
+    rng = np.random.default_rng(seed)
+    table = pd.DataFrame(
+        {
+            "which": rng.integers(0, 2000, rows),
+            "turn": rng.uniform(-45, 45, rows),
+            "shade": rng.uniform(0, 1, rows),
+            "grain": rng.integers(0, 2**20, rows),
+        }
+    )
+    table["violated"] = rng.uniform(size=rows) < np.where(table["turn"] > 5, 0.53, 0.19)
+    table["rho"] = np.where(table["violated"], -1.0, 1.0)
+    table["status"] = "ok"
+    return table
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_conditions_that_rows_kept_aside_do_not_support_are_dropped(seed):
+    (rule,) = rules(planted(seed)).rules
+    (condition,) = rule.conditions
+    assert condition.feature == "turn"
+    assert abs(condition.above - 5) < 4
+    assert condition.upto == np.inf
+    assert rule.coverage > 0.6
+    assert rule.precision.low < 0.53 < rule.precision.high
+
+
+def test_a_random_key_is_never_in_a_rule():
+    """Whole numbers of so many values need far more support than chance ever gives."""
+    for seed in range(20):
+        table = planted(seed, 400).drop(columns="turn")
+        assert all(
+            condition.feature != "grain"
+            for rule in rules(table).rules
+            for condition in rule.conditions
+        )
+    # Where failures do depend on such a number, the rule has it.
+    table["violated"] = table["grain"] > 700_000
+    assert "grain > 699149" in str(rules(table))

@@ -94,8 +94,25 @@ def test_the_assumption_leaves_room_to_halt():
     halting = slowest * fastest + slowest**2 / (2 * 6.0)
     low = float(specs.space.domains["ego_dist"].low)
     assert halting < low - CAR.front - model.STOP_LINE
-    # From 25 m there is no such room: the question has no answer there.
+    # From 25 m there is no such room.
     assert halting > 25 - CAR.front - model.STOP_LINE
+
+
+@pytest.mark.thorough
+def test_notice_helps_those_too_who_start_too_near_to_halt():
+    """They go on, and are through before the other car comes (docs/road.md)."""
+    domains = {**specs.accident.space.domains, "ego_dist": vj.Box(25.0, 45.0)}
+    near = vj.Problem("near", domains, specs.accident.system, specs.SAFE)
+    curve = specs.collisions([0.0, 1.5, 2.0, 4.0], samples=4096, seed=11, problem=near)
+    assert curve["share"].is_monotonic_decreasing
+    assert curve["low"][0.0] < 0.222 < curve["high"][0.0]
+    assert curve["low"][1.5] < 0.024 < curve["high"][1.5]
+    assert (curve.loc[[2.0, 4.0], "collisions"] == 0).all()
+    # The independent simulation says so too.
+    points = features_of(7, 1000)
+    points[:, NAMES.index("ego_dist")] = np.linspace(25, 45, len(points))
+    assert (simulate(points, notice=4.0) > 0.1).all()
+    assert (simulate(points, notice=0.0) < 0.02).mean() > 0.15
 
 
 @pytest.mark.thorough

@@ -39,6 +39,12 @@ from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
+TOLD = 5
+"""Components that are told, and compared with chance."""
+CHANCE = 0.99
+"""Share of tables of unrelated features whose components explain less than a telling one does."""
+_TABLES = 300
+"""Such tables that are drawn."""
 _NOTHING = 1e-12
 """Share of the total variance below which a component is rounding."""
 _REDRAWS = 32
@@ -52,7 +58,10 @@ class Components:
     **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
     orthonormal in the scaled coordinates, the largest entry of each positive; `deviations` `[m]`:
     standard deviation along each, in the scaled coordinates; `shares` `[m]` of the total variance;
-    `offset` and `width` `[k]` of the scaling.
+    `offset` and `width` `[k]` of the scaling; `telling`: how many of the first components, of five
+    at most, explain more than chance: more than the first one of features with these deviations
+    that vary independently (Horn's parallel analysis, Psychometrika 30, 1965, at 99 %), each after
+    those before it were taken out.
 
     There are only directions in which the rows vary: none if all rows are equal.
     """
@@ -65,6 +74,7 @@ class Components:
     offset: Float[np.ndarray, " k"]
     width: Float[np.ndarray, " k"]
     scale: Scale
+    telling: int
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -203,18 +213,24 @@ class Components:
             f"{len(self.directions)} principal components of {self.samples.kind}, "
             f"over {len(self.names)} ordered columns"
         ]
-        for i, direction in enumerate(self.directions[:5]):
+        for i, direction in enumerate(self.directions[:TOLD]):
             order = np.argsort(-np.abs(direction), kind="stable")
             parts = [
                 f"{direction[j]:+.2f} {self.names[j]}" for j in order if _matters(direction[j])
             ]
             rest = ", ..." if len(parts) > 4 else ""
+            chance = "" if i < self.telling else ", no more than chance"
             lines.append(
-                f"  {i + 1}: {format_percent(self.shares[i])} of variance: "
+                f"  {i + 1}: {format_percent(self.shares[i])} of variance{chance}: "
                 f"{', '.join(parts[:4])}{rest}"
             )
         if not len(self.directions):
             lines.append("  the rows do not vary")
+        elif not self.telling:
+            lines.append(
+                "  no direction explains more than chance: as far as these rows show, no columns "
+                "vary together"
+            )
         return "\n".join(lines)
 
 
@@ -263,6 +279,7 @@ def pca(
     directions = np.where(constant, 0.0, directions[kept][:components])
     largest = np.argmax(np.round(np.abs(directions), 9), axis=1)
     signs = np.sign(np.take_along_axis(directions, largest[:, None], axis=1))
+    telling = min(_telling(scaled - mean, directions), components or TOLD)
     variances, total = variances[kept][:components], variances.sum()
     return Components(
         samples=samples,
@@ -273,7 +290,30 @@ def pca(
         offset=offset,
         width=width,
         scale=scale,
+        telling=telling,
     )
+
+
+def _telling(moved: Float[np.ndarray, "n k"], directions: Float[np.ndarray, "m k"]) -> int:
+    """Return how many of the first components explain more than independent columns would.
+
+    Covariances of these are normal, with a deviation of the product of those of the columns over
+    the root of the rows.
+    """
+    count, k = moved.shape
+    if count < 3 or k < 2:
+        return 0
+    drawn = np.random.default_rng(0).normal(size=(_TABLES, k, k)) / np.sqrt(count - 1)
+    upper = np.triu(drawn, 1)
+    correlations = upper + np.swapaxes(upper, 1, 2) + np.eye(k)
+    for i, direction in enumerate(directions[:TOLD]):
+        deviations = np.sqrt((moved**2).sum(axis=0) / (count - 1))
+        chance = np.linalg.eigvalsh(correlations * np.outer(deviations, deviations))[:, -1]
+        along = moved @ direction
+        if not (along**2).sum() / (count - 1) > np.quantile(chance, CHANCE):
+            return i
+        moved = moved - np.outer(along, direction)
+    return min(TOLD, len(directions))
 
 
 def _accepted(space: FeatureSpace | None, frame: pd.DataFrame) -> np.ndarray:

@@ -29,6 +29,7 @@ from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_features, one_line, printable
+from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.table import ErrorTable
 
@@ -213,9 +214,7 @@ def _describe_failures(source: object, samples: Samples) -> str:
         lines.append(
             f"failure rate {rate} as simulated"
             if rate is not None
-            else f"failure rate not given: {source.search} stopped by {source.stopped}"
-            if source.prior
-            else "failure rate not given: this search goes where failures are"
+            else f"failure rate not given: {why_no_rate(source)}"
         )
     if np.isfinite(samples.rho).any():
         place = samples.worst

@@ -147,6 +147,8 @@ def describe_run(run: Any) -> dict[str, Any]:
         "compile_seconds": run.compile_seconds,
         "run_seconds": run.run_seconds,
         "search_seconds": run.search_seconds,
+        "simulate_seconds": run.simulate_seconds,
+        "confirm_seconds": run.confirm_seconds,
         "folder": run.folder,
         "table": run.table_path,
         "notes": run.notes,

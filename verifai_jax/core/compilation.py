@@ -41,6 +41,9 @@ _running: dict[int, tuple[str, float]] = {}
 """What is being compiled: a name for people, and when it began."""
 _lock = threading.Lock()
 
+_waited = 0.0
+"""Seconds that this process has waited for programs."""
+
 LONG = 0.4
 """Seconds of waiting for a program, from which on work is done that is needed later only: it would
 delay a result for which programs need but be loaded."""
@@ -68,6 +71,7 @@ class Compilation:
         **Raises:** what the compiler raised.
         """
         if self._program is None:
+            began = time.perf_counter()
             try:
                 for work, after in sorted(_meanwhile.items(), key=lambda each: each[1]):
                     wait([self._future], after)
@@ -83,12 +87,25 @@ class Compilation:
                 # Or else the process would not end before all others are compiled.
                 _cancel_waiting()
                 raise
+            finally:
+                _count_waiting(time.perf_counter() - began)
             self._lowered = None
         return self._program
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the program."""
         return (self._program or self.result())(*arguments)
+
+
+def seconds_waited() -> float:
+    """Return the seconds that this process has waited for programs, all of its threads together."""
+    return _waited
+
+
+def _count_waiting(seconds: float) -> None:
+    global _waited
+    with _lock:
+        _waited += seconds
 
 
 def compile_soon(name: str, lowered: jax.stages.Lowered, effort: Effort = "most") -> Compilation:

@@ -66,8 +66,10 @@ class Shrunk:
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
     margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
-    name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
-    coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
+    name of coordinate: `(nominal, value)`, None where nominal does not have the item; `count`: how
+    many; `distance`: Euclidean, in unit coordinates; `nominal`: that point of the cube;
+    `start_count` and `start_distance` of the row;
+    `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
     `notes` for people; `duration` of the simulation in seconds.
     """
@@ -89,6 +91,8 @@ class Shrunk:
     notes: tuple[str, ...] = ()
     key: Key[Array, ""] | None = field(default=None, repr=False)
     duration: float | None = None
+    broken: tuple[str, ...] = ()
+    start_broken: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -143,12 +147,21 @@ class Shrunk:
             for name, value in self.features.items()
             if isinstance(value, Events)
         ]
+        if len(self.problem.formulas) > 1:
+            lines.append(f"  {self._breaks()}")
         lines.append(
             f"  row {self.row} departed in {_of(self.start_count, d)}, by "
             f"{self.start_distance:.3g}; {self.simulations} simulations"
         )
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
+
+    def _breaks(self) -> str:
+        """Say which formulas break, and which of those that the row broke do not any more."""
+        text = f"breaks {', '.join(self.broken)}"
+        if self.broken == self.start_broken:
+            return f"{text}, as the row did"
+        return f"{text}; row {self.row} broke {', '.join(self.start_broken)}"
 
     __repr__ = __str__
 
@@ -172,8 +185,10 @@ def shrink(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `by`: `"count"`: first the fewest events, and other items of arrays of variable length; then
-      the fewest coordinates that are not exactly nominal, then, with so many, the least distance;
+    - `by`: `"count"`: first as many events, and other items of arrays of variable length, as
+      nominal has, or the least difference from that; then the fewest coordinates that are not
+      exactly nominal, those of items that nominal does not have among them, then, with so many, the
+      least distance; nothing that departs in more coordinates than the row does;
       `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
       of which each is 1 over its whole range (by probability, for a distribution), between two
       choices 1, and by places in integers. Every control point of a signal and every component of a
@@ -216,7 +231,7 @@ def shrink(
     if stay:
         at = at.restrict_to_side(start[0])
     candidates = Candidates(problem, at, int(budget), run.precision)
-    search = _Search(candidates, by, np.random.default_rng(seed))
+    search = _Search(candidates, by, np.random.default_rng(seed), start)
     points = np.concatenate([start, select_others(run, at, number, OTHERS)]) if others else start
     notes = []
     try:
@@ -245,14 +260,23 @@ def shrink(
         notes=tuple(notes),
         key=key,
         duration=original.duration,
+        broken=_broken(replayed),
+        start_broken=_broken(original),
     )
 
 
 class _Search:
     """The order of a shrinking: fewer coordinates, a smaller distance, then other failures."""
 
-    def __init__(self, candidates: Candidates, by: str, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        candidates: Candidates,
+        by: str,
+        rng: np.random.Generator,
+        start: Float[np.ndarray, "1 d"],
+    ) -> None:
         self.candidates, self.by, self.rng = candidates, by, rng
+        self.most = int(candidates.nominal.count(start)[0])
         self.history: list[Step] = []
 
     def order(self, points: Float[np.ndarray, "n d"]) -> np.ndarray:
@@ -268,6 +292,9 @@ class _Search:
     def failures(self) -> Float[np.ndarray, "n d"]:
         """Return all failing points so far, the least departure first."""
         points = self.candidates.points[self.candidates.failing]
+        if self.by == "count":
+            # However few its items, what departs in more than the row does is no smaller.
+            points = points[self.candidates.nominal.count(points) <= self.most]
         return points[self.order(points)]
 
     def note(self) -> None:
@@ -324,6 +351,8 @@ class _Search:
         """Return the failure with the fewest items, such as events; from now on none has more."""
         candidates = self.candidates
         least = remove_items(candidates, self.failures()[0])
+        if int(candidates.nominal.count(least[None])[0]) > self.most:
+            return self.failures()[:1]
         candidates.most_items = int(candidates.nominal.items(least[None])[0])
         self.note()
         return least[None]
@@ -470,8 +499,15 @@ def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[An
         if column is None and names:
             column = columns[names[i]]
         values = (nominal.u[i], u[i]) if column is None else column
-        changed[name] = (_plain(values[0]), _plain(values[1]))
+        changed[name] = (None if nominal.lacks[i] else _plain(values[0]), _plain(values[1]))
     return changed
+
+
+def _broken(replayed: Replay) -> tuple[str, ...]:
+    """Return the names of the formulas that a simulation breaks, the worst one first."""
+    broken = {name: rho for name, rho in replayed.rho.items() if rho < 0}
+    # At exactly zero the Boolean semantics decide, and the least one is the one that they break.
+    return tuple(sorted(broken, key=broken.__getitem__)) or (replayed.worst,)
 
 
 def _plain(value: object) -> Any:

@@ -34,7 +34,7 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
     """
     nominal = candidates.nominal
     while candidates.left > 0:
-        changed = np.flatnonzero(nominal.departs(u[None])[0])
+        changed = np.flatnonzero(nominal.moved(u[None])[0])
         if not len(changed):
             return u
         groups = [np.intersect1d(places, changed) for _, places in nominal.groups]
@@ -161,7 +161,7 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
     random, three rounds, with more for the sets that came nearest to a failure.
     """
     nominal = candidates.nominal
-    support = np.flatnonzero(nominal.departs(u[None])[0])
+    support = np.flatnonzero(nominal.moved(u[None])[0])
     if len(support) < 2:
         return None
     smaller = [np.setdiff1d(support, [i]) for i in support]
@@ -250,9 +250,11 @@ def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Genera
         if count <= 1:
             break
         smaller = grow(candidates, starts, count - 1)
+        # A new item counts with all of its coordinates, however it came.
+        smaller = smaller[nominal.count(smaller) < count]
         if not len(smaller):
             one = exchange(candidates, u, rng)
-            if one is None:
+            if one is None or nominal.count(one[None])[0] >= count:
                 break
             smaller = one[None]
         pool += [

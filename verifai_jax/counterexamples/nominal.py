@@ -4,10 +4,12 @@
     nominal.count(points), nominal.distance(points)     # [n] each
 
 A departure is measured in unit coordinates, in which 1 is the whole range of the prior. Every
-coordinate counts for itself, a control point of a signal too.
+coordinate counts for itself, a control point of a signal too. An item that nominal has and a point
+has not, such as an event, counts with the number of items alone; one that nominal has not counts
+with each of its coordinates, wherever they are, since nothing else says what they have to be.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -106,12 +108,25 @@ class Nominal:
             middles = self.centres(cells)
             u[:, discrete] = np.where(same, self.u[discrete], middles)
         if self.space.items and len(u):
-            # Coordinates of items that there are not mean nothing, and do not depart. Powers of
-            # two, so that few shapes are compiled.
-            missing = (1 << (len(u) - 1).bit_length()) - len(u)
-            padded = np.pad(u, ((0, missing), (0, 0)), mode="edge")
-            u = np.asarray(self.space.settle(padded))[: len(u)]
+            # Coordinates of items that there are not mean nothing, and do not depart; an item that
+            # comes back is nominal's.
+            used = self._compiled(self.space.used, u)
+            u = np.where(used, self._compiled(self.space.settle, u), self.u)
         return u
+
+    @staticmethod
+    def _compiled(function: Callable[..., Any], points: Float[np.ndarray, "n d"]) -> np.ndarray:
+        """Return a compiled function of points; of powers of two, so that there are few shapes."""
+        missing = (1 << (len(points) - 1).bit_length()) - len(points)
+        padded = np.pad(points, ((0, missing), (0, 0)), mode="edge")
+        return np.asarray(function(padded))[: len(points)]
+
+    @cached_property
+    def lacks(self) -> Bool[np.ndarray, " d"]:
+        """The coordinates of items that nominal does not have."""
+        if not self.space.items:
+            return np.zeros(len(self.u), bool)
+        return ~self._compiled(self.space.used, self.u[None])[0]
 
     def cells(self, points: Float[np.ndarray, "*n d"]) -> Int[np.ndarray, "*n k"]:
         """Return the cell of each discrete coordinate of points `[*n, d]`."""
@@ -130,9 +145,16 @@ class Nominal:
         counts = np.array([cube.levels[i] for i in cube.discrete], np.float32)
         return ((places + np.float32(0.5)) / counts).astype(np.float32)
 
-    def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
-        """Return the coordinates of settled points that are not nominal."""
+    def moved(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
+        """Return the coordinates of settled points that can be moved back to those of nominal."""
         return points != self.u
+
+    def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
+        """Return the coordinates of settled points that are not nominal: moved, or of new items."""
+        moved = self.moved(points)
+        if not self.lacks.any() or not len(points):
+            return moved
+        return moved | (self.lacks & self._compiled(self.space.used, np.asarray(points)))
 
     def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Return the departure of each coordinate, from 0 to 1.
@@ -154,11 +176,32 @@ class Nominal:
         return self.departs(points).sum(axis=1)
 
     def items(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
-        """Count the items of all arrays of variable length, such as events, beyond the least."""
+        """Count the items, such as events, that arrays have more or fewer of than nominal."""
+        own, home = self.lengths(points), self.lengths(self.u[None])
+        return np.abs(own - home).sum(axis=1)
+
+    def lengths(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, "n k"]:
+        """Return the number of items of each array of variable length, beyond the least."""
         lengths = list(self.cube.lengths)
         levels = np.array([self.cube.levels[i] for i in lengths], np.float32)
         places = np.asarray(points, np.float32)[:, lengths] * levels
-        return np.clip(places.astype(int), 0, np.maximum(levels - 1, 0).astype(int)).sum(axis=1)
+        return np.clip(places.astype(int), 0, np.maximum(levels - 1, 0).astype(int))
+
+    def restored(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "n d"]:
+        """Return a point with some or all of the items back that nominal has and it lacks."""
+        own, home = self.lengths(u[None])[0], self.lengths(self.u[None])[0]
+        points = []
+        for k, i in enumerate(self.cube.lengths):
+            for length in range(own[k] + 1, home[k] + 1):
+                point = u.copy()
+                point[i] = (length + 0.5) / self.cube.levels[i]
+                points.append(point)
+        if points:
+            whole = u.copy()
+            short = np.array(self.cube.lengths)[own < home]
+            whole[short] = self.u[short]
+            points.append(whole)
+        return self.settle(np.array(points, np.float32).reshape(-1, len(u)))
 
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Return the Euclidean length of the departure."""

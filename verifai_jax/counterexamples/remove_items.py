@@ -1,8 +1,9 @@
-"""The fewest events, and other items of arrays of variable length, for a failure: before all else.
+"""The items, such as events, that nominal has, for a failure: before all else.
 
     u = remove_items(candidates, u)                     # a failing point, often of fewer items
 
-What is not there cannot be wrong, and has no values that somebody would have to understand. Up to
+What is not there cannot be wrong, and has no values that somebody would have to understand. So
+items go that nominal does not have, and those come back that it has. Up to
 `EXHAUSTIVE` items all subsets are tried; of more of them runs, pairs and single ones, repeatedly
 (delta debugging: Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, IEEE
 Transactions on Software Engineering 28(2), 2002).
@@ -20,39 +21,34 @@ EXHAUSTIVE = 8
 
 
 def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """Take items away from a failing point as long as it fails without them.
+    """Take items away from a failing point, or put nominal's back, as long as it fails.
 
     **Arguments:**
 
     - `candidates`: simulates, and remembers what failed.
     - `u`: the failing point.
 
-    **Returns:** the failing point with the fewest items that was found.
+    **Returns:** the failing point with the least difference in items from nominal that was found.
     """
     nominal = candidates.nominal
-    while candidates.left > 0:
+    while candidates.left > 0 and (own := nominal.items(u[None])[0]):
+        points = nominal.restored(u)
         present = _present(candidates, u)
-        if not len(present):
-            return u
         drops = np.zeros((0, nominal.space.items), bool)
         for places in _sets(present):
             row = np.zeros((1, nominal.space.items), bool)
             row[0, places] = True
             drops = np.concatenate([drops, row])
-        points = _without(candidates, u, drops)
-        order = np.argsort(nominal.items(points), kind="stable")
-        points = points[order]
+        if len(drops):
+            points = np.concatenate([points, _without(candidates, u, drops)])
+        points = points[nominal.items(points) < own]
+        points = points[np.argsort(nominal.items(points), kind="stable")]
         rho, failing = candidates(points)
         if not failing.any():
             return u
         items = nominal.items(points)
         # The fewest items, and of those the failure that is the surest.
-        best = np.lexsort((rho, items, ~failing))[0]
-        if items[best] >= nominal.items(u[None])[0]:
-            return u
-        u = points[best]
-        if len(present) <= EXHAUSTIVE:
-            return u
+        u = points[np.lexsort((rho, items, ~failing))[0]]
     return u
 
 

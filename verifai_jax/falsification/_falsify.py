@@ -6,9 +6,10 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -21,9 +22,11 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
-from verifai_jax.falsification.loop import Rounds
+from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
+from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import (
     RECORD,
     Run,
@@ -352,14 +355,13 @@ def _resume(
         rounds.suggestions.restore(checkpoint)
         rounds.suggestions.check_source()
 
-    rounds.confirm_seconds, rounds.checked = run.confirm_seconds, run.checked
-    rounds.search_seconds = run.search_seconds
+    rounds.checked = run.checked
 
     def prepare() -> None:
         if checkpoint:
             rounds.resume(checkpoint)
 
-    ends = ends._replace(budget=budget, earlier=run.run_seconds)
+    ends = ends._replace(budget=budget, earlier=_seconds_of(run))
     kept = ("portfolio ", "search ", NOMINAL_FAILS)
     notes = [note for note in run.notes if note.startswith(kept)]
     notes += notes_before(problem, search)
@@ -377,6 +379,18 @@ def _resume(
     )
 
 
+def _seconds_of(run: Run) -> dict[str, float]:
+    """Return the seconds of a run by what they were spent on."""
+    rest = max(run.run_seconds - run.search_seconds - run.simulate_seconds, 0.0)
+    return {
+        COMPILE: run.compile_seconds,
+        SEARCH: run.search_seconds,
+        SIMULATE: run.simulate_seconds,
+        CONFIRM: run.confirm_seconds,
+        REST: rest,
+    }
+
+
 class _Ending(NamedTuple):
     """The conditions that end a run."""
 
@@ -385,7 +399,8 @@ class _Ending(NamedTuple):
     max_seconds: float | None
     stop_after: int | None
     stop_when: StoppingRule | None
-    earlier: float = 0.0  # Seconds of simulation that an earlier part of the run has taken.
+    earlier: Mapping[str, float] = MappingProxyType({})
+    """Seconds that an earlier part of the run has taken, by what they were spent on."""
 
     @property
     def seconds(self) -> float:
@@ -427,12 +442,12 @@ def _run_rounds(
     asked = rounds.suggestions
     recorded = search if asked is None else asked.search
     chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
-    confirmed_before = rounds.confirm_seconds
-
-    def confirmed() -> float:
-        return rounds.confirm_seconds - confirmed_before
+    # Checking and tracing are part of what a second run of the problem does not repeat.
+    watch = rounds.watch = Stopwatch(COMPILE, ends.started, ends.earlier)
 
     def run(stopped: str) -> Run:
+        spent = dict(watch.seconds)
+        origin = origin_of(recorded, len(rounds.first))
         return Run(
             name=problem.name,
             formulas={name: str(formula) for name, formula in problem.formulas.items()},
@@ -441,13 +456,15 @@ def _run_rounds(
             seed=int(seed),
             batch=rounds.batch,
             stopped=stopped,
-            compile_seconds=rounds.compile_seconds,
-            run_seconds=ends.earlier + ends.seconds - rounds.compile_seconds - confirmed(),
-            confirm_seconds=rounds.confirm_seconds,
-            search_seconds=rounds.search_seconds if recorded.learns else 0.0,
+            compile_seconds=spent.get(COMPILE, 0.0),
+            run_seconds=sum(spent.get(name, 0.0) for name in (SEARCH, SIMULATE, REST)),
+            confirm_seconds=spent.get(CONFIRM, 0.0),
+            search_seconds=spent.get(SEARCH, 0.0),
+            simulate_seconds=spent.get(SIMULATE, 0.0),
             checked=rounds.checked,
             version=__version__,
-            prior=recorded.samples_prior and not len(rounds.first),
+            prior=origin == "prior",
+            origin=origin,
             first=rounds.first.tolist(),
             folder=place,
             target=target,
@@ -485,16 +502,15 @@ def _run_rounds(
                         rounds.record_checksum = write_record(run("running"), place)
                 for note in rounds.notes:
                     bar.note(note)
-            # Checking and tracing are part of what a second run of the problem does not repeat.
-            rounds.compile_seconds = ends.seconds
             stopped = "exhausted" if rounds.exhausted else None
-            while stopped is None:
-                rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)), ends.budget)
-                bar.update(len(rounds.table), rounds.found, rounds.best)
-                notify(callbacks, len(rounds.table), rounds.numbers)
-                stopped = ends.reached(rounds)
-                if stopped is None:
-                    rounds.save(seldom=True)
+            with watch.on(REST):
+                while stopped is None:
+                    rounds.advance(min(rounds.batch, ends.budget - len(rounds.table)), ends.budget)
+                    bar.update(len(rounds.table), rounds.found, rounds.best)
+                    notify(callbacks, len(rounds.table), rounds.numbers)
+                    stopped = ends.reached(rounds)
+                    if stopped is None:
+                        rounds.save(seldom=True)
     except KeyboardInterrupt:
         stopped = "interrupted"
     except Exception as error:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from verifai_jax.core.compilation import while_compiling
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.steering import Steering
@@ -39,6 +40,8 @@ from verifai_jax.search.proposals import Proposals, compiled_search
 if TYPE_CHECKING:
     import pandas as pd
 
+COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
+"""What the seconds of a run are spent on."""
 MOST_WARM = 2048
 """Rows of an earlier table at most that a search starts with; the worst of a longer one."""
 
@@ -51,9 +54,10 @@ class Rounds:
     `first` are points that are simulated before the search proposes any, and `suggestions` those
     that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
-    `confirm_seconds` is what closer replays took, without compilation, and `checked` says in words
-    which they were. `search_seconds` is what the search took for its proposals and to learn, and
-    whoever suggests points to think of them.
+    `checked` says in words which closer replays there were. `watch` has the seconds of all: to
+    `COMPILE`; to `SEARCH`, which the search took for its proposals and to learn, and whoever
+    suggests points to think of them; to `SIMULATE`, and to put the rows into the table; to
+    `CONFIRM`. The rest is whoever advances the rounds.
     """
 
     def __init__(
@@ -95,7 +99,7 @@ class Rounds:
         self._marks = MarkBook(problem) if search.wants_marks else None
         self.found = self.violating = self.without_verdict = 0
         self.best = float("nan")
-        self.compile_seconds = self.confirm_seconds = self.search_seconds = 0.0
+        self.watch = Stopwatch(COMPILE)
         self.checked = ""
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
@@ -164,7 +168,8 @@ class Rounds:
             with self._searching():
                 self._pending = self._proposals.next(most)
         points = np.asarray(self.first if len(self.first) else self._pending)
-        return self._simulations.measure(points[:most])
+        with self.watch.on(SIMULATE):
+            return self._simulations.measure(points[:most])
 
     def switch(self, search: Search, note: str, batch: int) -> None:
         """Go on with another search, for which the rows that are measured are given ones."""
@@ -229,6 +234,10 @@ class Rounds:
 
         - `limit`: simulations of the whole run, up to which points may be sent ahead to workers.
         """
+        with self.watch.on(SIMULATE):
+            self._advance(most, limit)
+
+    def _advance(self, most: int, limit: int | None) -> None:
         first = len(self.table)
         verdicts: Verdicts | None = None
         # The number of rows alone says how many of them are still to come, so resuming goes on.
@@ -271,10 +280,10 @@ class Rounds:
             objective = self._objective(verdicts.rho, verdicts.rho < 0)
         claimed = verdicts.violated
         if self._claims is not None:
-            found = self._claims(columns, first)
+            with self.watch.on(CONFIRM):
+                found = self._claims(columns, first)
+                self.watch.move(found.compile_seconds, COMPILE)
             columns["verdict"] = found.verdict
-            self.compile_seconds += found.compile_seconds
-            self.confirm_seconds += found.seconds
             self.checked = self._claims.checked or self.checked
             claimed = verdicts.violated & ~found.refused
             # A search that took them for failures would stay with them.
@@ -296,12 +305,9 @@ class Rounds:
 
     @contextmanager
     def _searching(self) -> Iterator[None]:
-        """Count the time as the search's."""
-        started = time.perf_counter()
-        try:
+        """Count the time as the search's, but for that in which its programs compile."""
+        with self.watch.on(SEARCH), self.watch.waiting_for_programs_is(COMPILE):
             yield
-        finally:
-            self.search_seconds += time.perf_counter() - started
 
     def _learn(
         self,
@@ -328,13 +334,12 @@ class Rounds:
 
     def _begin_stage(self) -> None:
         """Compile what the next round needs for the first time, search and derivatives together."""
-        started = time.perf_counter()
-        if not self._proposals.begin_stage():
-            return
-        if self._proposals.stage.differentiates:
-            self._simulations.begin_derivatives()
-        self._proposals.wait()
-        self.compile_seconds += time.perf_counter() - started
+        with self.watch.on(COMPILE):
+            if not self._proposals.begin_stage():
+                return
+            if self._proposals.stage.differentiates:
+                self._simulations.begin_derivatives()
+            self._proposals.wait()
 
     def _suggested(self, suggestions: Suggestions, rows: int) -> Float[np.ndarray, "n d"]:
         """Return the suggested points that come next, after a question where it is time for one."""
@@ -404,7 +409,7 @@ class Rounds:
             temperature=1.0 if given else self._proposals.temperature,
         )
         # A robustness of exactly zero compiles a program of its own.
-        self.compile_seconds += self._simulations.compile_seconds - compiled
+        self.watch.move(self._simulations.compile_seconds - compiled, COMPILE)
         return verdicts
 
     def warm(self, table: "pd.DataFrame") -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from verifai_jax.core.seals import is_intact
 from verifai_jax.core.text import one_line
+from verifai_jax.falsification.origin import ORIGINS
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
@@ -43,9 +44,11 @@ ADDED = (
     "confirm",
     "confirm_seconds",
     "search_seconds",
+    "simulate_seconds",
     "checked",
     "first",
     "guide",
+    "origin",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
@@ -175,7 +178,9 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "confirm": _is_flag,
     "confirm_seconds": _is_number,
     "search_seconds": _is_number,
+    "simulate_seconds": _is_number,
     "checked": _is_text,
     "guide": _is_mapping,
+    "origin": lambda value: value in ("", *ORIGINS),
 }
 """What each entry of a record must be."""

@@ -61,11 +61,17 @@ class Run:
       search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
       was cut off.
     - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
-      and in everything else.
+      and in everything else; of a resumed run, that of all its parts.
     - `search_seconds`: the part of `run_seconds` that proposals and suggestions took, and learning
-      from what came of them; 0 for a search that does not learn.
+      from what came of them.
+    - `simulate_seconds`: the part of `run_seconds` that simulations took, and their rows to be put
+      into the table. What is left is that of callbacks and checkpoints.
     - `version`: of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
+    - `origin`: where the rows come from, one of `origin.ORIGINS`, which says why they are no such
+      samples: `"first"` (rows that were given came before the samples), `"given"` (all rows were),
+      `"sequence"` (the points of a fixed sequence), `"coverage"` and `"learned"` (a search that
+      goes where coverage grows, or where failures are); empty in a record that does not say.
     - `folder`: on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
     - `problem`: None for a run that was loaded without it.
@@ -107,10 +113,12 @@ class Run:
     confirm: bool = False
     confirm_seconds: float = 0.0
     search_seconds: float = 0.0
+    simulate_seconds: float = 0.0
     checked: str = ""
     first: Sequence[Sequence[float]] = ()
     guide: Mapping[str, Any] | None = None
     damage: str = ""
+    origin: str = ""
 
     @property
     def simulations(self) -> int:

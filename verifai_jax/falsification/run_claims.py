@@ -8,7 +8,6 @@ Of a run's violations so many are replayed as `evaluation/confirmation.py` says;
 holds how many were, so that a run that is resumed goes on as one that was not interrupted.
 """
 
-import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -28,14 +27,12 @@ class Claimed(NamedTuple):
     - `verdict`: in a word; empty where nothing is violated.
     - `refused`: rows that violate the property and are not claimed.
     - `greatest`: robustness that the search learns of these, the greatest of their replays.
-    - `seconds`: that the replays took, without compilation.
     - `compile_seconds`: that their programs took to compile.
     """
 
     verdict: Shaped[np.ndarray, " n"]
     refused: Bool[np.ndarray, " n"]
     greatest: Float[np.ndarray, " n"]
-    seconds: float = 0.0
     compile_seconds: float = 0.0
 
 
@@ -87,13 +84,12 @@ class RunClaims:
             verdict[rows] = "unchecked"
             return claimed
         own = {name: column[rows] for name, column in columns.items()}
-        started, compiled = time.perf_counter(), confirmer.compile_seconds
+        compiled = confirmer.compile_seconds
         checked = confirmer(own, first + rows, max(LIMIT, (first + count) // SHARE))
         compiled = confirmer.compile_seconds - compiled
-        seconds = time.perf_counter() - started - compiled
         verdict[rows] = checked.verdict
         refused[rows], greatest[rows] = checked.refuse(own["rho"])
-        return claimed._replace(seconds=seconds, compile_seconds=compiled)
+        return claimed._replace(compile_seconds=compiled)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Return what decides which rows are examined next, as an entry of a checkpoint."""

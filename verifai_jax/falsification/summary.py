@@ -11,7 +11,11 @@ import numpy as np
 from verifai_jax.core.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
 from verifai_jax.evaluation.journal import count_unfinished
+from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run
+
+SHOWN = 0.005
+"""Seconds from which on they are not zero in the summary."""
 
 
 def summarize(run: Run) -> str:
@@ -56,14 +60,7 @@ def summarize(run: Run) -> str:
         lines.append(
             f"  constraint   let through {format_percent(run.acceptance)} of all proposals"
         )
-    simulating = run.run_seconds - run.search_seconds
-    speed = run.simulations / simulating if simulating > 0 else float("nan")
-    searching = f"{run.search_seconds:.2f} s to search, " if run.search_seconds > 0 else ""
-    confirming = f", {run.confirm_seconds:.2f} s to confirm" if run.checked else ""
-    lines.append(
-        f"  time         {run.compile_seconds:.1f} s to compile, {searching}{simulating:.2f} s to "
-        f"simulate ({speed:,.0f} simulations/s){confirming}; stopped by {run.stopped}"
-    )
+    lines.append(f"  time         {_times(run)}; stopped by {run.stopped}")
     lines.append(f"  search       {run.search}, seed {run.seed}")
     # Names, values and notes come from files and systems, which a terminal must not obey.
     return printable("\n".join(lines))
@@ -98,6 +95,8 @@ def _headline(run: Run, violating: int) -> str:
     without = run.table.counts.without_verdict
     if run.simulations and without == run.simulations:
         return f"no verdict: none of {run.simulations} simulations ended properly"
+    if not run.simulations:
+        return f"nothing was simulated; stopped by {run.stopped}"
     text = f"{violating} of {run.simulations} simulations violate the property"
     if without:
         text += f"; {without} have no verdict"
@@ -134,13 +133,25 @@ _UNDECIDED_IN_WORDS = {
 }
 
 
+def _times(run: Run) -> str:
+    """Write what the time was spent on: parts that were measured each, and add up."""
+    simulating = run.simulate_seconds
+    speed = f" ({run.simulations / simulating:,.0f} simulations/s)" if simulating > 0 else ""
+    parts = [f"{run.compile_seconds:.1f} s to compile"]
+    if run.search_seconds > 0:
+        parts.append(f"{run.search_seconds:.2f} s to search")
+    parts.append(f"{simulating:.2f} s to simulate{speed}")
+    if run.checked:
+        parts.append(f"{run.confirm_seconds:.2f} s to confirm")
+    if (rest := run.run_seconds - run.search_seconds - simulating) >= SHOWN:
+        parts.append(f"{rest:.2f} s for callbacks and files")
+    return ", ".join(parts)
+
+
 def _rates(run: Run) -> list[str]:
     """Write the failure rate as simulated, and that of confirmed failures where it differs."""
     if not run.prior:
-        return [
-            "  failure rate not given: this search goes where failures are; "
-            "use search='uniform' for a rate"
-        ]
+        return [f"  failure rate not given: {why_no_rate(run)}; {remedy(run)}"]
     if run.failure_rate is None:
         return []
     lines = [f"  failure rate {run.failure_rate} as simulated"]

@@ -303,6 +303,13 @@ class VariableArray(Domain):
         absent = self._absent_unit.astype(u.dtype)
         return jnp.concatenate([u[:1], jnp.ravel(jnp.where(present, own, absent))])
 
+    def used(self, u: Float[jax.Array, " size"]) -> Bool[jax.Array, " size"]:
+        length = self.least + (cell(u[0], self.levels[0]) if self._varies else 0)
+        units = u[int(self._varies) :].reshape(self.most, self.domain.size)
+        own = jax.vmap(self.domain.used, axis_size=self.most)(units)
+        mine = jnp.ravel(own & (jnp.arange(self.most)[:, None] < length))
+        return jnp.concatenate([jnp.ones(int(self._varies), bool), mine])
+
     def refined(self, factor: int) -> "VariableArray":
         return VariableArray(self.domain.refined(factor), self.least, self.most)
 

@@ -238,6 +238,13 @@ class Automaton(Domain):
         length = self._wanted(taken, nodes)
         return self._joined(u, length, slots)
 
+    def used(self, u: Float[jax.Array, " size"]) -> Bool[jax.Array, " size"]:
+        taken, _, _ = self._walk(u)
+        there = taken >= 0
+        used = jnp.asarray(self._tables.uses)[taken].astype(bool) & there[:, None]
+        used = used.at[:, 0].set(there)
+        return jnp.concatenate([jnp.ones(int(self._varies), bool), jnp.ravel(used)])
+
     @property
     def items(self) -> int:
         return self.most

@@ -173,6 +173,13 @@ class Struct(Domain):
             start += domain.size
         return jnp.concatenate(parts)
 
+    def used(self, u: Float[jax.Array, " size"]) -> Bool[jax.Array, " size"]:
+        parts, start = [jnp.ones(0, bool)], 0
+        for _, domain in self.fields:
+            parts.append(domain.used(u[start : start + domain.size]))
+            start += domain.size
+        return jnp.concatenate(parts)
+
     @property
     def mark_count(self) -> int:
         return sum(domain.mark_count for _, domain in self.fields)

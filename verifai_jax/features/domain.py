@@ -162,6 +162,10 @@ class Domain(abc.ABC):
         """Return coordinates of the same value, those without a meaning in it at one place."""
         return u
 
+    def used(self, u: Float[Array, " size"]) -> Bool[Array, " size"]:
+        """Return which coordinates mean something: all but those of items that there are not."""
+        return jnp.ones(self.size, bool)
+
     @property
     def mark_count(self) -> int:
         """Number of things that values can cover, such as transitions of an automaton."""

@@ -310,6 +310,11 @@ class FeatureSpace:
         return jax.jit(jax.vmap(self.root.settled))
 
     @cached_property
+    def used(self) -> Callable[[Numbers], Bool[Array, "n dim"]]:
+        """Say which coordinates of points `[n, dim]` mean something; compiled."""
+        return jax.jit(jax.vmap(self.root.used))
+
+    @cached_property
     def marks_at(self) -> Callable[[Numbers], Int[Array, "n marks"]]:
         """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
         return jax.jit(jax.vmap(lambda u: self.root.marks(self.unflatten(u))))

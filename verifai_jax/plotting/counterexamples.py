@@ -227,11 +227,13 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     for y, (i, name) in enumerate(zip(places, shown, strict=False)):
         was, now = shrunk.changed[name]
         left.plot([0, 1], [y, y], color=QUIET, linewidth=3, alpha=0.25, solid_capstyle="round")
-        left.plot([shrunk.nominal[i], shrunk.u[i]], [y, y], color=FAILING, linewidth=2)
-        left.plot([shrunk.nominal[i]], [y], "o", color=SAFE, markersize=6)
+        if was is not None:
+            left.plot([shrunk.nominal[i], shrunk.u[i]], [y, y], color=FAILING, linewidth=2)
+            left.plot([shrunk.nominal[i]], [y], "o", color=SAFE, markersize=6)
         left.plot([shrunk.u[i]], [y], "o", color=FAILING, markersize=7)
         left.annotate(
-            f"{format_number(was)} to {format_number(now)}", (0.5, y), xytext=(0, 5), ha="center",
+            f"{'absent' if was is None else format_number(was)} to {format_number(now)}",
+            (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
     labels = [_short(label, 24) for label in shrunk.labels[: len(places)]]

@@ -34,11 +34,10 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
         places = places[:: max(1, len(places) // DOTS)]
         cloud.scatter(along[0][places], along[1][places], c=color, s=9, alpha=0.55, linewidths=0)
     for i, axis in ((0, cloud.xaxis), (1, cloud.yaxis)):
-        share = (
-            f" ({format_percent(components.shares[i])} of variance)"
-            if i < len(directions)
-            else " (none)"
-        )
+        share = " (none)"
+        if i < len(directions):
+            chance = "" if i < components.telling else ", no more than chance"
+            share = f" ({format_percent(components.shares[i])} of variance{chance})"
         axis.set_label_text(f"component {i + 1}{share}")
     tidy(cloud)
     height = 0.8 / max(1, min(3, len(directions)))

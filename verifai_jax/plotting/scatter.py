@@ -100,6 +100,7 @@ def plot_features(
         axes.set_visible(False)
     rate = run.failure_rate
     by_search = f"search {run.search.split('(')[0]}"
+    by_search = "rows that were given" if run.origin == "given" else by_search
     source = by_search if rate is None else f"failure rate {rate} as simulated"
     violating = len(run.table.violating)
     figure.suptitle(

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.confirmation_verdicts import MEANING, NOT_CLAIMED, VERDICTS
+from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.plotting.scatter import plot_features
@@ -73,7 +74,7 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
 def no_rate(run: Run) -> str:
     """Say why a run has no failure rate."""
     if not run.prior:
-        return "not given: this search goes where failures are, so that its rows are no sample"
+        return f"not given: {why_no_rate(run)}, so that the rows are no sample of the prior"
     return "not given: no simulation has a verdict"
 
 
@@ -232,16 +233,7 @@ def not_sampled(run: Run, studies: Studies) -> list[str]:
         "Whatever the system does not take from the features, such as other disturbances, parts "
         "and faults: it is as the model fixes it.",
     ]
-    if not run.prior:
-        items.append(
-            "The search chose its points by what it found before. Where it did not look nothing is "
-            "shown, and the share of failing rows is no probability."
-        )
-    else:
-        items.append(
-            f"The points between the {run.simulations:,} samples: of them nothing but the rate is "
-            "known, with its interval."
-        )
+    items.append(what_lies_between(run))
     try:
         covered = studies.analysis["coverage"] if studies.analysis.samples is not None else None
     except UnknownNameError:

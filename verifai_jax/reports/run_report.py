@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from verifai_jax.core.text import format_features
 from verifai_jax.evaluation.confirmation_verdicts import UNDECIDED
+from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.record import RECORD
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl import parse
@@ -47,6 +48,15 @@ FILES = (
     ("search.npz", "the state of the search"),
 )
 """Files of a run, and what they are."""
+ENDED = {
+    "budget": "their number was fixed beforehand",
+    "exhausted": "their number was fixed beforehand",
+    "max_seconds": "their number was decided by the time spent, and not by the outcomes",
+    "interrupted": "a person ended the run, and the outcomes had no part in when that was",
+}
+"""Assumption on what decided the number of samples, by what ended a run."""
+BROKE_DOWN = "the run was cut off or broke down, and the outcomes had no part in when that was"
+"""The same for every other end."""
 FROM_DATA = "Verdicts are those of the robustness of the formulas, in {}; of exactly zero, Boolean."
 """Assumption of every count."""
 
@@ -117,6 +127,8 @@ def run_page(
 def headline(run: Run) -> str:
     """Write the finding in a sentence or two."""
     counts = run.table.counts
+    if not run.simulations:
+        return f"Nothing was simulated; the run was stopped by {run.stopped}."
     if run.simulations == counts.without_verdict:
         return f"No verdict: none of {run.simulations:,} simulations ended properly."
     text = f"{counts.violating:,} of {run.simulations:,} simulations violate the property"
@@ -126,7 +138,7 @@ def headline(run: Run) -> str:
     if run.failure_rate is not None:
         return f"{text} Failure rate {run.failure_rate}, as simulated."
     if not counts.violating:
-        text += " That shows no probability: the search chose where to look."
+        text += f" That shows no probability: {why_no_rate(run)}."
     return text
 
 
@@ -139,8 +151,7 @@ def assumptions(run: Run) -> list[str]:
             + (
                 "it holds whatever decided when sampling ended (a confidence sequence)."
                 if rate.at_any_time
-                else "their number was fixed beforehand, or decided by the time spent and not by "
-                "the outcomes (Clopper and Pearson's exact interval)."
+                else f"{ENDED.get(run.stopped, BROKE_DOWN)} (Clopper and Pearson's exact interval)."
             )
         )
         items.append(

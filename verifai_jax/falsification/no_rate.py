@@ -1,0 +1,73 @@
+"""Sentences on a run whose rows are no samples of the prior, and so give no failure rate.
+
+    why_no_rate(run)                   "its points are a fixed sequence"
+
+Every text that says so takes its reason from here, so that all of them give the same one.
+"""
+
+from verifai_jax.falsification.run import Run
+
+_WHY: dict[str, str] = {
+    "given": "its rows were given",
+    "sequence": "its points are a fixed sequence",
+    "coverage": "this search goes where coverage grows",
+    "learned": "this search goes where failures are",
+}
+_UNKNOWN = "its rows are no independent samples of the prior"
+_UNIFORM = "use search='uniform' for a rate"
+_REMEDY: dict[str, str] = {
+    "first": "leave out first= for a rate",
+    "given": "use vj.falsify(problem, 'uniform') for a rate",
+}
+_BETWEEN: dict[str, str] = {
+    "prior": (
+        "The points between the {rows} samples: of them nothing but the rate is known, with its "
+        "interval."
+    ),
+    "first": (
+        "The points between the {rows} simulations: nothing is known of them. {given} of these "
+        "were given, so that the share of failing rows is no probability."
+    ),
+    "given": (
+        "All but the {rows} rows that were given: nothing is known of other points, and the share "
+        "of failing rows is no probability."
+    ),
+    "sequence": (
+        "The points between the {rows} of the sequence: nothing is known of them. The sequence is "
+        "fixed, so that the share of failing rows is no probability with an interval."
+    ),
+    "coverage": (
+        "The search chose its points by what it had covered before. Where it did not look nothing "
+        "is shown, and the share of failing rows is no probability."
+    ),
+    "learned": (
+        "The search chose its points by what it found before. Where it did not look nothing is "
+        "shown, and the share of failing rows is no probability."
+    ),
+}
+_BETWEEN_UNKNOWN = (
+    "The points between the {rows} simulations: nothing is known of them. The rows are no "
+    "independent samples of the prior, so that the share of failing ones is no probability."
+)
+
+
+def why_no_rate(run: Run) -> str:
+    """Say why the rows of a run give no failure rate; empty where they are samples of the prior."""
+    if run.prior:
+        return ""
+    if run.origin == "first":
+        count = len(run.first)
+        return "its first row was given" if count == 1 else f"its first {count:,} rows were given"
+    return _WHY.get(run.origin, _UNKNOWN)
+
+
+def remedy(run: Run) -> str:
+    """Say how a run that has no failure rate would have one."""
+    return _REMEDY.get(run.origin, _UNIFORM)
+
+
+def what_lies_between(run: Run) -> str:
+    """Say what is not known of the points that a run did not simulate."""
+    origin = "prior" if run.prior else run.origin
+    text = _BETWEEN.get(origin, _BETWEEN_UNKNOWN)
+    return text.format(rows=f"{run.simulations:,}", given=f"{len(run.first):,}")
