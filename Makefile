@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: help falsify test test-slow test-all test-changed prove lint notebooks notebooks-update bench \
-  policy wheel docs constraints clean
+  policy wheel docs claims constraints clean
 
 help:
 	@echo "make falsify    set up, then break the trained cart-pole controller"
@@ -17,6 +17,7 @@ help:
 	@echo "make notebooks-update  execute the notebooks and store what they show"
 	@echo "make docs       build the documentation as a site, out/site/index.html"
 	@echo "make bench      measure; see benchmarks/RESULTS.md"
+	@echo "make claims     what the README claims, run again and compared"
 	@echo "make policy     train the networks again from their seeds (the hopper: 7 minutes)"
 	@echo "make constraints  write constraints.txt anew; VERSIONS=--newest for the newest of everything"
 
@@ -110,6 +111,10 @@ bench: .venv-bench/installed .venv/extras
 	$(BIN)/python benchmarks/perception.py loop
 	$(BIN)/python benchmarks/road.py
 	$(BIN)/python benchmarks/scenes.py
+
+# Those that take under a minute each; benchmarks/CLAIMS.md has all of them.
+claims: .venv/installed
+	$(BIN)/python -m benchmarks.claims
 
 policy: .venv/installed
 	$(BIN)/python -m envs.train_cartpole
