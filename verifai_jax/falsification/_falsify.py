@@ -6,10 +6,10 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,11 @@ from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
+from verifai_jax.falsification.model_changes import (
+    ANOTHER_MODEL,
+    continued_with,
+    with_files_read_since,
+)
 from verifai_jax.falsification.run import (
     RECORD,
     Run,
@@ -265,6 +270,7 @@ def resume(
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
     executor: Executor | None = None,
+    even_if_changed: bool = False,
 ) -> Run:
     """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
 
@@ -274,6 +280,9 @@ def resume(
     - `problem`: needed for a folder, which names no code to run.
     - `search`: needed only if it is none of `verifai_jax.search`.
     - `budget`: simulations in all, those done included; the run's own when left out.
+    - `even_if_changed`: whether to go on where files of the model are others than those that the
+      run recorded when it began; its rows are then of two models, it has no failure rate, and its
+      notes and its record say so.
     - the others as in `falsify`.
 
     The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
@@ -281,8 +290,8 @@ def resume(
 
     **Returns:** the run with the earlier rows and the new ones.
 
-    **Raises:** `ValueError` for a run without its problem or its state, a budget that is spent, or
-    a folder that another process writes; as `falsify` otherwise.
+    **Raises:** `ValueError` for a run without its problem or its state, a model that has changed, a
+    budget that is spent, or a folder that another process writes; as `falsify` otherwise.
     """
     ends = _Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
     folder = Path(run) if isinstance(run, str | Path) else run.folder
@@ -295,7 +304,9 @@ def resume(
         elif run.folder is not None:
             check_not_continued(run, run.folder)
         called = check_callbacks(callbacks)
-        return _resume(run, problem, search, budget, ends, progress, called, executor)
+        return _resume(
+            run, problem, search, budget, ends, progress, called, executor, even_if_changed
+        )
 
 
 def _resume(
@@ -306,7 +317,8 @@ def _resume(
     ends: "_Ending",
     progress: bool | None,
     callbacks: Sequence[Callback],
-    executor: Executor | None = None,
+    executor: Executor | None,
+    even_if_changed: bool,
 ) -> Run:
     """Go on with a run whose folder is locked; `ends` is completed from the run."""
     problem = problem or run.problem
@@ -336,6 +348,7 @@ def _resume(
         )
     if not checkpoint and len(run.table) and run.stopped != "running":
         raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+    sources, changed = continued_with(run.name, run.sources, problem, rows, even_if_changed)
     choice = resolved(problem, wanted=run.backend)
     problem = choice.problem
     check_gradient(problem, search)
@@ -360,8 +373,9 @@ def _resume(
             rounds.resume(checkpoint)
 
     ends = ends._replace(budget=budget, earlier=run.run_seconds)
-    kept = ("portfolio ", "search ", NOMINAL_FAILS)
+    kept = ("portfolio ", "search ", NOMINAL_FAILS, ANOTHER_MODEL)
     notes = [note for note in run.notes if note.startswith(kept)]
+    notes += [changed] if changed else []
     notes += notes_before(problem, search)
     return _run_rounds(
         rounds,
@@ -374,6 +388,7 @@ def _resume(
         notes,
         callbacks,
         resumed=True,
+        sources=sources,
     )
 
 
@@ -421,6 +436,7 @@ def _run_rounds(
     *,
     warm: bool = False,
     resumed: bool = False,
+    sources: Sequence[Mapping[str, Any]] | None = None,
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
@@ -428,6 +444,8 @@ def _run_rounds(
     recorded = search if asked is None else asked.search
     chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
     confirmed_before = rounds.confirm_seconds
+    begun = time.time()
+    models = (problem.sources().to_json(),) if sources is None else tuple(sources)
 
     def confirmed() -> float:
         return rounds.confirm_seconds - confirmed_before
@@ -461,6 +479,7 @@ def _run_rounds(
             backend=choice.backend,
             confirm=rounds.confirms,
             guide=None if problem.guide is None else problem.guide.to_json(),
+            sources=models,
             notes=(*chosen, *notes, *rounds.notes),
         )
 
@@ -500,6 +519,7 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     rounds.close()
+    models = with_files_read_since(models, problem, begun)
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
     result = replace(result, notes=(*result.notes, *after))
