@@ -27,7 +27,18 @@ from verifai_jax.core.source_scan import MAX_FILES, Import, files_of_model, scan
 from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 
 PACKAGES = (
-    *("verifai_jax", "jax", "jaxlib", "numpy", "scipy", "pandas", "sklearn", "mujoco", "brax", "gymnax"),
+    *(
+        "verifai_jax",
+        "jax",
+        "jaxlib",
+        "numpy",
+        "scipy",
+        "pandas",
+        "sklearn",
+        "mujoco",
+        "brax",
+        "gymnax",
+    ),
     *("gymnasium", "diffrax", "scenic", "torch"),
 )
 """Packages whose versions decide numbers; the version of one that is imported is recorded."""

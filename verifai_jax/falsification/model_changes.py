@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +19,17 @@ from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.problem.problem import Problem
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 ROUNDING = 1e-4
 """Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
 otherwise than in a batch, and some systems make that grow."""
 EXACT = 1e-6
 """The same for a black box, whose code is the same; its numbers are stored in single precision."""
+NEAR = 1e-3
+"""The same for a replay in another precision, above which it is simulated again in that of the
+run."""
 EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes it in the record"
 """How to go on with another model."""
 ANOTHER_MODEL = "from row "
@@ -145,14 +151,17 @@ def changed_since(changes: Sequence[Change], row: int | None) -> str:
     return f"The model has changed since {when}: {list_changes(changes)}."
 
 
-def finding_of(seen: Replay, stored: Mapping[str, Any], several: bool) -> str:
+def finding_of(
+    seen: Replay, stored: "Mapping[str, Any] | pd.Series", several: bool, near: float | None = None
+) -> str:
     """Say that a replay does not give the number of its row; empty where it does.
 
     **Arguments:**
 
-    - `seen`: the replay, in the precision of the run.
+    - `seen`: the replay, in the precision of the run unless `near` says what may differ.
     - `stored`: the row of the table.
     - `several`: whether the problem has several formulas.
+    - `near`: share of the signals by which the number may differ; that of rounding when left out.
     """
     before = str(stored.get("status", "ok"))
     now = seen.status.name.lower()
@@ -162,7 +171,8 @@ def finding_of(seen: Replay, stored: Mapping[str, Any], several: bool) -> str:
         return ""
     verbs = {True: "violates", False: "keeps"}
     violated = bool(stored["violated"]) if "violated" in stored else seen.violated
-    rounding = (EXACT if seen.problem.black_box else ROUNDING) * _scale(seen)
+    usual = EXACT if seen.problem.black_box else ROUNDING
+    rounding = (usual if near is None else near) * _scale(seen)
     for name, rho in seen.rho.items():
         was = float(stored[f"rho.{name}"] if several else stored["rho"])
         # Infinite where a formula says nothing of the trace.

@@ -30,6 +30,7 @@ from verifai_jax.falsification.checkpoint import (
     write_checkpoint,
 )
 from verifai_jax.falsification.model_changes import (
+    NEAR,
     changed_since,
     finding_of,
     has_several_models,
@@ -240,10 +241,14 @@ class Run:
         if seen.row is None:
             return seen
         changed = self.changed_since(seen.row)
-        finding = finding_of(seen, self.table.row(seen.row).to_dict(), len(self.formulas) > 1)
+        finding = finding_of(seen, self.table.row(seen.row), self._several)
         if finding and not changed:
             finding += f"; {self._why_not_again(seen.row)}"
         return replace(seen, changed=changed, finding=f"{finding}." if finding else "")
+
+    @property
+    def _several(self) -> bool:
+        return len(self.formulas) > 1
 
     def _why_not_again(self, row: int) -> str:
         """Say what may be the reason where no file has changed."""
@@ -291,13 +296,18 @@ class Run:
         if number is None or not 0 <= number < self.simulations:
             return seen
         stored = self.table.row(number)
-        own = all(
-            values[name] is stored[name] or values[name] == stored[name]
+        own = isinstance(row, int | np.integer) or all(
+            values[name] == stored[name] or values[name] != values[name]
             for name in self.table.features
         )
         if own and precision == self.precision:
             return self.compared(seen)
-        return replace(seen, changed=self.changed_since(number))
+        if not own or not finding_of(seen, stored, self._several, NEAR):
+            return replace(seen, changed=self.changed_since(number))
+        # The other precision may be all that differs, which is no finding.
+        again = replay(self.problem, values, run_keys(self.seed)[1], number, self.precision)
+        again = self.compared(again)
+        return replace(seen, changed=again.changed, finding=again.finding)
 
     def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
         """Write counterexamples as small files made for version control; returns their paths.
