@@ -132,6 +132,8 @@ def _compare(
             chosen, BATCH, precision=precision, seed=seed, executor=executor
         )
     notes = _notes(baseline, named)
+    sides = {"baseline": baseline, **named}
+    sources = {name: problem.sources().to_json() for name, problem in sides.items()}
     each = 1 - (1 - confidence) / len(named)
     tallies = {name: _Tally() for name in named}
     open_ones, stopped, size, first = set(named), "budget", FIRST, 0
@@ -169,6 +171,7 @@ def _compare(
         time.perf_counter() - started,
         seed,
         notes,
+        sources,
     )
 
 

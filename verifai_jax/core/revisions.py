@@ -83,7 +83,7 @@ def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
                 loaded = load_target(plain, kind)
         except TargetError as error:
             raise TargetError(f"at revision {revision}: {error}") from None
-        add_tree(tree / inner)
+        add_tree(tree / inner, commit)
         try:
             yield loaded
         finally:

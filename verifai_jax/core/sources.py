@@ -15,7 +15,7 @@ import importlib.machinery
 import os
 import platform
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -95,6 +95,7 @@ class Sources:
     - `without_file`: what of the model is in no file, such as cells of a notebook.
     - `root`: the working directory, from which names of files go out.
     - `first`: the row of a table from which on this is what it was made of.
+    - `commit`: of git, at which the files were taken; empty for those of the working directory.
     """
 
     files: tuple[Source, ...]
@@ -102,12 +103,14 @@ class Sources:
     without_file: tuple[str, ...] = ()
     root: str = ""
     first: int = 0
+    commit: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
         return {
             "first": self.first,
             "root": self.root,
+            "commit": self.commit,
             "files": [list(file) for file in self.files],
             "without_file": list(self.without_file),
             "versions": dict(self.versions),
@@ -123,7 +126,8 @@ class Sources:
             files = tuple(Source(*map(str, file)) for file in data["files"])
             versions = {str(name): str(value) for name, value in data["versions"].items()}
             without = tuple(map(str, data["without_file"]))
-            return cls(files, versions, without, str(data["root"]), int(data["first"]))
+            root, first, commit = str(data["root"]), int(data["first"]), str(data["commit"])
+            return cls(files, versions, without, root, first, commit)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError("the record of the files of a model has another form") from error
 
@@ -135,6 +139,8 @@ class Sources:
         - `now`: what the problem is made of now; what lies on the disk counts when left out, and
           for files that the problem of now does not have.
         """
+        if self.commit:
+            return ()  # It stays what it is.
         found = []
         present = {} if now is None else {file.name: file for file in now.files}
         for file in self.files:
@@ -224,9 +230,19 @@ def sources_of(*things: object, made: Sequence[Maker] = (), first: int = 0) -> S
         else:
             collector.add_function(part)
     collector.follow()
-    root = Path.cwd().as_posix()
-    without = tuple(dict.fromkeys(collector.without_file))
-    return Sources(tuple(collector.sources()), versions(), without, root, first)
+    commits = [commit for tree, commit in _trees.items() if _any_below(collector.modules, tree)]
+    return Sources(
+        files=tuple(collector.sources()),
+        versions=versions(),
+        without_file=tuple(dict.fromkeys(collector.without_file)),
+        root=Path.cwd().as_posix(),
+        first=first,
+        commit=commits[0] if commits else "",
+    )
+
+
+def _any_below(files: Iterable[str], folder: Path) -> bool:
+    return any(Path(file).is_relative_to(folder) for file in files)
 
 
 class _Collector:
@@ -412,18 +428,18 @@ def versions() -> dict[str, str]:
     return found
 
 
-_trees: list[Path] = []
-"""Folders in which other versions of the project's files are, while they are."""
+_trees: dict[Path, str] = {}
+"""Folders with the project's files as they are at commits of git, while they are there."""
 
 
-def add_tree(folder: Path) -> None:
+def add_tree(folder: Path, commit: str) -> None:
     """Let names of files below a folder go out from there, and imports of them be found there."""
-    _trees.append(folder)
+    _trees[folder] = commit
 
 
 def remove_tree(folder: Path) -> None:
     """End what `add_tree` began."""
-    _trees.remove(folder)
+    del _trees[folder]
 
 
 def _tree_of(file: str) -> Path | None:

@@ -69,7 +69,8 @@ class Shrunk:
     name of coordinate: `(nominal, value)`; `count`: how many; `distance`: Euclidean, in unit
     coordinates; `nominal`: that point of the cube; `start_count` and `start_distance` of the row;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
-    `notes` for people; `duration` of the simulation in seconds.
+    `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
+    the replay of the row says, as in `Replay`.
     """
 
     problem: Problem
@@ -89,6 +90,8 @@ class Shrunk:
     notes: tuple[str, ...] = ()
     key: Key[Array, ""] | None = field(default=None, repr=False)
     duration: float | None = None
+    model_changed: str = ""
+    finding: str = ""
 
     @property
     def count(self) -> int:
@@ -148,7 +151,8 @@ class Shrunk:
             f"{self.start_distance:.3g}; {self.simulations} simulations"
         )
         lines += [f"  note: {note}" for note in self.notes]
-        return "\n".join(lines)
+        warnings = [text for text in (self.model_changed, self.finding) if text]
+        return "\n".join([*warnings, *lines])
 
     __repr__ = __str__
 
@@ -200,7 +204,7 @@ def shrink(
     at = Nominal.of(problem, nominal)
     problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
-    original = replay(problem, first, key, number, run.precision)
+    original = run.compared(replay(problem, first, key, number, run.precision))
     if not original.violated:
         reason = (
             f"robustness {min(original.rho.values()):.4g}"
@@ -210,6 +214,7 @@ def shrink(
         raise ValueError(
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
             f"({reason}); see what confirm says of it, and shrink another"
+            f"{''.join(f'. {text}' for text in original.warnings)}"
         )
     u = np.asarray(problem.space.point_of(problem.space.from_row(first)))
     start = at.settle(u[None])
@@ -245,6 +250,8 @@ def shrink(
         notes=tuple(notes),
         key=key,
         duration=original.duration,
+        model_changed=original.changed,
+        finding=original.finding,
     )
 
 

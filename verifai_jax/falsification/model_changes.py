@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from verifai_jax.core.sources import READ, Change, Sources, list_changes
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.problem.problem import Problem
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 ROUNDING = 1e-4
 """Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
@@ -152,7 +149,7 @@ def changed_since(changes: Sequence[Change], row: int | None) -> str:
 
 
 def finding_of(
-    seen: Replay, stored: "Mapping[str, Any] | pd.Series", several: bool, near: float | None = None
+    seen: Replay, stored: Mapping[str, Any], several: bool, near: float | None = None
 ) -> str:
     """Say that a replay does not give the number of its row; empty where it does.
 

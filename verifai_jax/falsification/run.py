@@ -241,7 +241,7 @@ class Run:
         if seen.row is None:
             return seen
         changed = self.changed_since(seen.row)
-        finding = finding_of(seen, self.table.row(seen.row), self._several)
+        finding = finding_of(seen, self.table.row(seen.row).to_dict(), self._several)
         if finding and not changed:
             finding += f"; {self._why_not_again(seen.row)}"
         return replace(seen, changed=changed, finding=f"{finding}." if finding else "")
@@ -295,7 +295,7 @@ class Run:
         seen = replay(self.problem, values, run_keys(self.seed)[1], number, precision)
         if number is None or not 0 <= number < self.simulations:
             return seen
-        stored = self.table.row(number)
+        stored = self.table.row(number).to_dict()
         own = isinstance(row, int | np.integer) or all(
             values[name] == stored[name] or values[name] != values[name]
             for name in self.table.features

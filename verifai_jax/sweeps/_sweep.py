@@ -22,6 +22,7 @@ from verifai_jax.core.cache import Arrays, Cache, locked_cache
 from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
+from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
@@ -36,6 +37,7 @@ from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.rows import Row, tabulate
 from verifai_jax.sweeps.safety import SCREENING, PolicySafety, SafetyReport, certify_policies
 from verifai_jax.sweeps.study import Study
+from verifai_jax.sweeps.trainer import StudyError
 from verifai_jax.sweeps.training_runs import TrainingRuns
 from verifai_jax.sweeps.validation import check_options
 
@@ -68,6 +70,7 @@ def sweep(
     note: Mapping[str, Any] | None = None,
     callbacks: Iterable[Callback] = (),
     executor: Executor | None = None,
+    even_if_changed: bool = False,
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify their policies.
 
@@ -102,6 +105,8 @@ def sweep(
       read from the folder counts too.
     - `executor`: whose workers train and simulate, as in `falsify`; the table is the same. With
       `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
+    - `even_if_changed`: whether to go on with finished work of a folder although files of the study
+      are others than those that were recorded when it began; the record then says so.
 
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
@@ -149,15 +154,42 @@ def sweep(
         Cache(folder) as cache,
         Clock(study.name, max_seconds, progress) as clock,
     ):
+        begun = cache.note(cache.kind) is not None
         cache.claim(fingerprint(study, options))
+        sources = _record_sources(study, cache, begun, even_if_changed)
         if note is not None:
             cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = _RunningSweep(
-            study, options, cache, clock, halving, attack, called, executor=executor
-        )
+            study, options, cache, clock, halving, attack, called, executor=executor,
+            sources=sources,
+        )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
+
+
+def _record_sources(
+    study: Study, cache: Cache, begun: bool, even_if_changed: bool
+) -> list[dict[str, Any]]:
+    """Return what the study was made of when the work of a cache began, and what it is made of now.
+
+    **Raises:** `StudyError` where that is something else, unless that will do.
+    """
+    now = study.sources()
+    known: list[dict[str, Any]] = cache.note("sources") or []
+    if begun and not known:
+        return []
+    if known:
+        changes = Sources.from_json(known[-1]).changes(now)
+        if not changes:
+            return known
+        if not even_if_changed:
+            raise StudyError(
+                f"the work in {cache.path} was done with another study of the name {study.name!r}: "
+                f"{list_changes(changes)}. Give another folder, or restore the files; "
+                "even_if_changed=True (--even-if-changed) goes on all the same, and notes it"
+            )
+    return cache.note("sources", [*known, now.to_json()])
 
 
 @dataclass(eq=False)
@@ -185,6 +217,7 @@ class _RunningSweep:
     callbacks: tuple[Callback, ...] = ()
     calls: int = 0
     executor: Executor | None = None
+    sources: Sequence[Mapping[str, Any]] = ()
     runs: TrainingRuns = field(init=False)
     configurations: list[_Configuration] = field(default_factory=list)
     numbers: dict[str, int] = field(default_factory=dict)
@@ -474,6 +507,7 @@ class _RunningSweep:
             version=__version__,
             seconds=dict(self.clock.seconds),
             complete=complete,
+            sources=tuple(self.sources),
         )
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
