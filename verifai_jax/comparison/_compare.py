@@ -133,7 +133,7 @@ def _compare(
         )
     notes = _notes(baseline, named)
     sides = {"baseline": baseline, **named}
-    sources = {name: problem.sources().to_json() for name, problem in sides.items()}
+    sources, begun = {name: side.sources() for name, side in sides.items()}, time.time()
     each = 1 - (1 - confidence) / len(named)
     tallies = {name: _Tally() for name in named}
     open_ones, stopped, size, first = set(named), "budget", FIRST, 0
@@ -171,7 +171,10 @@ def _compare(
         time.perf_counter() - started,
         seed,
         notes,
-        sources,
+        {
+            name: made.settled(sides[name].sources(), begun).to_json()
+            for name, made in sources.items()
+        },
     )
 
 

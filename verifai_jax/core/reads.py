@@ -23,7 +23,6 @@ _CODE = (".py", ".pyc", ".so", ".pyd", ".pth")
 """Endings of files that are imported; those have records of their own."""
 
 _read: dict[str, set[str]] = {}
-_written: set[str] = set()
 _watching = False
 
 
@@ -36,13 +35,13 @@ def watch() -> None:
 
 
 def files_read_by(module: str) -> set[str]:
-    """Return the files that a module has read so far and that nothing of the user's has written.
+    """Return the files that a module has read so far.
 
     **Arguments:**
 
     - `module`: path of its file.
     """
-    return _read.get(module, set()) - _written
+    return _read.get(module, set())
 
 
 def _note(event: str, arguments: tuple[object, ...]) -> None:
@@ -56,15 +55,11 @@ def _note_open(path: object, mode: object, flags: object) -> None:
     if not isinstance(path, str | bytes | os.PathLike):
         return
     text = os.fsdecode(path)
-    if text.endswith(_CODE):
+    if text.endswith(_CODE) or _writes(mode, flags):
         return
     module = _reader(sys._getframe(2))
-    if module is None:
-        return
     place = os.path.abspath(text)
-    if _writes(mode, flags):
-        _written.add(place)
-    elif os.path.isfile(place) and is_user_file(place):
+    if module is not None and os.path.isfile(place) and is_user_file(place):
         files = _read.setdefault(module, set())
         if len(files) < MAX_FILES:
             files.add(place)

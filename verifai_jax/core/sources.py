@@ -16,7 +16,7 @@ import os
 import platform
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -130,6 +130,38 @@ class Sources:
             return cls(files, versions, without, root, first, commit)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError("the record of the files of a model has another form") from error
+
+    def settled(self, now: "Sources", begun: float) -> "Sources":
+        """Return it at the end of the work that it is the record of.
+
+        Files of data that have been written since the work began are what came of it, such as the
+        state of a simulator, and no part of the model; files that were read by then are.
+
+        **Arguments:**
+
+        - `now`: what the problem is made of at the end.
+        - `begun`: seconds since the epoch.
+        """
+        known = {file.name for file in self.files}
+        files = list(self.files)
+        files += [f for f in now.files if f.role in (READ, NAMED) and f.name not in known]
+        written = {
+            file.name
+            for file in files
+            if file.role in (READ, NAMED) and not self._is_older(file.name, begun)
+        }
+        without = [f"{name} was written in the meantime, and is not recorded" for name in written]
+        return replace(
+            self,
+            files=tuple(file for file in files if file.name not in written),
+            without_file=(*self.without_file, *sorted(without)),
+        )
+
+    def _is_older(self, name: str, moment: float) -> bool:
+        try:
+            return os.stat(os.path.join(self.root, name)).st_mtime < moment
+        except OSError:
+            return False
 
     def changes(self, now: "Sources | None" = None) -> tuple[Change, ...]:
         """Return the files that are others by now.

@@ -107,7 +107,7 @@ def estimate(
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
-    sources = problem.sources()
+    sources, begun = problem.sources(), time.time()
     simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed, executor)
     simulated.compile()
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
@@ -134,7 +134,7 @@ def estimate(
     found = _result(
         problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds
     )
-    return replace(found, sources=sources.to_json())
+    return replace(found, sources=sources.settled(problem.sources(), begun).to_json())
 
 
 _METHODS = {

@@ -21,13 +21,13 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.sources import Sources
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.model_changes import (
     ANOTHER_MODEL,
     continued_with,
-    with_files_read_since,
 )
 from verifai_jax.falsification.run import (
     RECORD,
@@ -519,7 +519,9 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     rounds.close()
-    models = with_files_read_since(models, problem, begun)
+    if models:
+        last = Sources.from_json(models[-1]).settled(problem.sources(), begun)
+        models = (*models[:-1], last.to_json())
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
     result = replace(result, notes=(*result.notes, *after))

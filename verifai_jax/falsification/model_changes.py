@@ -7,14 +7,12 @@ A run has a record of its model for each part of it that was simulated in one go
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from verifai_jax.core.sources import READ, Change, Sources, list_changes
+from verifai_jax.core.sources import Change, Sources, list_changes
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.problem.problem import Problem
@@ -98,40 +96,6 @@ def continued_with(
     parts += [f"other versions: {', '.join(versions)}"] if versions else []
     kept = [part for part in recorded if int(part["first"]) < rows]
     return (*kept, now.to_json()), f"{ANOTHER_MODEL}{rows} on with {' and '.join(parts)}"
-
-
-def with_files_read_since(
-    recorded: Sequence[Mapping[str, Any]], problem: Problem, begun: float
-) -> tuple[Mapping[str, Any], ...]:
-    """Return the record of a run's models with the files that its simulations have read.
-
-    Those that were written since the run began are no part of the model, but what came of it.
-
-    **Arguments:**
-
-    - `recorded`: when the run began.
-    - `problem`: of the run.
-    - `begun`: seconds since the epoch.
-    """
-    if not recorded:
-        return ()
-    last = Sources.from_json(recorded[-1])
-    known = {file.name for file in last.files}
-    more = [
-        file
-        for file in problem.sources().files
-        if file.role == READ and file.name not in known and _older(file.name, begun)
-    ]
-    if not more:
-        return tuple(recorded)
-    return (*recorded[:-1], replace(last, files=(*last.files, *more)).to_json())
-
-
-def _older(name: str, begun: float) -> bool:
-    try:
-        return Path(name).stat().st_mtime < begun
-    except OSError:
-        return False
 
 
 def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
