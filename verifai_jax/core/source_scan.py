@@ -1,4 +1,4 @@
-"""What a program refers to, read from its text: modules that it imports and files that it names.
+"""The modules that a program imports and the files that it names, read from its text.
 
     found = scan(Path("specs/car.py").read_bytes())
     found.imports                                       # (Import(0, "envs", ("car",)), ...)

@@ -1,4 +1,4 @@
-"""What a result was made of: hashes of the files of its model, and versions, as it was made.
+"""The record of what a result was made of: hashes of the files of its model, and versions.
 
     made = made_here()                                  # where a problem is made, remembered there
     sources = sources_of(problem, made)                 # taken when a run begins
@@ -88,7 +88,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Sources:
-    """What a result was made of, as it was made.
+    """The files and versions that a result was made of, as they were then.
 
     - `files`: of the model, with their hashes.
     - `versions`: by the name of the package.

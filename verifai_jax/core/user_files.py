@@ -1,4 +1,4 @@
-"""Which files are a user's own, and which are Python's, installed or of this package.
+"""A distinction of files: a user's own, and those of Python, of packages and of this one.
 
     is_user_file("specs/cartpole.py")                   # True
     is_user_file(numpy.__file__)                        # False

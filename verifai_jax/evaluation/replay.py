@@ -49,7 +49,7 @@ class Replay:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What stands in the way of taking the replay for its row, as sentences; often none."""
+        """Sentences that stand in the way of taking the replay for its row; often none."""
         return tuple(text for text in (self.changed, self.finding) if text)
 
     @property

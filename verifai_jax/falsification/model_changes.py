@@ -1,4 +1,4 @@
-"""Whether the model of a run is still the one that it ran, and a row gives its number again.
+"""Changes of the model of a run since it ran, and rows that do not give their numbers again.
 
     sources_of_row(run.sources, 417)                    # what row 417 was simulated with
     finding_of(seen, stored, several=False)             # "" where a replay gives the row's number

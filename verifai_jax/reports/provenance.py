@@ -55,7 +55,7 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
 
 
 class Model(NamedTuple):
-    """What a result was made of, and what of it is another one by now.
+    """The files that a result was made of, and those of them that are others by now.
 
     - `parts`: as it was recorded, once for each part of a run with a model of its own; none where
       that is not recorded.
@@ -84,7 +84,7 @@ class Model(NamedTuple):
 
     @property
     def answer(self) -> str:
-        """Whether the model is still the one that ran, in a sentence."""
+        """A sentence on whether the model is still the one that ran."""
         if not self.parts:
             return "Not recorded: nobody can say whether the model is still the one that ran."
         if self.changes:
