@@ -281,3 +281,33 @@ def test_what_is_installed_is_no_file_of_a_user():
     assert not is_user_file(vj.__file__)
     assert not is_user_file("/usr/lib/python3/dist-packages/yaml/__init__.py")
     assert is_user_file(__file__)
+
+
+ARM = """
+import verifai_jax as vj
+
+system = vj.mujoco("arm.xml", duration=0.2, control_period=0.02, backend="native")
+swing = vj.Problem("swing", {"a": vj.Box(0.0, 1.0)}, system, "always hinge < 1")
+"""
+
+
+def test_a_problem_in_mujoco_has_the_files_that_it_was_loaded_from(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.xml").write_text('<mujoco><include file="body.xml"/></mujoco>')
+    body = (
+        '<mujoco><worldbody><body><joint name="hinge" type="hinge"/><geom size="{size}"/></body>'
+        "</worldbody></mujoco>"
+    )
+    (tmp_path / "body.xml").write_text(body.format(size=0.1))
+    (tmp_path / "arm.py").write_text(ARM)
+    problem = load_target("arm.py:swing", vj.Problem)
+    before = problem.sources()
+    assert [file[:2] for file in before.files] == [
+        ("arm.py", "the problem"), ("arm.xml", "part of a model"), ("body.xml", "part of a model")
+    ]  # fmt: skip
+    assert "mujoco" in before.versions
+    (tmp_path / "body.xml").write_text(body.format(size=0.2))
+    assert before.changes(problem.sources()) == ()
+    again = load_target("arm.py:swing", vj.Problem).sources()
+    assert [change.name for change in before.changes(again)] == ["body.xml"]

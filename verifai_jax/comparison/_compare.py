@@ -171,10 +171,7 @@ def _compare(
         time.perf_counter() - started,
         seed,
         notes,
-        {
-            name: made.settled(sides[name].sources(), begun).to_json()
-            for name, made in sources.items()
-        },
+        {name: made.settled(begun).to_json() for name, made in sources.items()},
     )
 
 

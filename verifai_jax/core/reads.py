@@ -19,6 +19,10 @@ MAX_FILES = 200
 """Files of one module at most."""
 _READS_FOR_A_MODEL = ("rl", "systems", "features", "perception", "scenes", "mtl", "blocks")
 """Rooms of this package that open files which a model is made of: policies, tables, programs."""
+_READS_FOR_ITSELF = ("jax", "jaxlib", "matplotlib", "IPython")
+"""Packages that read devices, caches and settings of their own while a user's module runs."""
+_OF_THE_MACHINE = ("/sys/", "/proc/", "/dev/", "/etc/", "/usr/", "/run/")
+"""Beginnings of paths that are no data of a model."""
 _CODE = (".py", ".pyc", ".so", ".pyd", ".pth")
 """Endings of files that are imported; those have records of their own."""
 
@@ -58,8 +62,12 @@ def _note_open(path: object, mode: object, flags: object) -> None:
     if text.endswith(_CODE) or _writes(mode, flags):
         return
     module = _reader(sys._getframe(2))
+    if module is None:
+        return
     place = os.path.abspath(text)
-    if module is not None and os.path.isfile(place) and is_user_file(place):
+    # What lies in a folder with a dot is a cache, or settings.
+    hidden = f"{os.sep}." in place or place.startswith(_OF_THE_MACHINE)
+    if not hidden and os.path.isfile(place) and is_user_file(place):
         files = _read.setdefault(module, set())
         if len(files) < MAX_FILES:
             files.add(place)
@@ -76,7 +84,7 @@ def _reader(frame: FrameType | None) -> str | None:
     own = str(PACKAGE) + os.sep
     while frame is not None:
         file = frame.f_code.co_filename
-        if file.startswith("<frozen importlib"):
+        if file.startswith("<frozen importlib") or _package(file) in _READS_FOR_ITSELF:
             return None
         if file.startswith(own):
             if file[len(own) :].partition(os.sep)[0] not in _READS_FOR_A_MODEL:
@@ -85,3 +93,9 @@ def _reader(frame: FrameType | None) -> str | None:
             return os.path.abspath(file)
         frame = frame.f_back
     return None
+
+
+def _package(file: str) -> str:
+    """Return the name of the installed package that a file is of; empty for another file."""
+    _, installed, rest = file.rpartition("site-packages" + os.sep)
+    return rest.partition(os.sep)[0] if installed else ""

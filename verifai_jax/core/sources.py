@@ -131,7 +131,7 @@ class Sources:
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError("the record of the files of a model has another form") from error
 
-    def settled(self, now: "Sources", begun: float) -> "Sources":
+    def settled(self, begun: float) -> "Sources":
         """Return it at the end of the work that it is the record of.
 
         Files of data that have been written since the work began are what came of it, such as the
@@ -139,12 +139,14 @@ class Sources:
 
         **Arguments:**
 
-        - `now`: what the problem is made of at the end.
         - `begun`: seconds since the epoch.
         """
-        known = {file.name for file in self.files}
+        modules = [f for f in self.files if f.role in (PROBLEM, IMPORTED)]
+        read = [files_read_by(os.path.join(self.root, file.name)) for file in modules]
         files = list(self.files)
-        files += [f for f in now.files if f.role in (READ, NAMED) and f.name not in known]
+        for path in sorted(set().union(*read)):
+            if os.path.isfile(path) and _shown(path) not in {file.name for file in files}:
+                files.append(Source(_shown(path), READ, file_hash(Path(path))))
         written = {
             file.name
             for file in files
@@ -360,8 +362,7 @@ class _Collector:
         """The variables of the modules that are imported, by their files."""
         # Asked without __getattr__, by which some modules import others.
         every = [getattr(module, "__dict__", {}) for module in tuple(sys.modules.values())]
-        files = {values.get("__file__"): values for values in every}
-        return {os.path.abspath(f): v for f, v in files.items() if isinstance(f, str)}
+        return {values["__file__"]: values for values in every if values.get("__file__")}
 
 
 def _named(text: str, program: str) -> Iterator[str]:

@@ -134,7 +134,7 @@ def estimate(
     found = _result(
         problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds
     )
-    return replace(found, sources=sources.settled(problem.sources(), begun).to_json())
+    return replace(found, sources=sources.settled(begun).to_json())
 
 
 _METHODS = {

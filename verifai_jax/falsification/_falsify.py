@@ -520,7 +520,7 @@ def _run_rounds(
         stopped, cause = format_user_error(error), error
     rounds.close()
     if models:
-        last = Sources.from_json(models[-1]).settled(problem.sources(), begun)
+        last = Sources.from_json(models[-1]).settled(begun)
         models = (*models[:-1], last.to_json())
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)

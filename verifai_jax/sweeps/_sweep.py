@@ -22,7 +22,6 @@ from verifai_jax.core.cache import Arrays, Cache, locked_cache
 from verifai_jax.core.callbacks import Callback, check_callbacks, notify
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
-from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.rl._evaluate import EPISODES, batched_mean_returns
 from verifai_jax.rl.policy import Policy
 from verifai_jax.search import Search
@@ -37,7 +36,6 @@ from verifai_jax.sweeps.result import Sweep
 from verifai_jax.sweeps.rows import Row, tabulate
 from verifai_jax.sweeps.safety import SCREENING, PolicySafety, SafetyReport, certify_policies
 from verifai_jax.sweeps.study import Study
-from verifai_jax.sweeps.trainer import StudyError
 from verifai_jax.sweeps.training_runs import TrainingRuns
 from verifai_jax.sweeps.validation import check_options
 
@@ -154,9 +152,7 @@ def sweep(
         Cache(folder) as cache,
         Clock(study.name, max_seconds, progress) as clock,
     ):
-        begun = cache.note(cache.kind) is not None
-        cache.claim(fingerprint(study, options))
-        sources = _record_sources(study, cache, begun, even_if_changed)
+        sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
@@ -166,30 +162,6 @@ def sweep(
             sources=sources,
         )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
-
-
-def _record_sources(
-    study: Study, cache: Cache, begun: bool, even_if_changed: bool
-) -> list[dict[str, Any]]:
-    """Return what the study was made of when the work of a cache began, and what it is made of now.
-
-    **Raises:** `StudyError` where that is something else, unless that will do.
-    """
-    now = study.sources()
-    known: list[dict[str, Any]] = cache.note("sources") or []
-    if begun and not known:
-        return []
-    if known:
-        changes = Sources.from_json(known[-1]).changes(now)
-        if not changes:
-            return known
-        if not even_if_changed:
-            raise StudyError(
-                f"the work in {cache.path} was done with another study of the name {study.name!r}: "
-                f"{list_changes(changes)}. Give another folder, or restore the files; "
-                "even_if_changed=True (--even-if-changed) goes on all the same, and notes it"
-            )
-    return cache.note("sources", [*known, now.to_json()])
 
 
 @dataclass(eq=False)
