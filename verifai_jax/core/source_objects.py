@@ -87,8 +87,12 @@ def parts_of(things: object) -> Iterator[Part]:
             waiting += list(value)[:MAX_ENTRIES]
             waiting.append(type(value))
         else:
-            yield from _own_files(value)
-            waiting += _inside(value)
+            try:
+                own, inside = list(_own_files(value)), _inside(value)
+            except Exception:  # Objects of somebody else may answer with anything.
+                continue
+            yield from own
+            waiting += inside
 
 
 def _inside(value: object) -> list[object]:

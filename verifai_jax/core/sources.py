@@ -308,8 +308,12 @@ class _Collector:
             self.modules[file] = Source(_shown(file), role, sha256)
 
     def add_data(self, file: str, role: str, sha256: str | None = None) -> None:
-        if file not in self.data and file not in self.modules and len(self.data) < MAX_FILES:
+        if file in self.data or file in self.modules or len(self.data) >= MAX_FILES:
+            return
+        try:
             self.data[file] = Source(_shown(file), role, sha256 or file_hash(Path(file)))
+        except OSError:
+            self.without_file.append(f"{_shown(file)} cannot be read, and is not recorded")
 
     def add_function(self, function: Function) -> None:
         where = "notebook" if is_notebook_cell(function.file) else "no file"
@@ -435,7 +439,11 @@ _imported_as: dict[int, tuple[object, str]] = {}
 def _as_imported(owner: object, file: str) -> str:
     known = _imported_as.get(id(owner))
     if known is None or known[0] is not owner:
-        known = _imported_as[id(owner)] = (owner, file_hash(Path(file)))
+        try:
+            sha256 = file_hash(Path(file))
+        except OSError:  # It is gone since it was imported.
+            sha256 = ""
+        known = _imported_as[id(owner)] = (owner, sha256)
     return known[1]
 
 
