@@ -358,7 +358,7 @@ class _Collector:
         """Return the hash of a file as it was imported, or as it is where it is not imported."""
         values = self._loaded.get(file)
         if values is None:
-            return file_hash(Path(file))
+            return _hash_of_code(file)
         return _as_imported(values.get("__spec__") or values, file)
 
     @cached_property
@@ -439,12 +439,15 @@ _imported_as: dict[int, tuple[object, str]] = {}
 def _as_imported(owner: object, file: str) -> str:
     known = _imported_as.get(id(owner))
     if known is None or known[0] is not owner:
-        try:
-            sha256 = file_hash(Path(file))
-        except OSError:  # It is gone since it was imported.
-            sha256 = ""
-        known = _imported_as[id(owner)] = (owner, sha256)
+        known = _imported_as[id(owner)] = (owner, _hash_of_code(file))
     return known[1]
+
+
+def _hash_of_code(file: str) -> str:
+    try:
+        return file_hash(Path(file))
+    except OSError:
+        return ""  # It is gone since it was imported.
 
 
 def file_hash(file: Path) -> str:
