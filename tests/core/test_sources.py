@@ -311,3 +311,13 @@ def test_a_problem_in_mujoco_has_the_files_that_it_was_loaded_from(tmp_path, mon
     assert before.changes(problem.sources()) == ()
     again = load_target("arm.py:swing", vj.Problem).sources()
     assert [change.name for change in before.changes(again)] == ["body.xml"]
+
+
+def test_functions_that_a_decorator_makes_are_no_part(project):
+    scope = {}
+    exec("def made(function):\n    return lambda features: function(features)", scope)
+    problem = loaded()
+    wrapped = vj.Problem(
+        "w", problem.space, vj.blackbox(scope["made"](problem.check)), "always x<1"
+    )
+    assert not [file for file in wrapped.sources().files if file.role == "a function"]

@@ -119,12 +119,11 @@ def _part_of_function(function: FunctionType) -> Module | Function | None:
     values = function.__globals__
     if os.path.isfile(file):
         return _module(file, values) if is_user_file(file) else None
-    if not is_user_file(file):
+    # Functions that decorators and dataclasses make say that they are from "<string>"; what they
+    # were made of has a file.
+    made = file == "<string>" and values.get("__name__") != "__main__"
+    if made or not is_user_file(file):
         return None
-    # Functions that dataclasses make say that they are from "<string>".
-    named = values.get("__file__")
-    if file == "<string>" and isinstance(named, str) and os.path.isfile(named):
-        return _module(named, values) if is_user_file(named) else None
     return Function(function.__qualname__, file, _hash_of_function(function))
 
 
