@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from verifai_jax._version import __version__ as __version__
 from verifai_jax.core.cores import claim_cores as _claim_cores
+from verifai_jax.core.reads import watch as _watch
 
 if TYPE_CHECKING:
     from verifai_jax import analysis as analysis
@@ -288,3 +289,4 @@ def __dir__() -> list[str]:
 
 
 _claim_cores()
+_watch()

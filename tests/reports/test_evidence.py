@@ -2,7 +2,6 @@
 
 import json
 import re
-import subprocess
 from html.parser import HTMLParser
 
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from verifai_jax.mtl import parse
 from verifai_jax.reports import write_report
 from verifai_jax.reports.commands import run_command
 from verifai_jax.reports.markup import data_block, element
-from verifai_jax.reports.provenance import Input, chained, project_inputs
+from verifai_jax.reports.provenance import Input, chained
 from verifai_jax.reports.view import MOST_ROWS, numbers_of, view_data
 from verifai_jax.reports.words import domain_words, formula_words
 
@@ -269,36 +268,6 @@ def test_the_chain_depends_on_every_input_and_their_order():
     assert last == chained([one, two])[-1].chain
     assert last != chained([two, one])[-1].chain
     assert last != chained([one._replace(sha256="3"), two])[-1].chain
-
-
-def test_the_inputs_of_a_problem_are_found_without_running_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "__init__.py").write_text("")
-    (tmp_path / "models" / "car.py").write_text('WEIGHTS = "car.npz"\n')
-    (tmp_path / "models" / "car.npz").write_text("weights")
-    (tmp_path / "spec.py").write_text("from models import car\nimport json\nraise SystemExit\n")
-    names = {(each.name, each.role) for each in project_inputs("spec.py:balance")}
-    assert names == {
-        ("spec.py", "the problem"),
-        ("models/__init__.py", "imported"),
-        ("models/car.py", "imported"),
-        ("models/car.npz", "named in a program"),
-    }
-    assert project_inputs("models.car:balance") == []
-    assert project_inputs(None) == []
-
-
-def test_a_revision_of_git_is_its_commit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    who = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
-    (tmp_path / "spec.py").write_text("")
-    for command in (["init", "-q"], ["add", "."], [*who, "commit", "-qm", "first"]):
-        subprocess.run(["git", *command], check=True)
-    head = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-    (found,) = project_inputs("spec.py:balance@HEAD")
-    assert found.name == f"spec.py:balance at {head.stdout.strip()}"
-    assert found.role == "a commit of git"
 
 
 def test_the_command_repeats_the_run():

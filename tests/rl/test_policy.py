@@ -13,6 +13,7 @@ from verifai_jax.rl import (
     PolicyFileError,
     load_policy,
     policy_notes,
+    policy_sources,
     save_policy,
 )
 from verifai_jax.rl.policy import new_layers, scalar_network
@@ -161,3 +162,11 @@ def test_new_layers_are_orthogonal_with_their_gains():
 def test_actions_that_make_no_sense_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_file_says_what_it_was_made_with(tmp_path):
+    path = tmp_path / "policy.npz"
+    save_policy(Policy(LAYERS, None, None, None, Discrete(2)), path)
+    sources = policy_sources(path)
+    assert any(name.endswith("test_policy.py") for name, *_ in sources["files"])
+    assert "jax" in sources["versions"]

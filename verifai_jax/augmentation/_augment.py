@@ -29,6 +29,7 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import ProgressBar
+from verifai_jax.core.sources import sources_of
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search, named
@@ -58,6 +59,7 @@ def augment(
     confidence: float = 0.95,
     folder: str | Path | None = None,
     progress: bool | None = None,
+    even_if_changed: bool = False,
 ) -> Augmentation:
     """Compare ways of adding training data, over seeds with paired data, weights and tests.
 
@@ -92,6 +94,8 @@ def augment(
     - `folder`: a folder, or a `.sqlite` file, that keeps finished work: the same call goes on where
       it was interrupted, and one with more seeds or arms computes only these.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
+    - `even_if_changed`: whether to go on with finished work of a folder although files of the task
+      are others than those that were recorded when it began.
 
     **Returns:** the result: a table with a row for each arm and seed, and what follows from it. One
     that was interrupted (Ctrl-C) has the finished rows; its `complete` is False.
@@ -118,7 +122,7 @@ def augment(
     check_search(searched_problem(task, None, search, None), search)
     plan = Plan(initial, added, steps, further_steps, search, budget, seed, test, hard)
     with locked_cache(folder, KIND), Cache(folder, KIND) as cache, ProgressBar(progress) as bar:
-        cache.claim(_fingerprint(task, plan))
+        cache.claim(_fingerprint(task, plan), sources_of(task), even_if_changed)
         bar.begin(task.name, seeds * (1 + len(chosen)), "networks")
         study = Study(task, plan, cache, bar)
         complete = True

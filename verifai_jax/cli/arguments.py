@@ -110,6 +110,13 @@ REPORT = click.option(
 )
 """File of the evidence report on a result."""
 
+EVEN_IF_CHANGED = click.option(
+    "--even-if-changed",
+    is_flag=True,
+    help="The model has changed on purpose: a row that gives another number is no error.",
+)
+"""For commands that simulate a row again: whether it may be that of another model."""
+
 SET = click.option(
     "--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search."
 )

@@ -71,7 +71,7 @@ def compare(
     click.echo(printable(str(result)))
     if report is not None:
         with load_at_revision(target, Problem) as baseline:
-            path = result.report(report, problem=baseline, targets=(target, *candidates))
+            path = result.report(report, problem=baseline)
         click.echo(f"  report       {path}")
     give_result(
         baseline=result.baseline,
@@ -93,5 +93,6 @@ def compare(
         seconds=result.seconds,
         seed=result.seed,
         notes=result.notes,
+        sources=result.sources,
     )
     check_gate(fail_on, {"regression": result.regression})

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import as_plain, command, give_result
 
@@ -14,12 +15,14 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @ROW
 @PROBLEM
 @click.option("--simulator", help="Another backend of the system that has to agree.")
+@EVEN_IF_CHANGED
 @fail_on(unconfirmed="if any is not confirmed", counterexample="if any is confirmed")
 def confirm(
     folder: Path,
     row: int | None,
     target: str | None,
     simulator: str | None,
+    even_if_changed: bool,
     fail_on: Gate | None,
 ) -> None:
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
@@ -37,3 +40,4 @@ def confirm(
     if isinstance(result, counterexamples.Confirmations):
         give_result(counts=result.counts, rows=result.table)
     check_gate(fail_on, {"unconfirmed": confirmed < examined, "counterexample": confirmed > 0})
+    check_again(result.finding, even_if_changed)

@@ -88,7 +88,7 @@ def estimate(
         )
     show_result(found, plot)
     if report is not None:
-        path = found.report(report, problem=problem, targets=(target,))
+        path = found.report(report, problem=problem)
         click.echo(f"  report       {path}")
     if found.prior_no_verdict == found.prior_simulations and not found.failures:
         raise CommandError(

@@ -6,6 +6,7 @@
 | 1 | a gate that was asked for by `--fail-on` failed |
 | 2 | wrong usage: an option, a name, a file or a package that is not as it should be |
 | 3 | the tool or the simulator broke, or no simulation had a verdict |
+| 4 | a row that was simulated again did not give its number, and --even-if-changed was not given |
 | 129, 143 | ended by SIGHUP or SIGTERM, after what was finished is saved |
 | 130 | interrupted before there was a result |
 | 141 | whoever read the output has closed the pipe, as `head` does |
@@ -21,6 +22,7 @@ from verifai_jax.core.errors import MissingExtra
 GATE_FAILED = 1
 WRONG_USAGE = 2
 BROKEN = 3
+NOT_AGAIN = 4
 INTERRUPTED = 130
 CLOSED_PIPE = 141
 
@@ -30,6 +32,7 @@ Exit codes:
   1  a gate asked for with --fail-on failed
   2  wrong usage
   3  the tool or the simulator broke, or no simulation had a verdict
+  4  a row that was simulated again did not give its number
 """
 """What `--help` says of them."""
 
@@ -61,6 +64,18 @@ class CommandError(click.ClickException):
 def fail_gate() -> click.exceptions.Exit:
     """Return what ends a command whose gate failed."""
     return click.exceptions.Exit(GATE_FAILED)
+
+
+def check_again(finding: str, even_if_changed: bool) -> None:
+    """End the command with code 4 where a row did not give its number again.
+
+    **Arguments:**
+
+    - `finding`: what differs, in words; empty where nothing does.
+    - `even_if_changed`: whether the user has said that another model is meant.
+    """
+    if finding and not even_if_changed:
+        raise click.exceptions.Exit(NOT_AGAIN)
 
 
 def command_error(error: BaseException, show_traceback: bool = False) -> CommandError:

@@ -4,7 +4,16 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run
+from verifai_jax.cli.arguments import (
+    EVEN_IF_CHANGED,
+    FOLDER,
+    PICTURES,
+    PROBLEM,
+    ROW,
+    RUN,
+    load_judged_run,
+)
+from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, give_result
 
 
@@ -12,10 +21,16 @@ from verifai_jax.cli.json_output import command, give_result
 @RUN
 @ROW
 @PROBLEM
+@EVEN_IF_CHANGED
 @FOLDER
 @PICTURES
 def explain(
-    folder: Path, row: int | None, target: str | None, into: Path | None, pictures: bool
+    folder: Path,
+    row: int | None,
+    target: str | None,
+    even_if_changed: bool,
+    into: Path | None,
+    pictures: bool,
 ) -> None:
     """Say why a ROW (by default the worst) of the run in RUN fails, and draw it."""
     import textwrap
@@ -25,7 +40,8 @@ def explain(
 
     run = load_judged_run(folder, target)
     why = counterexamples.explain(run, row)
-    click.echo(textwrap.fill(printable(str(why)), 88, break_on_hyphens=False))
+    for line in printable(str(why)).splitlines():
+        click.echo(textwrap.fill(line, 88, break_on_hyphens=False))
     influences = {one.name: why.effect(one) for one in why.influences}
     give_result(
         row=why.row,
@@ -34,9 +50,12 @@ def explain(
         text=str(why),
         effects=influences,
         simulations=why.simulations,
+        changed=why.replay.changed,
+        finding=why.replay.finding,
     )
     if pictures:
         path = (into or folder) / f"why-{why.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         why.plot(path)
         click.echo(f"  picture      {path}")
+    check_again(why.replay.finding, even_if_changed)

@@ -49,6 +49,9 @@ if TYPE_CHECKING:
 @click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
 @click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
+@click.option(
+    "--even-if-changed", is_flag=True, help="Resume although the model has changed, and note it."
+)
 @PRECISION
 @BACKEND
 @CLUSTER
@@ -89,6 +92,7 @@ def falsify(
     decide: float | None,
     warm_start: Path | None,
     resume: Path | None,
+    even_if_changed: bool,
     precision: Literal["float32", "float64"] | None,
     backend: str | None,
     cluster: str | None,
@@ -144,6 +148,7 @@ def falsify(
                 stop_when=stop_when,
                 progress=progress,
                 executor=executor,
+                even_if_changed=even_if_changed,
             )
     elif target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")

@@ -4,7 +4,17 @@ from pathlib import Path
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, load_judged_run, load_run
+from verifai_jax.cli.arguments import (
+    EVEN_IF_CHANGED,
+    FOLDER,
+    PICTURES,
+    PROBLEM,
+    ROW,
+    RUN,
+    load_judged_run,
+    load_run,
+)
+from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
@@ -18,6 +28,7 @@ from verifai_jax.cli.json_output import command, give_result
     type=click.Choice(["float32", "float64"]),
     help="[default: float64, and that of the run for a system that draws random numbers]",
 )
+@EVEN_IF_CHANGED
 @FOLDER
 @PICTURES
 @fail_on(counterexample="if it violates the property, or has no verdict")
@@ -26,6 +37,7 @@ def replay(
     row: int | None,
     target: str | None,
     precision: str | None,
+    even_if_changed: bool,
     into: Path | None,
     pictures: bool,
     fail_on: Gate | None,
@@ -41,6 +53,8 @@ def replay(
         precision = run.precision if run.problem.draws() else "float64"
     again = run.replay(number, precision)
     stored = run.table.row(number)
+    for text in again.warnings:
+        click.echo(printable(text))
     click.echo(printable(f"{run.name}, row {number}, {precision}"))
     for name in run.table.features:
         value = stored[name]
@@ -62,8 +76,11 @@ def replay(
         stored_robustness=stored["rho"],
         status=again.status.name.lower(),
         violated=again.violated,
+        changed=[change._asdict() for change in run.changes(number)],
+        finding=again.finding,
     )
     if pictures:
         for path in write_replay_pictures(again, into or folder):
             click.echo(f"  picture      {path}")
     check_gate(fail_on, {"counterexample": again.violated or again.status.name != "OK"})
+    check_again(again.finding, even_if_changed)

@@ -82,7 +82,6 @@ def report(
         studies=studies,
         modes=modes,
         problem=problem,
-        targets=() if target is None else (target,),
     )
     give_result(report=path, claims=claims_path(path))
     click.echo(f"  report       {path}")

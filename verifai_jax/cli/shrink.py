@@ -5,7 +5,17 @@ from typing import Literal
 
 import click
 
-from verifai_jax.cli.arguments import FOLDER, PICTURES, PROBLEM, ROW, RUN, SEED, load_judged_run
+from verifai_jax.cli.arguments import (
+    EVEN_IF_CHANGED,
+    FOLDER,
+    PICTURES,
+    PROBLEM,
+    ROW,
+    RUN,
+    SEED,
+    load_judged_run,
+)
+from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, give_result
 
 
@@ -28,6 +38,7 @@ from verifai_jax.cli.json_output import command, give_result
     show_default=True,
     help="Start from other counterexamples of the run too.",
 )
+@EVEN_IF_CHANGED
 @FOLDER
 @PICTURES
 def shrink(
@@ -38,6 +49,7 @@ def shrink(
     budget: int,
     seed: int,
     others: bool,
+    even_if_changed: bool,
     into: Path | None,
     pictures: bool,
 ) -> None:
@@ -56,9 +68,12 @@ def shrink(
         count=small.count,
         distance=small.distance,
         simulations=small.simulations,
+        model_changed=small.model_changed,
+        finding=small.finding,
     )
     if pictures:
         path = (into or folder) / f"shrunk-{small.row}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         small.plot(path)
         click.echo(f"  picture      {path}")
+    check_again(small.finding, even_if_changed)

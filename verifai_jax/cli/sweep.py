@@ -75,6 +75,9 @@ _MOST_ROWS = 12
 )
 @click.option("--resume", type=click.Path(path_type=Path), help="Folder of a sweep to resume.")
 @click.option(
+    "--even-if-changed", is_flag=True, help="Resume although the study has changed, and note it."
+)
+@click.option(
     "--folder",
     type=click.Path(path_type=Path),
     help="Folder to write  [default: sweeps/NAME-1, -2, ...]",
@@ -90,6 +93,7 @@ def sweep(
     max_seconds: float | None,
     cache: Path | None,
     resume: Path | None,
+    even_if_changed: bool,
     folder: Path | None,
     cluster: str | None,
     pictures: bool,
@@ -145,6 +149,7 @@ def sweep(
             max_seconds=max_seconds,
             note=note,
             executor=executor,
+            even_if_changed=even_if_changed,
             **keywords,
         )
         record = replace(result.record, options={**result.record.options, "target": target})

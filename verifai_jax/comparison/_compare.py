@@ -132,6 +132,8 @@ def _compare(
             chosen, BATCH, precision=precision, seed=seed, executor=executor
         )
     notes = _notes(baseline, named)
+    sides = {"baseline": baseline, **named}
+    sources, begun = {name: side.sources() for name, side in sides.items()}, time.time()
     each = 1 - (1 - confidence) / len(named)
     tallies = {name: _Tally() for name in named}
     open_ones, stopped, size, first = set(named), "budget", FIRST, 0
@@ -169,6 +171,7 @@ def _compare(
         time.perf_counter() - started,
         seed,
         notes,
+        {name: made.settled(begun).to_json() for name, made in sources.items()},
     )
 
 

@@ -1,5 +1,6 @@
 """The result of a comparison: how often each fails, by how much they differ, and where."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,6 +84,8 @@ class Comparison:
     - `stopped`: `"decided"`, `"budget"`, `"max_seconds"` or `"interrupted"`.
     - `seconds`, `seed`: of the comparison.
     - `notes`: what the two sides differ in beside the system.
+    - `sources`: what each side was made of, by its name, as a run records it; that of the baseline
+      has the name `"baseline"`.
     """
 
     baseline: str
@@ -92,6 +95,7 @@ class Comparison:
     seconds: float
     seed: int
     notes: tuple[str, ...] = ()
+    sources: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
 
     def __getitem__(self, name: str) -> Compared:
         """Return the candidate of this name."""
@@ -114,7 +118,7 @@ class Comparison:
         **Arguments:**
 
         - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `targets`, `units`, `reasons`.
+        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
 
         **Returns:** the path.
         """

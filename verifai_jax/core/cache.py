@@ -23,6 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.sources import Sources, list_changes
 
 log = logging.getLogger("verifai_jax.cache")
 
@@ -112,15 +113,26 @@ class Cache:
         )
         self._base.execute("COMMIT")
 
-    def claim(self, fingerprint: Mapping[str, Any]) -> None:
+    def claim(
+        self,
+        fingerprint: Mapping[str, Any],
+        sources: Sources | None = None,
+        even_if_changed: bool = False,
+    ) -> tuple[Mapping[str, Any], ...]:
         """Record the work that this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**
 
         - `fingerprint`: nested dictionaries of plain data.
+        - `sources`: what the work is made of; finished work of other files is refused too.
+        - `even_if_changed`: whether work of other files will do; it is recorded then.
+
+        **Returns:** what the work was made of when it began, and each time it went on with other
+        files; nothing where that is not recorded.
 
         **Raises:** `CacheError` with the differences.
         """
+        begun = self.note(self.kind) is not None
         text = json.dumps(fingerprint, sort_keys=True)
         with self._transaction():
             # If two processes start at once, the first to write decides.
@@ -136,6 +148,24 @@ class Cache:
                 f"{'; ...' if len(differences) > 4 else ''}. Give another folder, or repeat "
                 f"the {self.kind} that this one belongs to"
             )
+        return () if sources is None else self._claim_sources(sources, begun, even_if_changed)
+
+    def _claim_sources(
+        self, sources: Sources, begun: bool, even_if_changed: bool
+    ) -> tuple[Mapping[str, Any], ...]:
+        known = self.note("sources") or []
+        if begun and not known:
+            return ()
+        changes = Sources.from_json(known[-1]).changes(sources) if known else ()
+        if changes and not even_if_changed:
+            raise CacheError(
+                f"{self.path} holds work of the same {self.kind} with other files: "
+                f"{list_changes(changes)}. Give another folder, or restore the files; "
+                "even_if_changed=True (--even-if-changed) goes on all the same, and notes it"
+            )
+        if known and not changes:
+            return tuple(known)
+        return tuple(self.note("sources", [*known, sources.to_json()]))
 
     def note(self, name: str, value: object = None) -> Any:
         """Return the plain data stored under a name, after storing `value` where one is given."""

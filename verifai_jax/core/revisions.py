@@ -20,8 +20,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from verifai_jax.core.sources import add_tree, remove_tree
 from verifai_jax.core.targets import Kind, TargetError, load_target
-from verifai_jax.core.user_errors import is_user_file
+from verifai_jax.core.user_files import is_user_file
 
 _AT = re.compile(r"(?P<target>.+?\.py(?::[^@]*)?)@(?P<revision>.+)", re.DOTALL)
 _OWN = "verifai_jax"
@@ -82,7 +83,11 @@ def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
                 loaded = load_target(plain, kind)
         except TargetError as error:
             raise TargetError(f"at revision {revision}: {error}") from None
-        yield loaded
+        add_tree(tree / inner, commit)
+        try:
+            yield loaded
+        finally:
+            remove_tree(tree / inner)
 
 
 def _write_files(commit: str, root: Path, index: Path, tree: Path) -> None:

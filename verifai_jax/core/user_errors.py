@@ -16,9 +16,7 @@ import inspect
 import linecache
 import os
 import re
-import sysconfig
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from types import CodeType, FrameType, TracebackType
 from typing import Any, NamedTuple
@@ -27,6 +25,7 @@ import jax
 
 from verifai_jax.core.errors import nearest_names
 from verifai_jax.core.text import shorten
+from verifai_jax.core.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.waveform import IS_CALLED
 
 MOST_CODE = 80
@@ -340,28 +339,8 @@ def _is_of_user(frame: FrameType) -> bool:
     return is_user_file(file) and (module is None or is_user_file(module))
 
 
-@cache
-def is_user_file(file: str) -> bool:
-    """Return whether a file is a user's: neither this package nor Python nor installed."""
-    if file.startswith("<") and not file.startswith(("<stdin", "<string", "<ipython")):
-        return False
-    if "ipykernel_" in file:
-        return True
-    place = Path(file).absolute()
-    return not any(place.is_relative_to(folder) for folder in _libraries())
-
-
-@cache
-def _libraries() -> tuple[Path, ...]:
-    """Return the folders of this package, of Python and of what is installed."""
-    names = ("stdlib", "platstdlib", "purelib", "platlib")
-    folders = {Path(sysconfig.get_path(name)) for name in names}
-    folders |= {Path(__file__).parents[1], Path(os.__file__).parent, Path(jax.__file__).parents[1]}
-    return tuple(folders | {folder.resolve() for folder in folders})
-
-
 def _shown_file(file: str) -> str:
-    if "ipykernel_" in file or file.startswith("<ipython"):
+    if is_notebook_cell(file):
         return "a notebook cell"
     place, here = Path(file), Path(os.getcwd())
     return str(place.relative_to(here)) if place.is_relative_to(here) else str(place)

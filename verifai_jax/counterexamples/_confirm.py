@@ -9,7 +9,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias, overload
 
 import numpy as np
@@ -46,6 +46,8 @@ class Confirmation:
     - `why`: the reason of the verdict, in words.
     - `notes`: checks that could not be made, and why.
     - `precision`: of the run.
+    - `changed`, `finding`: as in `Replay`, of the row simulated again in the run's precision; the
+      second is looked for where the model has changed or the verdict is not `"confirmed"`.
     """
 
     name: str
@@ -56,6 +58,8 @@ class Confirmation:
     why: str
     notes: tuple[str, ...]
     precision: str = "float32"
+    changed: str = ""
+    finding: str = ""
 
     @property
     def confirmed(self) -> bool:
@@ -70,7 +74,8 @@ class Confirmation:
         words = {"as_run": f"as run ({self.precision})", **IN_WORDS}
         values = [f"{rho:.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
         text += f". Robustness {', '.join(values)}" if values else ""
-        return ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
+        text = ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
+        return "\n".join([*(each for each in (self.changed, self.finding) if each), text])
 
     __repr__ = __str__
 
@@ -86,12 +91,16 @@ class Confirmations:
       `band`, `why`.
     - `notes`: checks that could not be made, and why.
     - `checked`: the checks that a confirmed row has passed, in words.
+    - `changed`, `finding`: as in `Confirmation`, of the worst row that is not confirmed, or the
+      worst of all.
     """
 
     name: str
     table: pd.DataFrame = field(repr=False)
     notes: tuple[str, ...]
     checked: str = ""
+    changed: str = ""
+    finding: str = ""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -108,13 +117,14 @@ class Confirmations:
         return len(self.table)
 
     def __str__(self) -> str:
+        warnings = [text for text in (self.changed, self.finding) if text]
         if not len(self):
-            return f"{self.name}: no counterexample to confirm"
+            return "\n".join([*warnings, f"{self.name}: no counterexample to confirm"])
         counts = ", ".join(
             f"{count} {verdict}{f' {self.checked}' if verdict == 'confirmed' else ''}"
             for verdict, count in self.counts.items()
         )
-        lines = [f"{self.name}: of {_counted(len(self))}, {counts}"]
+        lines = [*warnings, f"{self.name}: of {_counted(len(self))}, {counts}"]
         doubtful = self.table.loc[~self.table["verdict"].isin(["confirmed", "unexamined"])]
         reasons = [
             (rows.index, str(verdict), str(why))
@@ -185,8 +195,35 @@ def confirm(
         )
     confirmer = Confirmer(run.problem, run.precision, run.seed, simulator=simulator, most=most)
     if row is None:
-        return _all(run, confirmer)
-    return _one(run, confirmer, row)
+        return _with_changes_of_all(run, _all(run, confirmer))
+    return _with_changes(run, _one(run, confirmer, row))
+
+
+def _with_changes(run: Run, found: Confirmation) -> Confirmation:
+    """Return a confirmation that says whether the model, or the number of the row, is another."""
+    if found.row is None:
+        return found
+    changed = run.changed_since(found.row)
+    looked_at = changed or not found.confirmed
+    finding = _finding(run, found.row) if looked_at else ""
+    return replace(found, changed=changed, finding=finding)
+
+
+def _with_changes_of_all(run: Run, found: Confirmations) -> Confirmations:
+    changed = run.changed_since()
+    table = found.table.loc[found.table["verdict"] != "unexamined"]
+    doubtful = table.loc[table["verdict"] != "confirmed"]
+    rows = doubtful if len(doubtful) else table
+    looked_at = len(rows) and (changed or len(doubtful))
+    finding = _finding(run, int(rows["rho"].idxmin())) if looked_at else ""  # pyright: ignore[reportArgumentType]
+    return replace(found, changed=changed, finding=finding)
+
+
+def _finding(run: Run, row: int) -> str:
+    try:
+        return run.replay(row).finding
+    except Exception:  # A system may raise whatever it likes; the verdict says so.
+        return ""
 
 
 def _one(

@@ -79,9 +79,10 @@ class Explained:
 
     def __str__(self) -> str:
         name = self.replay.problem.name
-        return describe(
+        text = describe(
             name, self.row, self.why, self.rho, self.influences, self.matter, self.notes
         )
+        return "\n".join([*self.replay.warnings, text])
 
     __repr__ = __str__
 
@@ -113,7 +114,7 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
         if nominal:
             raise
         at, known = Nominal(problem.space, np.full(problem.space.dim, 0.5, np.float32)), False
-    replayed = replay(problem, entry, run_keys(run.seed)[1], number, run.precision)
+    replayed = run.compared(replay(problem, entry, run_keys(run.seed)[1], number, run.precision))
     if not replayed.violated:
         notes.append("simulated again alone the row does not fail; see what confirm says of it")
     why = replayed.explain()

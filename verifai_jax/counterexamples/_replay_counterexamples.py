@@ -13,6 +13,7 @@ import numpy as np
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.sources import Change, Sources
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.core.trace import Status
 from verifai_jax.counterexamples.corpus import SavedCounterexample, read_corpus, renamed
@@ -46,6 +47,7 @@ class ReplayedCounterexample:
     - `robustness`: the least now; NaN without one.
     - `before`: the least when it was saved.
     - `note`: what has changed, or what is wrong, in words.
+    - `changed`: whether the model is another one than that which it was saved with.
     """
 
     path: Path
@@ -53,6 +55,7 @@ class ReplayedCounterexample:
     robustness: float
     before: float
     note: str = ""
+    changed: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,8 @@ class CorpusReplay:
         plural = "s" * (count != 1)
         lines = [f"{self.problem}: {count} counterexample{plural} in {self.place}"]
         lines[0] += f": {counts}" if count else ""
+        if changed := sum(one.changed for one in self.replayed):
+            lines.append(f"  the model has changed since {changed} of them were saved")
         for one in self.replayed:
             if one.state == OTHER:
                 continue
@@ -189,23 +194,49 @@ def _replay_batch(
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
     [verdicts] = replays(1, [features], numbers)
     formulas = {name: str(formula) for name, formula in problem.formulas.items()}
+    now = problem.sources()
     results = {}
     for i, (path, entry, _) in enumerate(batch):
         status = Status(int(verdicts.status[i]))
         notes = []
+        changes = _changes(entry, now)
         if entry.formulas != formulas:
             notes.append(f"the formulas were {one_line(', '.join(entry.formulas.values()))}")
         state, robustness = WITHOUT_VERDICT, np.nan
         if status == Status.OK:
             robustness = float(np.min(verdicts.rho[i]))
             state = FAILING if bool(verdicts.violated[i]) else FIXED
+            notes += _not_again(entry, changes, robustness)
         else:
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())
         results[path] = ReplayedCounterexample(
-            path, state, robustness, _least(entry), "; ".join(notes)
+            path, state, robustness, _least(entry), "; ".join(notes), bool(changes)
         )
     return results
+
+
+def _changes(entry: SavedCounterexample, now: Sources) -> tuple[Change, ...] | None:
+    """Return what has changed since a counterexample was saved; None where that is not known."""
+    recorded = entry.found.get("sources")
+    try:
+        return Sources.from_json(recorded).changes(now) if recorded else None
+    except ValueError:
+        return None  # Somebody has edited it.
+
+
+def _not_again(
+    entry: SavedCounterexample, changes: tuple[Change, ...] | None, robustness: float
+) -> list[str]:
+    """Say that the same model gives another number than when a counterexample was saved."""
+    before = _least(entry)
+    near = abs(robustness - before) <= CLOSE * max(1.0, abs(before))
+    if changes is None or changes or near or np.isnan(before):
+        return []
+    return [
+        "it does not give its number again, though no file of its model has changed: the system "
+        "has memory, chance or state of its own, or reads what is not recorded"
+    ]
 
 
 def _least(entry: SavedCounterexample) -> float:

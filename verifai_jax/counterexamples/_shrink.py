@@ -71,7 +71,8 @@ class Shrunk:
     `start_count` and `start_distance` of the row;
     `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;
     `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
-    `notes` for people; `duration` of the simulation in seconds.
+    `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
+    the replay of the row says, as in `Replay`.
     """
 
     problem: Problem
@@ -93,6 +94,8 @@ class Shrunk:
     duration: float | None = None
     broken: tuple[str, ...] = ()
     start_broken: tuple[str, ...] = ()
+    model_changed: str = ""
+    finding: str = ""
 
     @property
     def count(self) -> int:
@@ -154,7 +157,8 @@ class Shrunk:
             f"{self.start_distance:.3g}; {self.simulations} simulations"
         )
         lines += [f"  note: {note}" for note in self.notes]
-        return "\n".join(lines)
+        warnings = [text for text in (self.model_changed, self.finding) if text]
+        return "\n".join([*warnings, *lines])
 
     def _breaks(self) -> str:
         """Say which formulas break, and which of those that the row broke do not any more."""
@@ -215,7 +219,7 @@ def shrink(
     at = Nominal.of(problem, nominal)
     problem = fix_key(problem, run, number)
     key = run_keys(run.seed)[1]
-    original = replay(problem, first, key, number, run.precision)
+    original = run.compared(replay(problem, first, key, number, run.precision))
     if not original.violated:
         reason = (
             f"robustness {min(original.rho.values()):.4g}"
@@ -225,6 +229,7 @@ def shrink(
         raise ValueError(
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
             f"({reason}); see what confirm says of it, and shrink another"
+            f"{''.join(f'. {text}' for text in original.warnings)}"
         )
     u = np.asarray(problem.space.point_of(problem.space.from_row(first)))
     start = at.settle(u[None])
@@ -262,6 +267,8 @@ def shrink(
         duration=original.duration,
         broken=_broken(replayed),
         start_broken=_broken(original),
+        model_changed=original.changed,
+        finding=original.finding,
     )
 
 

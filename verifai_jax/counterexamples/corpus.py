@@ -12,7 +12,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.counterexamples.selection import columns_at, problem_of
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.falsification.model_changes import sources_of_row
 from verifai_jax.falsification.run import Run
 
 FORMAT = 1
@@ -46,7 +47,8 @@ class SavedCounterexample:
     - `precision`, `backend`: that it was simulated with.
     - `verdict`: of closer replays of the row that it came from; empty where there were none.
     - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
-    - `found`: the search, its budget, the number of simulations, and the version.
+    - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
+      what the model was made of, as a run records it.
     """
 
     problem: str
@@ -189,10 +191,18 @@ def save_counterexamples(
                 "simulations": run.simulations,
                 "version": run.version,
                 "jax": jax.__version__,
+                "sources": _sources(run, row),
             },
         )
         paths[saved.write(folder)] = None
     return list(paths)
+
+
+def _sources(run: Run, row: int) -> dict[str, Any]:
+    """Return what a row was simulated with, as it belongs into a file under version control."""
+    found = sources_of_row(run.sources, row)
+    # Where the project lay on this machine is nobody else's concern.
+    return {} if found is None else replace(found, root="", first=0).to_json()
 
 
 def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], dict[Path, str]]:

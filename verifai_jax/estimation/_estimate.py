@@ -8,6 +8,7 @@ result.probability, result.interval, result.upper_bound
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 
 import numpy as np
 
@@ -106,6 +107,7 @@ def estimate(
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
+    sources, begun = problem.sources(), time.time()
     simulated = DoublePrecisionEvaluator(choice.problem, batch, precision, seed, executor)
     simulated.compile()
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
@@ -129,7 +131,10 @@ def estimate(
             limit_state.ended = "interrupted"
             answer = bound_from_pilot(limit_state, plan)
     seconds = time.perf_counter() - started
-    return _result(problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds)
+    found = _result(
+        problem, choice.backend, answer, limit_state, plan, seed, precision, p0, seconds
+    )
+    return replace(found, sources=sources.settled(begun).to_json())
 
 
 _METHODS = {

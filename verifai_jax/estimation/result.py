@@ -8,6 +8,7 @@ result.plot("estimate.png")
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,6 +51,7 @@ class Estimate:
     - `p0`: the wanted upper limit of the probability, if one was given.
     - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
     - `seconds`: wall-clock time.
+    - `sources`: what the model was made of, as a run records it; empty where that is not recorded.
     - `drawn`: data of the pictures.
     """
 
@@ -77,6 +79,7 @@ class Estimate:
     precision: str = "float32"
     backend: str | None = None
     seconds: float = 0.0
+    sources: Mapping[str, Any] = field(default_factory=dict)
     drawn: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -167,7 +170,7 @@ class Estimate:
         **Arguments:**
 
         - `path`: of the HTML file.
-        - `options`: of `reports.write_report`: `problem`, `targets`, `units`, `reasons`.
+        - `options`: of `reports.write_report`: `problem`, `units`, `reasons`.
 
         **Returns:** the path.
         """

@@ -44,6 +44,13 @@ class Replay:
     status: Status
     key: Key[Array, ""] | None = None
     duration: float | None = None
+    changed: str = ""
+    finding: str = ""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences that stand in the way of taking the replay for its row; often none."""
+        return tuple(text for text in (self.changed, self.finding) if text)
 
     @property
     def violated(self) -> bool:
@@ -84,7 +91,7 @@ class Replay:
 
     def __str__(self) -> str:
         which = "a simulation" if self.row is None else f"row {self.row}"
-        lines = [f"{which} of {self.problem.name}: {self._verdict()}"]
+        lines = [*self.warnings, f"{which} of {self.problem.name}: {self._verdict()}"]
         if len(self.rho) > 1 and self.status == Status.OK:
             lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
         lines.append(f"  {'features':<12} {self.describe_features()}")

@@ -134,6 +134,8 @@ class Modes:
     - `notes`: surprises, in words.
     - `run`: simulations of the likeliest failures, as `falsify` keeps them.
     - `seconds`: wall-clock time.
+    - `sources`: what the model was made of, as a run records it.
+    - `changed`: says that the model of the run from which they began is another one by now.
     """
 
     name: str
@@ -150,6 +152,8 @@ class Modes:
     notes: tuple[str, ...]
     run: Run | None = field(repr=False)
     seconds: float = math.nan
+    sources: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    changed: str = ""
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -208,6 +212,8 @@ class Modes:
                 f"{self.low:.3g} to {self.high:.3g}), in {len(self.modes)} "
                 f"mode{'s' if len(self.modes) != 1 else ''}"
             ]
+        if self.changed:
+            lines.insert(0, self.changed)
         for mode in self.modes:
             lines.append(
                 f"  {mode.number}  {format_percent(mode.share)} of the failures: "

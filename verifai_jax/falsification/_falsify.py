@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,10 +22,15 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice, resolved
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
+from verifai_jax.falsification.model_changes import (
+    ANOTHER_MODEL,
+    continued_with,
+)
 from verifai_jax.falsification.origin import origin_of
 from verifai_jax.falsification.run import (
     RECORD,
@@ -268,6 +273,7 @@ def resume(
     callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
     executor: Executor | None = None,
+    even_if_changed: bool = False,
 ) -> Run:
     """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
 
@@ -277,6 +283,9 @@ def resume(
     - `problem`: needed for a folder, which names no code to run.
     - `search`: needed only if it is none of `verifai_jax.search`.
     - `budget`: simulations in all, those done included; the run's own when left out.
+    - `even_if_changed`: whether to go on where files of the model are others than those that the
+      run recorded when it began; its rows are then of two models, it has no failure rate, and its
+      notes and its record say so.
     - the others as in `falsify`.
 
     The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
@@ -284,8 +293,8 @@ def resume(
 
     **Returns:** the run with the earlier rows and the new ones.
 
-    **Raises:** `ValueError` for a run without its problem or its state, a budget that is spent, or
-    a folder that another process writes; as `falsify` otherwise.
+    **Raises:** `ValueError` for a run without its problem or its state, a model that has changed, a
+    budget that is spent, or a folder that another process writes; as `falsify` otherwise.
     """
     ends = _Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
     folder = Path(run) if isinstance(run, str | Path) else run.folder
@@ -298,7 +307,9 @@ def resume(
         elif run.folder is not None:
             check_not_continued(run, run.folder)
         called = check_callbacks(callbacks)
-        return _resume(run, problem, search, budget, ends, progress, called, executor)
+        return _resume(
+            run, problem, search, budget, ends, progress, called, executor, even_if_changed
+        )
 
 
 def _resume(
@@ -309,7 +320,8 @@ def _resume(
     ends: "_Ending",
     progress: bool | None,
     callbacks: Sequence[Callback],
-    executor: Executor | None = None,
+    executor: Executor | None,
+    even_if_changed: bool,
 ) -> Run:
     """Go on with a run whose folder is locked; `ends` is completed from the run."""
     problem = problem or run.problem
@@ -339,6 +351,7 @@ def _resume(
         )
     if not checkpoint and len(run.table) and run.stopped != "running":
         raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+    sources, changed = continued_with(run.name, run.sources, problem, rows, even_if_changed)
     choice = resolved(problem, wanted=run.backend)
     problem = choice.problem
     check_gradient(problem, search)
@@ -362,8 +375,9 @@ def _resume(
             rounds.resume(checkpoint)
 
     ends = ends._replace(budget=budget, earlier=_seconds_of(run))
-    kept = ("portfolio ", "search ", NOMINAL_FAILS)
+    kept = ("portfolio ", "search ", NOMINAL_FAILS, ANOTHER_MODEL)
     notes = [note for note in run.notes if note.startswith(kept)]
+    notes += [changed] if changed else []
     notes += notes_before(problem, search)
     return _run_rounds(
         rounds,
@@ -376,6 +390,7 @@ def _resume(
         notes,
         callbacks,
         resumed=True,
+        sources=sources,
     )
 
 
@@ -436,12 +451,15 @@ def _run_rounds(
     *,
     warm: bool = False,
     resumed: bool = False,
+    sources: Sequence[Mapping[str, Any]] | None = None,
 ) -> Run:
     """Compile, `prepare`, and play rounds until something ends them."""
     problem, search, place = rounds.problem, rounds.search, rounds.folder
     asked = rounds.suggestions
     recorded = search if asked is None else asked.search
     chosen = (f"backend {choice.backend}: {choice.why}",) if choice.why else ()
+    begun = time.time()
+    models = (problem.sources().to_json(),) if sources is None else tuple(sources)
     # Checking and tracing are part of what a second run of the problem does not repeat.
     watch = rounds.watch = Stopwatch(COMPILE, ends.started, ends.earlier)
 
@@ -478,6 +496,7 @@ def _run_rounds(
             backend=choice.backend,
             confirm=rounds.confirms,
             guide=None if problem.guide is None else problem.guide.to_json(),
+            sources=models,
             notes=(*chosen, *notes, *rounds.notes),
         )
 
@@ -516,6 +535,9 @@ def _run_rounds(
     except Exception as error:
         stopped, cause = format_user_error(error), error
     rounds.close()
+    if models:
+        last = Sources.from_json(models[-1]).settled(begun)
+        models = (*models[:-1], last.to_json())
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
     result = replace(result, notes=(*result.notes, *after))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.core.seals import is_intact
+from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.falsification.origin import ORIGINS
 from verifai_jax.falsification.segments import SEGMENTS, list_segments
@@ -49,6 +50,7 @@ ADDED = (
     "first",
     "guide",
     "origin",
+    "sources",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
@@ -155,6 +157,15 @@ def _is_space(value: object) -> bool:
     return pairs and (value.get("where", 0) is None or isinstance(value.get("where"), str))
 
 
+def _is_sources(value: object) -> bool:
+    if not isinstance(value, list):
+        return False
+    try:
+        return all(isinstance(Sources.from_json(part), Sources) for part in value)
+    except ValueError:
+        return False
+
+
 _FORMS: dict[str, Callable[[Any], bool]] = {
     "features": _is_texts,
     "name": _is_text,
@@ -182,5 +193,6 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "checked": _is_text,
     "guide": _is_mapping,
     "origin": lambda value: value in ("", *ORIGINS),
+    "sources": _is_sources,
 }
 """What each entry of a record must be."""

@@ -8,7 +8,7 @@ run.save("runs/mine"); vj.load("runs/mine", problem)
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
 from verifai_jax.core.seals import sealed
+from verifai_jax.core.sources import Change
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.checkpoint import (
@@ -27,6 +28,14 @@ from verifai_jax.falsification.checkpoint import (
     CheckpointError,
     read_checkpoint,
     write_checkpoint,
+)
+from verifai_jax.falsification.model_changes import (
+    NEAR,
+    changed_since,
+    finding_of,
+    has_several_models,
+    model_changes,
+    sources_of_row,
 )
 from verifai_jax.falsification.record import (
     ADDED,
@@ -85,6 +94,9 @@ class Run:
     - `checked`: the checks that a confirmed row has passed, in words; empty where none was made.
     - `first`: points of the unit cube that were simulated before the search began.
     - `guide`: the term that steered the search, as plain data; None without one.
+    - `sources`: what the model was made of when the run began, and again where it went on with
+      another one: files with their hashes, and versions, as plain data; empty where that is not
+      recorded.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
@@ -117,6 +129,7 @@ class Run:
     checked: str = ""
     first: Sequence[Sequence[float]] = ()
     guide: Mapping[str, Any] | None = None
+    sources: Sequence[Mapping[str, Any]] = ()
     damage: str = ""
     origin: str = ""
 
@@ -158,7 +171,7 @@ class Run:
         whenever sampling stops. A simulation without a verdict is taken for safe at the lower end
         of the interval and for failing at the upper end. None unless the rows are independent
         samples of the feature space and at least one of them has a verdict: an active search may
-        refute, it never certifies.
+        refute, it never certifies. None too where the run went on with another model.
         """
         return self._rate(self.table.counts.violating, 0)
 
@@ -178,7 +191,7 @@ class Run:
 
     def _rate(self, failures: int, undecided: int) -> Rate | None:
         without = self.table.counts.without_verdict
-        if not self.prior or self.simulations == without:
+        if not self.prior or self.simulations == without or self.has_several_models:
             return None
         stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
         interval = anytime_interval if stopped_by_outcomes else clopper_pearson
@@ -209,6 +222,54 @@ class Run:
         rulebook = self.problem.rulebook or Rulebook(self.formulas)
         return failing.loc[rulebook.front(broken)] if len(failing) else failing
 
+    @property
+    def has_several_models(self) -> bool:
+        """True where the run went on although its model had changed."""
+        return has_several_models(self.sources)
+
+    def changes(self, row: int | None = None) -> tuple[Change, ...]:
+        """Return the files of the model that are others by now, with both hashes.
+
+        The model of now is that of the run's problem; of a run without it, what lies on the disk.
+
+        - `row`: the row that is asked about; all rows when left out.
+        """
+        return model_changes(self.sources, self.problem, row)
+
+    def changed_since(self, row: int | None = None) -> str:
+        """Say in a sentence which files of the model are others by now; empty where none is."""
+        return changed_since(self.changes(row), row)
+
+    def compared(self, seen: Replay) -> Replay:
+        """Return a replay of a row in the run's precision, with what speaks against taking it so.
+
+        Its `changed` says which files of the model are others by now, and its `finding` that it
+        does not give the number of its row.
+        """
+        if seen.row is None:
+            return seen
+        changed = self.changed_since(seen.row)
+        finding = finding_of(seen, self.table.row(seen.row).to_dict(), self._several)
+        if finding and not changed:
+            finding += f"; {self._why_not_again(seen.row)}"
+        return replace(seen, changed=changed, finding=f"{finding}." if finding else "")
+
+    @property
+    def _several(self) -> bool:
+        return len(self.formulas) > 1
+
+    def _why_not_again(self, row: int) -> str:
+        """Say what may be the reason where no file has changed."""
+        then = sources_of_row(self.sources, row)
+        if then is None or self.problem is None:
+            return "what its model was made of is not recorded, so that it may be another one"
+        if versions := then.other_versions(self.problem.sources()):
+            return f"no file of its model has changed, and versions have: {', '.join(versions)}"
+        return (
+            "no file of its model has changed: the system has memory, chance or state of its own, "
+            "or reads what is not recorded"
+        )
+
     def analyze(self, **options: Any) -> Any:
         """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""
         return late("verifai_jax.analysis", "analyze")(self, **options)
@@ -221,6 +282,9 @@ class Run:
         - `row`: a row number, or a row of `table.all` (its index is the row number), or any
           mapping with the feature columns.
         - `precision`: `"float32"` or `"float64"`; that of the run when left out.
+
+        **Returns:** the replay; its `changed` says that the model is another one by now, and its
+        `finding` that it does not give the number of its row, which its text begins with.
 
         **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
         in the table.
@@ -236,7 +300,22 @@ class Run:
             index = getattr(row, "name", None)
             number, values = None if index is None else int(index), row
         precision = self.precision if precision is None else precision
-        return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+        seen = replay(self.problem, values, run_keys(self.seed)[1], number, precision)
+        if number is None or not 0 <= number < self.simulations:
+            return seen
+        stored = self.table.row(number).to_dict()
+        own = isinstance(row, int | np.integer) or all(
+            values[name] == stored[name] or values[name] != values[name]
+            for name in self.table.features
+        )
+        if own and precision == self.precision:
+            return self.compared(seen)
+        if not own or not finding_of(seen, stored, self._several, NEAR):
+            return replace(seen, changed=self.changed_since(number))
+        # The other precision may be all that differs, which is no finding.
+        again = replay(self.problem, values, run_keys(self.seed)[1], number, self.precision)
+        again = self.compared(again)
+        return replace(seen, changed=again.changed, finding=again.finding)
 
     def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
         """Write counterexamples as small files made for version control; returns their paths.

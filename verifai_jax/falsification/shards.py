@@ -33,6 +33,7 @@ from verifai_jax.core.locks import LOCK
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.seals import is_intact, sealed
+from verifai_jax.core.sources import Sources, list_changes
 from verifai_jax.core.text import one_line
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.engine import chunks_and_lanes
@@ -163,6 +164,7 @@ def simulate_shard(
         "confirm": confirm,
         "target": target,
         "shard": [shard.number, shard.of],
+        "sources": problem.sources().to_json(),
     }
     with writing(place):
         place.mkdir(parents=True, exist_ok=True)
@@ -222,7 +224,9 @@ def _claim(place: Path, record: Mapping[str, Any]) -> None:
     if (place / RECORD).exists():
         known = read_shard(place)
         for name, value in json.loads(json.dumps(record)).items():
-            if known[name] != value:
+            if name == "sources":
+                _check_same_model(place, known, Sources.from_json(value))
+            elif known[name] != value:
                 raise ValueError(
                     f"{place} holds another part: its {name} is {one_line(str(known[name]))}, "
                     f"here {one_line(str(value))}; give another folder"
@@ -232,6 +236,19 @@ def _claim(place: Path, record: Mapping[str, Any]) -> None:
         raise ValueError(f"folder {str(place)!r} is not empty; a part of a run needs a new one")
     with writing(place):
         write_whole(place / RECORD, json.dumps(sealed(record), indent=2).encode())
+
+
+def _check_same_model(place: Path, record: Mapping[str, Any], now: Sources) -> None:
+    """Refuse a part that another model has simulated.
+
+    **Raises:** `ValueError`.
+    """
+    if "sources" in record and (changes := Sources.from_json(record["sources"]).changes(now)):
+        raise ValueError(
+            f"the model has changed since the part in {place} was simulated: "
+            f"{list_changes(changes)}. Restore the files, or simulate the part again in a new "
+            "folder: rows of one run are of one model"
+        )
 
 
 def read_shard(folder: Path) -> dict[str, Any]:
@@ -408,6 +425,9 @@ def merge(
             f"the parts are of the problem {first['name']!r} with other formulas or features than "
             f"{problem.name!r} has now"
         )
+    now = problem.sources()
+    for place, record in zip(places, records, strict=True):
+        _check_same_model(place, record, now)
     stored = _StoredRows([block for place in places for block in _blocks(place)])
     return falsify(
         problem,

@@ -93,6 +93,11 @@ def _differentiated(run: Run) -> str:
 def _headline(run: Run, violating: int) -> str:
     """Write how many simulations violate the property, and whatever makes that number doubtful."""
     without = run.table.counts.without_verdict
+    if run.has_several_models:
+        return (
+            f"{violating} of {run.simulations} simulations violate the property, and they are of "
+            "several models: it went on although its model had changed"
+        )
     if run.simulations and without == run.simulations:
         return f"no verdict: none of {run.simulations} simulations ended properly"
     if not run.simulations:

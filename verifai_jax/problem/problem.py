@@ -18,6 +18,7 @@ from verifai_jax.core.errors import missing_name
 from verifai_jax.core.lazy import late
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
+from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import (
     check_called_with,
@@ -62,6 +63,8 @@ class Problem:
     - `guide`: a term beside the robustness that steers searches and decides nothing: a formula,
       its text, a function of the trace and the features, or a `Guide` with its weight.
     - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
+    - `made_in`: the modules whose code makes the problem, for the record of its runs; those on the
+      stack when left out, and where a problem is made of another one, those of the other.
 
     `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
     `programs` what has been compiled for this problem.
@@ -81,6 +84,7 @@ class Problem:
     priority: Sequence[str] | Sequence[tuple[str, str]] | None
     behaviour: Behaviour | None
     guide: Guide | None
+    made_in: Sequence[Maker] | None = field(repr=False)
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False)
     programs: ProgramCache = field(init=False, repr=False)
@@ -98,6 +102,7 @@ class Problem:
         priority: Sequence[str] | Sequence[tuple[str, str]] | None = None,
         behaviour: Behaviour | None = None,
         guide: Guide | Formula | str | Term | None = None,
+        made_in: Sequence[Maker] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {name!r}")
@@ -127,6 +132,7 @@ class Problem:
             "priority": priority,
             "behaviour": behaviour,
             "guide": guide if guide is None or isinstance(guide, Guide) else Guide(guide),
+            "made_in": made_here() if made_in is None else tuple(made_in),
             "formulas": formulas,
             "rulebook": None if priority is None else _rulebook(priority, formulas),
             "programs": ProgramCache(),
@@ -146,6 +152,15 @@ class Problem:
     def black_box(self) -> bool:
         """True where the system runs on the host, and JAX cannot trace it."""
         return self.system.black_box
+
+    def sources(self, first: int = 0) -> Sources:
+        """Return the files of which the problem is made, with their hashes, and versions.
+
+        **Arguments:**
+
+        - `first`: the row of a table from which on that holds.
+        """
+        return sources_of(self, made=self.made_in or (), first=first)
 
     @truncate_silently()
     def draws(self) -> bool:

@@ -1,19 +1,19 @@
 """The report on a comparison: which candidate fails more often, by how much, and where."""
 
-from collections.abc import Sequence
-
 from verifai_jax.comparison.result import BETTER, SAME, WORSE, Comparison
 from verifai_jax.core.text import format_percent
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Markup, bullets, element, paragraph, preformatted, table
 from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import Input, chained, project_inputs
+from verifai_jax.reports.provenance import Model, chained
 from verifai_jax.reports.run_question import About, space_table
 from verifai_jax.reports.sections import (
     MODEL,
     answers_section,
     claims_section,
+    model_answer,
+    model_warnings,
     problem_content,
     provenance_content,
 )
@@ -28,9 +28,7 @@ MOST_PAIRS = 10
 """Pairs in which only one side fails that are listed."""
 
 
-def comparison_page(
-    comparison: Comparison, about: About, problem: Problem | None, targets: Sequence[str]
-) -> Page:
+def comparison_page(comparison: Comparison, about: About, problem: Problem | None) -> Page:
     """Make the report on a comparison.
 
     **Arguments:**
@@ -38,12 +36,10 @@ def comparison_page(
     - `comparison`: the comparison.
     - `about`: units and reasons of the features.
     - `problem`: the baseline; None where it is not at hand.
-    - `targets`: names of baseline and candidates on the command line, whose files are hashed.
     """
-    inputs: dict[str, Input] = {}
-    for target in targets:
-        inputs |= {each.name: each for each in project_inputs(target)}
-    links = tuple(chained(inputs.values()))
+    # That of one side says nothing of the files of the others.
+    model = Model.of(comparison.sources.values())
+    links = tuple(chained(model.inputs))
     first = comparison.candidates[0]
     sure = format_percent(1 - len(comparison.candidates) * (1 - first.rates.confidence))
     headline = (
@@ -89,6 +85,7 @@ def comparison_page(
                 ("How many pairs had no two verdicts?", f"{without:,}", "limits"),
                 ("Which assumption is under the intervals?", PAIRED, "limits"),
                 ("With which seed?", str(comparison.seed), "reproduce"),
+                model_answer(model),
             ]
         ),
         Section(
@@ -124,7 +121,7 @@ def comparison_page(
         Section(
             "reproduce",
             "How to reproduce it",
-            (preformatted(python), *provenance_content(links)),
+            (preformatted(python), *provenance_content(links, model)),
         ),
     )
     tones = {WORSE: "fails", BETTER: "holds", SAME: "holds"}
@@ -134,6 +131,7 @@ def comparison_page(
         tone=tones.get(comparison.verdict, "open"),
         sections=sections,
         claims=claims_json(comparison.baseline, claims, links[-1].chain if links else ""),
+        warnings=model_warnings(model._replace(parts=model.parts[:1])),
     )
 
 

@@ -35,7 +35,6 @@ def write_report(
     studies: bool | None = None,
     modes: int | None = None,
     problem: Problem | None = None,
-    targets: Sequence[str] = (),
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON beside it.
 
@@ -53,7 +52,6 @@ def write_report(
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
     - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
-    - `targets`: names of these problems, as `FILE.py:NAME`: their files are hashed.
 
     **Returns:** the path of the HTML file.
 
@@ -74,10 +72,10 @@ def write_report(
             page = sweep_page(result, about)
         case Estimate():
             _check(about, None if problem is None else problem.space, ())
-            page = estimate_page(result, about, problem, *targets[:1] or [None])
+            page = estimate_page(result, about, problem)
         case Comparison():
             _check(about, result.candidates[0].space, ())
-            page = comparison_page(result, about, problem, targets)
+            page = comparison_page(result, about, problem)
         case _:
             kind = type(result).__name__
             raise TypeError(

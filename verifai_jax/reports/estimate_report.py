@@ -6,7 +6,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Child, bullets, paragraph, picture, preformatted, table
 from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import chained, project_inputs
+from verifai_jax.reports.provenance import Model, chained
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.sections import (
     MODEL,
@@ -14,15 +14,15 @@ from verifai_jax.reports.sections import (
     SAMPLES,
     answers_section,
     claims_section,
+    model_answer,
+    model_warnings,
     problem_content,
     provenance_content,
 )
 from verifai_jax.reports.studies import png
 
 
-def estimate_page(
-    estimate: Estimate, about: About, problem: Problem | None, target: str | None
-) -> Page:
+def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> Page:
     """Make the report on an estimate.
 
     **Arguments:**
@@ -30,9 +30,9 @@ def estimate_page(
     - `estimate`: the estimate.
     - `about`: units and reasons of the features.
     - `problem`: what was asked; None where it is not at hand.
-    - `target`: its name on the command line, whose files are hashed.
     """
-    links = tuple(chained(project_inputs(target)))
+    model = Model.of([estimate.sources], None if problem is None else problem.sources())
+    links = tuple(chained(model.inputs))
     chain = links[-1].chain if links else ""
     sure = format_percent(estimate.confidence)
     interval = f"{estimate.low:.3g} to {estimate.high:.3g}"
@@ -98,6 +98,7 @@ def estimate_page(
                 ("How many had no verdict?", f"{estimate.no_verdict:,}", "limits"),
                 ("Which assumption is under the interval?", assumptions[-1], "limits"),
                 ("With which seed?", ", ".join(steps), "reproduce"),
+                model_answer(model),
             ]
         ),
         Section(
@@ -125,7 +126,7 @@ def estimate_page(
             (
                 preformatted(python),
                 paragraph(f"Made with verifai_jax {estimate.version}."),
-                *provenance_content(links),
+                *provenance_content(links, model),
             ),
         ),
     )
@@ -135,4 +136,5 @@ def estimate_page(
         tone="open",
         sections=sections,
         claims=claims_json(estimate.name, claims, chain),
+        warnings=model_warnings(model),
     )

@@ -36,6 +36,7 @@ class Page:
     - `sections`: in their order.
     - `claims`: as plain data.
     - `view`: data of the interactive table; None without one.
+    - `warnings`: what a reader must know before anything else, below the headline.
     """
 
     title: str
@@ -44,6 +45,7 @@ class Page:
     sections: tuple[Section, ...]
     claims: Mapping[str, Any]
     view: Mapping[str, Any] | None = field(default=None, repr=False)
+    warnings: tuple[Markup, ...] = ()
 
 
 def asset(name: str) -> str:
@@ -78,6 +80,7 @@ def render(page: Page) -> str:
     parts = [
         element("h1", page.title),
         element("p", page.headline, class_=f"headline {page.tone}"),
+        *([element("div", page.warnings, class_="warning")] if page.warnings else []),
         element("nav", links, aria_label="sections"),
     ]
     parts += [

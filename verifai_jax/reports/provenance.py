@@ -1,39 +1,25 @@
 """The inputs of a report with their hashes, chained, and the versions of what made it.
 
-    inputs = record_inputs(folder) + project_inputs("specs/cartpole.py:balance")
+    inputs = folder_inputs(folder, FILES) + Model.of(run.sources).inputs
     chained(inputs)[-1].chain                       # one hash that all inputs decide
 
 A link of the chain is the SHA-256 of the link before, the name of the input and its content's hash,
 so that the last link stands for all inputs in their order.
 """
 
-import ast
 import hashlib
 import platform
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from verifai_jax._version import __version__
-from verifai_jax.core.revisions import commit_of, split_revision
+from verifai_jax.core.sources import Change, Sources, file_hash, list_changes
+from verifai_jax.core.sources import Source as Input
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "pandas", "scikit-learn", "matplotlib", "mujoco")
 """Packages whose versions decide numbers and pictures."""
-PACKAGE = Path(__file__).resolve().parents[1]
-"""Folder of this package."""
-MOST_FILES = 200
-"""Files of a project that are hashed at most."""
-LONGEST_NAME = 200
-"""Characters of a text in a program that may be the name of a file, at most."""
-
-
-class Input(NamedTuple):
-    """An input of a report: its name, what it is, and the SHA-256 of its content."""
-
-    name: str
-    role: str
-    sha256: str
 
 
 class Link(NamedTuple):
@@ -68,97 +54,44 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
     ]
 
 
-def project_inputs(target: str | None) -> list[Input]:
-    """Hash the file of a target, the project's files that it imports, and those that they name.
+class Model(NamedTuple):
+    """The files that a result was made of, and those of them that are others by now.
 
-    Nothing is run: imports are read from the source. A file is named where a text in a program is
-    its path, from the program's folder or from the current one. Only files below the current
-    folder count.
-
-    **Arguments:**
-
-    - `target`: `FILE.py:NAME`; anything else has no inputs. That of a revision of git,
-      `FILE.py:NAME@REVISION`, is the commit, whose hash decides all its files.
+    - `parts`: as it was recorded, once for each part of a run with a model of its own; none where
+      that is not recorded.
+    - `changes`: since then.
     """
-    target, revision = split_revision(target or "")
-    if revision is not None:
-        commit = hashlib.sha256(commit_of(revision).encode()).hexdigest()
-        return [Input(f"{target} at {commit_of(revision)}", "a commit of git", commit)]
-    place = target.rpartition(":")[0] or target
-    root = Path.cwd().resolve()
-    first = Path(place)
-    if not place.endswith(".py") or not first.is_file():
-        return []
-    first = first.resolve()
-    if not first.is_relative_to(root):
-        return []
-    programs, named = {first}, set()
-    waiting = [first]
-    while waiting and len(programs) + len(named) < MOST_FILES:
-        program = waiting.pop()
-        try:
-            tree = ast.parse(program.read_bytes())
-        except (SyntaxError, ValueError):
-            continue
-        for file in sorted(_imported(tree, program, root)):
-            if file not in programs:
-                programs.add(file)
-                waiting.append(file)
-        named |= set(_named(tree, program, root))
-    others = sorted(programs - {first}) + sorted(named - programs)
-    roles = (
-        ["the problem"] + ["imported"] * (len(programs) - 1) + ["named in a program"] * len(named)
-    )
-    return [
-        Input(file.relative_to(root).as_posix(), role, file_hash(file))
-        for file, role in zip([first, *others], roles, strict=False)
-    ]
 
+    parts: tuple[Sources, ...]
+    changes: tuple[Change, ...]
 
-def _imported(tree: ast.Module, program: Path, root: Path) -> Iterator[Path]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                above = program.parents[node.level - 1]
-                if not above.is_relative_to(root):
-                    continue
-                parts = [*above.relative_to(root).parts, *([base] if base else [])]
-                base = ".".join(parts)
-            names = [base, *(f"{base}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for name in names:
-            path = root.joinpath(*name.split("."))
-            for file in (path.with_suffix(".py"), path / "__init__.py"):
-                if name and file.is_file() and _of_project(file.resolve(), root):
-                    yield file.resolve()
+    @classmethod
+    def of(cls, recorded: Iterable[Mapping[str, Any]], now: Sources | None = None) -> "Model":
+        """Compare what was recorded with what is there now, on the disk where `now` is None."""
+        parts = tuple(Sources.from_json(each) for each in recorded if each)
+        changes = [change for part in parts for change in part.changes(now)]
+        return cls(parts, tuple(dict.fromkeys(changes)))
 
+    @property
+    def inputs(self) -> list[Input]:
+        """The files of the model with the hashes that they had."""
+        found = {}
+        for part in self.parts:
+            for file in part.files:
+                name = f"{file.name} at {part.commit}" if part.commit else file.name
+                found[name, file.sha256] = Input(name, file.role, file.sha256)
+        return list(found.values())
 
-def _of_project(file: Path, root: Path) -> bool:
-    """Return whether a file is the project's own, and not of this package, which has a version."""
-    return file.is_relative_to(root) and not file.is_relative_to(PACKAGE)
-
-
-def _named(tree: ast.Module, program: Path, root: Path) -> Iterator[Path]:
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
-            continue
-        text = node.value
-        if not 0 < len(text) <= LONGEST_NAME or "." not in text or not text.isprintable():
-            continue
-        for base in (program.parent, root):
-            file = (base / text).resolve()
-            if _of_project(file, root) and file.is_file():
-                yield file
-
-
-def file_hash(file: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
+    @property
+    def answer(self) -> str:
+        """A sentence on whether the model is still the one that ran."""
+        if not self.parts:
+            return "Not recorded: nobody can say whether the model is still the one that ran."
+        if self.changes:
+            return f"No: {list_changes(self.changes)}."
+        files = len(self.inputs)
+        without = "; ".join(text for part in self.parts for text in part.without_file)
+        return f"Yes: {files} file{'s' * (files != 1)}, by hash." + f" {without}." * bool(without)
 
 
 def versions() -> list[tuple[str, str]]:

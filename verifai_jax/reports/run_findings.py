@@ -31,6 +31,10 @@ MOST_FEATURES = 40
 """Features of a failure that are listed one by one."""
 
 
+_AGAIN = "Each can be simulated again from its row, bit for bit."
+_NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
+
+
 def findings(run: Run) -> Section:
     """Write what was found, in numbers."""
     content = [table(["number", "value"], number_rows(run))]
@@ -90,7 +94,7 @@ def failures(run: Run, studies: Studies, about: About) -> Section:
     claimed = run.table.counts.claimed
     more = f" Of {claimed:,} failures {len(shown)} are shown." if claimed > len(shown) else ""
     content = [
-        paragraph(f"Each can be simulated again from its row, bit for bit.{more}"),
+        paragraph(f"{_AGAIN if not studies.findings else _NOT_AGAIN}{more}"),
         *(_failure(run, each, studies, about) for each in shown),
     ]
     return Section("failures", "Failures, one by one", tuple(content))
@@ -110,6 +114,7 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
     content: list[Child] = [
         element("h3", f"Failure {failure.number}: row {failure.row}, {failure.why}"),
         paragraph(f"Robustness {float(row['rho']):.6g}; closer replays: {verdict}{meaning}."),
+        *(paragraph(text) for text in (failure.replay.warnings if failure.replay else ())),
         table(["feature", "value"], values),
     ]
     if len(features) > MOST_FEATURES:

@@ -16,9 +16,9 @@ from verifai_jax.reports.page import Page, Section
 from verifai_jax.reports.provenance import (
     Input,
     Link,
+    Model,
     chained,
     folder_inputs,
-    project_inputs,
 )
 from verifai_jax.reports.run_findings import (
     analysis,
@@ -34,6 +34,8 @@ from verifai_jax.reports.sections import (
     MODEL,
     answers_section,
     claims_section,
+    model_answer,
+    model_warnings,
     provenance_content,
 )
 from verifai_jax.reports.studies import Studies, study
@@ -63,10 +65,13 @@ FROM_DATA = "Verdicts are those of the robustness of the formulas, in {}; of exa
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The ground of a report: `links` of the chain of its inputs, and the `command` for it."""
+    """The ground of a report: the `links` of the chain of its inputs, the `command` for it, and
+    the `model` that ran.
+    """
 
     links: tuple[Link, ...]
     command: str | None
+    model: Model
 
     @property
     def chain(self) -> str:
@@ -90,7 +95,9 @@ def run_page(
     - `traces`, `studies`, `modes`: as in `write_report`.
     """
     found = study(run, traces, studies, modes)
-    links = tuple(chained(_inputs(run)))
+    now = None if run.problem is None else run.problem.sources()
+    model = Model.of(run.sources, now)
+    links = tuple(chained(_inputs(run, model)))
     command = None
     if run.folder is not None:
         command = report_command(run.folder, about.units, about.reasons, traces, studies, modes)
@@ -98,7 +105,7 @@ def run_page(
             command += " --without-problem"
         elif run.target is None:
             command += " --problem FILE.py:NAME"
-    reproduction = Reproduction(links, command)
+    reproduction = Reproduction(links, command, model)
     claims = run_claims(run, found)
     view = view_data(run, found.traces, replay_command(run) if run.target and run.folder else None)
     sections = [
@@ -121,6 +128,7 @@ def run_page(
         sections=tuple(section for section in sections if section is not None),
         claims=claims_json(run.name, claims, reproduction.chain),
         view=view if run.simulations else None,
+        warnings=model_warnings(model, found.findings),
     )
 
 
@@ -205,12 +213,12 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
     return [Claim(f"C{i + 1}", *entry) for i, entry in enumerate(texts)]
 
 
-def _inputs(run: Run) -> list[Input]:
+def _inputs(run: Run, model: Model) -> list[Input]:
     files = [] if run.folder is None else folder_inputs(run.folder, FILES)
     if run.folder is None:
         digest = f"{run.table.digest(run.simulations):08x}"
         files = [Input("table in memory (CRC-32)", "the table", digest)]
-    return files + project_inputs(run.target)
+    return files + model.inputs
 
 
 def _reproduce(run: Run, reproduction: Reproduction) -> Section:
@@ -240,7 +248,7 @@ def _reproduce(run: Run, reproduction: Reproduction) -> Section:
         ]
     content += [
         paragraph(f"The run was made with verifai_jax {run.version}, this report with:"),
-        *provenance_content(reproduction.links),
+        *provenance_content(reproduction.links, reproduction.model),
     ]
     return Section("reproduce", "How to reproduce it", tuple(content))
 
@@ -288,6 +296,7 @@ def _answers(run: Run, studies: Studies, reproduction: Reproduction) -> Section:
             f"Seed {run.seed}, verifai_jax {run.version}; chain {reproduction.chain[:16]}.",
             "reproduce",
         ),
+        model_answer(reproduction.model),
         (
             "What did the tool decide by itself?",
             " ".join(f"{note}." for note in run.notes) or "Nothing that it noted.",

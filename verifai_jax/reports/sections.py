@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim
-from verifai_jax.reports.markup import Child, Markup, element, paragraph, table
+from verifai_jax.reports.markup import Child, Markup, bullets, element, paragraph, table
 from verifai_jax.reports.page import Section
-from verifai_jax.reports.provenance import Link, versions
+from verifai_jax.reports.provenance import Link, Model, versions
 from verifai_jax.reports.run_question import About, property_content, space_table
 
 MODEL = (
@@ -19,6 +19,8 @@ NOT_SEEN = (
     "guaranteed bound needs no such assumption."
 )
 """Assumption of an interval that a search has helped to find."""
+MAX_FINDINGS = 5
+"""Rows that do not give their numbers again that are listed on the first page."""
 SAMPLES = "The guaranteed bound rests on independent samples of the prior, and on nothing else."
 """Assumption of the bound."""
 
@@ -50,6 +52,56 @@ def claims_section(claims: list[Claim]) -> Section:
     )
 
 
+def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, ...]:
+    """Write that the model is another one by now, with both hashes of each file; often nothing.
+
+    **Arguments:**
+
+    - `model`: what the result was made of.
+    - `findings`: rows that did not give their numbers again, as sentences.
+    """
+    content: list[Markup] = []
+    if model.changes:
+        content.append(
+            paragraph(
+                element("strong", "The model has changed since this result was made. "),
+                "Numbers of the result are of the model as it was; whatever was simulated for this "
+                "report is of the model as it is now.",
+            )
+        )
+        rows = [
+            (
+                change.name,
+                element("code", change.was or "had no part in it"),
+                element("code", change.now or "is missing"),
+            )
+            for change in model.changes
+        ]
+        content.append(table(["file", "SHA-256 when it ran", "SHA-256 now"], rows))
+    if len(model.parts) > 1:
+        notes = [f"from row {part.first} on" for part in model.parts[1:]]
+        content.append(
+            paragraph(
+                "The result is of several models or versions: it went on with others "
+                f"{' and '.join(notes)}."
+            )
+        )
+    if findings:
+        content.append(
+            paragraph(element("strong", "Simulated again, rows do not give their numbers:"))
+        )
+        shown = [*findings[:MAX_FINDINGS]]
+        if len(findings) > MAX_FINDINGS:
+            shown.append(f"and {len(findings) - MAX_FINDINGS} more")
+        content.append(bullets(shown))
+    return tuple(content)
+
+
+def model_answer(model: Model) -> tuple[str, str, str]:
+    """Answer whether the model is still the one that ran: question, answer, anchor."""
+    return "Is the model still the one that ran?", model.answer, "reproduce"
+
+
 def chain_table(links: tuple[Link, ...]) -> Markup:
     """Write the inputs of a report with their hashes."""
     code = [
@@ -63,9 +115,13 @@ def _short(text: str) -> Markup:
     return element("code", text[:16])
 
 
-def version_table() -> Markup:
-    """Write the versions that built the report."""
-    return table(["built with", "version"], versions())
+def version_table(model: Model) -> Markup:
+    """Write the versions with which the result and the report were made."""
+    now = dict(versions())
+    then = dict(model.parts[-1].versions) if model.parts else {}
+    names = dict.fromkeys((*now, *then))
+    rows = [(name, then.get(name, "not recorded"), now.get(name, "not used")) for name in names]
+    return table(["package", "the result", "this report"], rows)
 
 
 def chain_words(chain: str) -> Markup:
@@ -74,13 +130,14 @@ def chain_words(chain: str) -> Markup:
         "Each link is the SHA-256 of the link before (empty for the first), a line break, the name "
         "of the input, a line break, and its SHA-256. The last link stands for all inputs: ",
         element("code", chain),
-        ". Data that the system reads in any other way is not among them.",
+        ". Files of the model have the hashes that they had when the result was made. What the "
+        "system reads in any other way, such as in another process, is not among them.",
     )
 
 
-def provenance_content(links: Sequence[Link]) -> list[Markup]:
+def provenance_content(links: Sequence[Link], model: Model) -> list[Markup]:
     """Write the versions and the inputs of a report, and the chain of their hashes."""
-    content = [element("h3", "Versions"), version_table()]
+    content = [element("h3", "Versions"), version_table(model)]
     if links:
         content += [
             element("h3", "Inputs"),

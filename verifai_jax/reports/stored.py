@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.comparison.result import Compared, Comparison
+from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.features import FeatureSpace
@@ -61,6 +62,7 @@ def _estimate(data: Mapping[str, Any]) -> Estimate:
     if values["method"] not in (None, *METHODS):
         raise KeyError("method")
     values["notes"] = tuple(map(str, values.get("notes", ())))
+    values["sources"] = _sources(values.get("sources", {}))
     return Estimate(**values)
 
 
@@ -94,7 +96,16 @@ def _comparison(data: Mapping[str, Any], space: FeatureSpace | None) -> Comparis
         float(data["seconds"]),
         int(data["seed"]),
         tuple(map(str, data["notes"])),
+        {str(name): _sources(each) for name, each in data.get("sources", {}).items()},
     )
+
+
+def _sources(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record of what a result was made of, empty where it has none.
+
+    **Raises:** `ValueError` for one of another form.
+    """
+    return Sources.from_json(data).to_json() if data else {}
 
 
 def _values(kind: type, data: Mapping[str, Any]) -> dict[str, Any]:

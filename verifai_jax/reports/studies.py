@@ -68,6 +68,7 @@ class Studies:
     - `analysis`: of the table.
     - `modes`: ways of failing with their probabilities; None where they were not asked for.
     - `left_out`: what was not done and why, as whole sentences.
+    - `findings`: rows that did not give their numbers when they were simulated again, likewise.
     """
 
     failures: tuple[Failure, ...]
@@ -78,6 +79,7 @@ class Studies:
     analysis: Analysis
     modes: Modes | None = None
     left_out: tuple[str, ...] = field(default=())
+    findings: tuple[str, ...] = ()
 
 
 def study(
@@ -108,14 +110,21 @@ def study(
     if traces is None:
         traces = TRACES_OF_A_BLACK_BOX if slow else TRACES
     failures, data = [], {}
+    findings: list[str] = []
+
+    def replayed(row: int) -> Replay:
+        again = run.replay(row)
+        findings.extend([again.finding] if again.finding else [])
+        return again
+
     for i, (row, why) in enumerate(rows):
-        again = run.replay(row) if i < max(traces, 1) else None
+        again = replayed(row) if i < max(traces, 1) else None
         failures.append(Failure(i + 1, row, why, again))
         if again is not None and i < traces:
             data[row] = trace_data(again, f"row {row}: failure {i + 1}")
     for row, label in rows_to_trace(run, traces, [row for row, _ in rows]).items():
         if row not in data:
-            data[row] = trace_data(run.replay(row), label)
+            data[row] = trace_data(replayed(row), label)
     worst = failures[0].replay if failures else None
     animation = None if worst is None else _animated(worst, left_out)
     explained = shrunk = None
@@ -133,7 +142,15 @@ def study(
             )
     ways = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
     return Studies(
-        tuple(failures), data, animation, explained, shrunk, found, ways, tuple(left_out)
+        tuple(failures),
+        data,
+        animation,
+        explained,
+        shrunk,
+        found,
+        ways,
+        tuple(left_out),
+        tuple(findings),
     )
 
 

@@ -7,12 +7,14 @@ from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.commands import report_command
 from verifai_jax.reports.markup import bullets, paragraph, picture, preformatted, table
 from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import chained, folder_inputs, project_inputs
+from verifai_jax.reports.provenance import Model, chained, folder_inputs
 from verifai_jax.reports.run_question import About, space_table
 from verifai_jax.reports.sections import (
     MODEL,
     answers_section,
     claims_section,
+    model_answer,
+    model_warnings,
     provenance_content,
 )
 from verifai_jax.reports.studies import png
@@ -47,9 +49,9 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
     - `about`: units and reasons of the hyper-parameters.
     """
     record = sweep.record
-    target = record.options.get("target")
+    model = Model.of(record.sources, None if sweep.study is None else sweep.study.sources())
     files = [] if sweep.folder is None else folder_inputs(sweep.folder, FILES)
-    links = tuple(chained(files + project_inputs(target if isinstance(target, str) else None)))
+    links = tuple(chained(files + model.inputs))
     frame, safe = sweep.table, sweep.safe
     limit = "a limit that is not recorded" if sweep.p is None else format_percent(sweep.p)
     headline = f"{sweep.headline[:1].upper()}{sweep.headline[1:].rstrip('.')}."
@@ -90,6 +92,7 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
                 ("How many are safe, unsafe, open?", verdicts, "found"),
                 ("Which assumption is under the intervals?", TOGETHER, "limits"),
                 ("With which seed?", str(record.seed), "reproduce"),
+                model_answer(model),
             ]
         ),
         Section("asked", "What was asked", tuple(asked)),
@@ -127,7 +130,7 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
             (
                 *repeat,
                 paragraph(f"The sweep was made with verifai_jax {record.version}."),
-                *provenance_content(links),
+                *provenance_content(links, model),
             ),
         ),
     )
@@ -137,4 +140,5 @@ def sweep_page(sweep: Sweep, about: About) -> Page:
         tone="holds" if len(safe) else "open",
         sections=sections,
         claims=claims_json(sweep.name, claims, links[-1].chain if links else ""),
+        warnings=model_warnings(model),
     )

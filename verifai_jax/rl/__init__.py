@@ -13,6 +13,7 @@ from verifai_jax.rl.policy import Policy as Policy
 from verifai_jax.rl.policy import PolicyFileError as PolicyFileError
 from verifai_jax.rl.policy import load_policy as load_policy
 from verifai_jax.rl.policy import policy_notes as policy_notes
+from verifai_jax.rl.policy import policy_sources as policy_sources
 from verifai_jax.rl.policy import save_policy as save_policy
 from verifai_jax.rl.ppo import PPO as PPO
 from verifai_jax.rl.pqn import PQN as PQN
@@ -48,6 +49,7 @@ __all__ = [
     "mjx_task",
     "ode_task",
     "policy_notes",
+    "policy_sources",
     "save_policy",
     "train",
 ]

@@ -11,7 +11,7 @@ The file holds numbers and text, never code.
 import dataclasses
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.sources import made_here, sources_of
 from verifai_jax.core.text import one_line
 from verifai_jax.rl.task.task import Action, Continuous, Discrete
 
@@ -166,13 +167,17 @@ def scale_to_range(
     return jnp.clip(middle + half * unit, action.low, action.high)
 
 
-def save_policy(policy: Policy, path: str | Path, **notes: object) -> None:
+def save_policy(
+    policy: Policy, path: str | Path, *, sources: Mapping[str, Any] | None = None, **notes: object
+) -> None:
     """Write a policy as a compressed `.npz` of float32 arrays.
 
     **Arguments:**
 
     - `policy`: the policy to write.
     - `path`: the file.
+    - `sources`: what it was trained with, as a run records it; that of the modules that call this
+      function when left out. `policy_sources` reads it.
     - `notes`: plain data that JSON can hold, kept beside the arrays; `policy_notes` reads them.
     """
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
@@ -181,6 +186,7 @@ def save_policy(policy: Policy, path: str | Path, **notes: object) -> None:
         "activation": policy.activation,
         "squash": policy.squash,
         "notes": notes,
+        "sources": sources_of(made=made_here()).to_json() if sources is None else dict(sources),
     }
     arrays: dict[str, Any] = {"about": np.array(json.dumps(about))}
     for i, (weight, bias) in enumerate(policy.layers):
@@ -228,6 +234,17 @@ def policy_notes(path: str | Path) -> dict[str, Any]:
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
     return _read(path)[1].get("notes", {})
+
+
+def policy_sources(path: str | Path) -> dict[str, Any]:
+    """Read which files and versions a policy was made with, as a run records it.
+
+    **Returns:** plain data with the hashes of `files` and the `versions`; empty for a file that
+    does not say so.
+
+    **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
+    """
+    return _read(path)[1].get("sources", {})
 
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

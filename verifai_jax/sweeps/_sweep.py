@@ -68,6 +68,7 @@ def sweep(
     note: Mapping[str, Any] | None = None,
     callbacks: Iterable[Callback] = (),
     executor: Executor | None = None,
+    even_if_changed: bool = False,
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify their policies.
 
@@ -102,6 +103,8 @@ def sweep(
       read from the folder counts too.
     - `executor`: whose workers train and simulate, as in `falsify`; the table is the same. With
       `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
+    - `even_if_changed`: whether to go on with finished work of a folder although files of the study
+      are others than those that were recorded when it began; the record then says so.
 
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
@@ -149,14 +152,15 @@ def sweep(
         Cache(folder) as cache,
         Clock(study.name, max_seconds, progress) as clock,
     ):
-        cache.claim(fingerprint(study, options))
+        sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = _RunningSweep(
-            study, options, cache, clock, halving, attack, called, executor=executor
-        )
+            study, options, cache, clock, halving, attack, called, executor=executor,
+            sources=sources,
+        )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
 
 
@@ -185,6 +189,7 @@ class _RunningSweep:
     callbacks: tuple[Callback, ...] = ()
     calls: int = 0
     executor: Executor | None = None
+    sources: Sequence[Mapping[str, Any]] = ()
     runs: TrainingRuns = field(init=False)
     configurations: list[_Configuration] = field(default_factory=list)
     numbers: dict[str, int] = field(default_factory=dict)
@@ -474,6 +479,7 @@ class _RunningSweep:
             version=__version__,
             seconds=dict(self.clock.seconds),
             complete=complete,
+            sources=tuple(self.sources),
         )
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:

@@ -65,6 +65,8 @@ class SweepRecord:
     - `version`: of verifai_jax.
     - `seconds`: wall-clock time of each stage, such as `training` and `certifying`.
     - `complete`: False where the sweep was interrupted or out of time.
+    - `sources`: what the study was made of when the sweep began, and again where it went on with
+      another one, as a run records it; empty where that is not recorded.
     """
 
     study: str
@@ -80,6 +82,7 @@ class SweepRecord:
     version: str
     seconds: Mapping[str, float] = field(default_factory=dict)
     complete: bool = True
+    sources: Sequence[Mapping[str, Any]] = ()
 
     @property
     def rows(self) -> int:

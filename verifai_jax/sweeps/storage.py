@@ -21,6 +21,7 @@ import numpy as np
 
 from verifai_jax.core.locks import write_lock
 from verifai_jax.core.seals import is_intact, sealed
+from verifai_jax.core.sources import Sources
 from verifai_jax.core.text import one_line
 from verifai_jax.features import FeatureSpace
 from verifai_jax.rl.policy import Policy, load_policy, save_policy
@@ -95,7 +96,8 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     for i, policy in enumerate(record.policies):
         if policy is not None:
             notes = {"study": record.study, "row": i, "verdict": str(table.loc[i, "verdict"])}
-            save_policy(policy, folder / POLICIES / f"{i}.npz", **notes)
+            sources = record.sources[-1] if record.sources else {}
+            save_policy(policy, folder / POLICIES / f"{i}.npz", sources=sources, **notes)
     stored.failing.to_parquet(folder / FAILING)
     arrays: dict[str, np.ndarray] = {}
     for (configuration, seed), curve in record.curves.items():
@@ -107,6 +109,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         "format": FORMAT,
         "complete": record.complete,
         "rows": record.rows,
+        "sources": list(record.sources),
         "used": _plain(stored.used),
         "mixed": mixed,
         "worst": _plain(record.worst),
@@ -234,6 +237,7 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
         complete=bool(description["complete"]),
         hyperparameters=tuple(description["hyperparameters"]),
         certified=tuple(description["certified"]),
+        sources=tuple(Sources.from_json(each).to_json() for each in description.get("sources", ())),
         **{name: description[name] for name in ("study", "seed", "options", "version", "seconds")},
     )
 

@@ -17,6 +17,7 @@ from typing import Any
 
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.mtl import Formula
@@ -44,6 +45,7 @@ class Study:
     - `p`: the failure probability below which a policy is safe, between 0 and 1.
     - `curve`: a formula over the learning curve, whose time is environment steps; None for none.
     - `description`: one line.
+    - `made_in`: as in `Problem`.
 
     **Fields** beside these:
 
@@ -63,6 +65,7 @@ class Study:
     p: float
     curve: Formula | str | None
     description: str
+    made_in: Sequence[Maker] | None = field(repr=False)
     training_seeds: tuple[int, ...] = field(init=False, repr=False)
     curve_formula: Formula | None = field(init=False, repr=False)
     _problems: dict[str, Problem] = field(init=False, repr=False)
@@ -78,6 +81,7 @@ class Study:
         p: float = 0.01,
         curve: Formula | str | None = None,
         description: str = "",
+        made_in: Sequence[Maker] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise StudyError(f"a study needs a name; got {name!r}")
@@ -105,6 +109,7 @@ class Study:
             "p": p,
             "curve": curve,
             "description": description,
+            "made_in": made_here() if made_in is None else tuple(made_in),
             "training_seeds": _seeds(seeds),
             "curve_formula": None if curve is None else check_curve(curve),
             "_problems": {},
@@ -147,6 +152,11 @@ class Study:
         if ALGORITHM not in self.space.domains:
             return tuple(self.trainer.by_name)
         return tuple(value for value, _ in probe_values(self.space.domains[ALGORITHM]))
+
+    def sources(self) -> Sources:
+        """Return the files of which the study and its problem are made, and versions."""
+        problem = self.untrained_problem()
+        return sources_of(self, problem, made=(*(self.made_in or ()), *(problem.made_in or ())))
 
     def untrained_problem(self) -> Problem:
         """Return the problem of a policy whose weights are all zero."""

@@ -12,8 +12,8 @@ import contextlib
 import copy
 import io
 import re
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -21,6 +21,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from verifai_jax.core.errors import require, unknown_name
+from verifai_jax.core.source_scan import files_of_model
+from verifai_jax.core.sources import file_hash
 
 MjModel: TypeAlias = Any
 """A `mujoco.MjModel`; MuJoCo is an optional package, so its types cannot be imported here."""
@@ -111,11 +113,15 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A compiled model, and the spec that it came from where there was one."""
+    """A compiled model, and the spec that it came from where there was one.
+
+    - `source_files`: the files that it was read from, with their hashes at that time.
+    """
 
     compiled: Any
     spec: Any = None
     contact_sensors: tuple[str, ...] = ()
+    source_files: Mapping[str, str] = field(default_factory=dict)
 
     def __getstate__(self) -> dict[str, Any]:
         # A spec cannot be pickled, and is compiled by now. The compiled model is sent bit by bit.
@@ -154,7 +160,16 @@ def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | N
             setattr(compiled.opt, name, value)
     # A simulation that becomes NaN must be seen, not silently begin again.
     compiled.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    return Model(compiled, spec, tuple(f"__contact{k}" for k in range(len(contacts))))
+    sensors = tuple(f"__contact{k}" for k in range(len(contacts)))
+    return Model(compiled, spec, sensors, _hashes_of_files(source))
+
+
+def _hashes_of_files(source: ModelSource) -> dict[str, str]:
+    """Return the hashes of the files of a model by their paths; none of one that is in no file."""
+    if not isinstance(source, str | Path) or "<" in str(source):
+        return {}
+    file = Path(source).absolute()
+    return {str(each): file_hash(each) for each in (file, *files_of_model(file))}
 
 
 def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:

@@ -1,0 +1,158 @@
+"""Changes of the model of a run since it ran, and rows that do not give their numbers again.
+
+    sources_of_row(run.sources, 417)                    # what row 417 was simulated with
+    finding_of(seen, stored, several=False)             # "" where a replay gives the row's number
+
+A run has a record of its model for each part of it that was simulated in one go.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from verifai_jax.core.sources import Change, Sources, list_changes
+from verifai_jax.core.trace import Status
+from verifai_jax.evaluation.replay import Replay
+from verifai_jax.problem.problem import Problem
+
+ROUNDING = 1e-4
+"""Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
+otherwise than in a batch, and some systems make that grow."""
+EXACT = 1e-6
+"""The same for a black box, whose code is the same; its numbers are stored in single precision."""
+NEAR = 1e-3
+"""The same for a replay in another precision, above which it is simulated again in that of the
+run."""
+EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes it in the record"
+"""How to go on with another model."""
+ANOTHER_MODEL = "from row "
+"""Beginning of the note of a run that has gone on with another model or other versions."""
+
+
+def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
+    """Return what a row of a run was simulated with; None where it is not recorded."""
+    parts = [Sources.from_json(part) for part in recorded]
+    return next((part for part in reversed(parts) if part.first <= row), None)
+
+
+def model_changes(
+    recorded: Sequence[Mapping[str, Any]], problem: Problem | None, row: int | None
+) -> tuple[Change, ...]:
+    """Return the files of a run's model that are others now.
+
+    **Arguments:**
+
+    - `recorded`: by the run.
+    - `problem`: as it is now; without it what lies on the disk counts.
+    - `row`: a row; all that the run was simulated with where it is None.
+
+    **Returns:** the changes; none where nothing is recorded.
+    """
+    parts = [Sources.from_json(part) for part in recorded]
+    if row is not None:
+        parts = [part for part in parts if part.first <= row][-1:]
+    if not parts:
+        return ()
+    now = None if problem is None else problem.sources()
+    return tuple(dict.fromkeys(change for part in parts for change in part.changes(now)))
+
+
+def continued_with(
+    name: str,
+    recorded: Sequence[Mapping[str, Any]],
+    problem: Problem,
+    rows: int,
+    even_if_changed: bool,
+) -> tuple[tuple[Mapping[str, Any], ...], str]:
+    """Return the record of the models of a run that goes on, and a note where one is another.
+
+    **Arguments:**
+
+    - `name`: of the run.
+    - `recorded`: by the run.
+    - `problem`: with which it goes on.
+    - `rows`: that it has.
+    - `even_if_changed`: whether another model will do.
+
+    **Raises:** `ValueError` for another model, unless that will do.
+    """
+    now = problem.sources(first=rows)
+    if not recorded:
+        # Nobody knows what the rows before were made of, and these are not to be taken for it.
+        return (now.to_json(),) if not rows else (), ""
+    before = Sources.from_json(recorded[-1])
+    changes = before.changes(now)
+    if changes and not even_if_changed:
+        raise ValueError(
+            f"the run of {name!r} cannot go on: its model has changed since it ran: "
+            f"{list_changes(changes)}. Begin a new run, or restore the files; {EVEN}"
+        )
+    versions = before.other_versions(now)
+    if not changes and not versions:
+        return tuple(recorded), ""
+    parts = [f"another model: {list_changes(changes)}"] if changes else []
+    parts += [f"other versions: {', '.join(versions)}"] if versions else []
+    kept = [part for part in recorded if int(part["first"]) < rows]
+    return (*kept, now.to_json()), f"{ANOTHER_MODEL}{rows} on with {' and '.join(parts)}"
+
+
+def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
+    """Return whether the rows of a run are of several models, and so no sample of any of them."""
+    parts = [Sources.from_json(part) for part in recorded]
+    return any(before.changes(after) for before, after in pairwise(parts))
+
+
+def changed_since(changes: Sequence[Change], row: int | None) -> str:
+    """Say that the model has changed; empty where it has not."""
+    if not changes:
+        return ""
+    when = "the run" if row is None else f"row {row} was simulated"
+    return f"The model has changed since {when}: {list_changes(changes)}."
+
+
+def finding_of(
+    seen: Replay, stored: Mapping[str, Any], several: bool, near: float | None = None
+) -> str:
+    """Say that a replay does not give the number of its row; empty where it does.
+
+    **Arguments:**
+
+    - `seen`: the replay, in the precision of the run unless `near` says what may differ.
+    - `stored`: the row of the table.
+    - `several`: whether the problem has several formulas.
+    - `near`: share of the signals by which the number may differ; that of rounding when left out.
+    """
+    before = str(stored.get("status", "ok"))
+    now = seen.status.name.lower()
+    if before != now:
+        return f"Row {seen.row} does not end as it did: {now} here, {before} in the table"
+    if seen.status != Status.OK:
+        return ""
+    verbs = {True: "violates", False: "keeps"}
+    violated = bool(stored["violated"]) if "violated" in stored else seen.violated
+    usual = EXACT if seen.problem.black_box else ROUNDING
+    rounding = (usual if near is None else near) * _scale(seen)
+    for name, rho in seen.rho.items():
+        was = float(stored[f"rho.{name}"] if several else stored["rho"])
+        # Infinite where a formula says nothing of the trace.
+        if rho != was and not abs(rho - was) <= rounding:
+            return (
+                f"Row {seen.row} does not give its number again: robustness {rho:.6g} here, "
+                f"{was:.6g} in the table"
+            )
+    if violated != seen.violated:
+        return (
+            f"Row {seen.row} does not give its verdict again: it {verbs[seen.violated]} the "
+            f"property here, and {verbs[violated]} it in the table, both by less than rounding"
+        )
+    return ""
+
+
+def _scale(seen: Replay) -> float:
+    """Return the greatest number that the formulas see, which rounding is a share of."""
+    values = [np.asarray(seen.trace.signals[n]) for n in seen.problem.monitored]
+    values += [np.asarray(list(seen.rho.values()))]
+    greatest = [np.max(np.abs(each[np.isfinite(each)]), initial=0.0) for each in values]
+    return float(max(greatest, default=0.0))
