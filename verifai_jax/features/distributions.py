@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import (
@@ -29,6 +29,7 @@ from verifai_jax.features.domain import (
     as_number,
     as_numbers,
     as_real,
+    nearest,
     on_device,
     real_numbers,
     short,
@@ -44,6 +45,8 @@ from verifai_jax.features.ends import (
 
 OUTERMOST = 2.0**-26
 """The probability beyond the outermost points: what float32 rounds away when taken from 1."""
+HIGHEST = 1 - 2.0**-24
+"""The greatest float32 number below 1, where a distribution has only one function for both ends."""
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
 DEEPEST = 1e-29
@@ -67,12 +70,37 @@ class Continuous(Domain):
         """Return the probability to the left of this value."""
 
     @property
+    def closed(self) -> str:
+        """The ends of the support that are values themselves, in the words of `Box`."""
+        return "both"
+
+    def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Return the natural logarithm of the probability density, in double precision.
+
+        **Arguments:**
+
+        - `value`: numbers of double precision; minus infinity comes for those beyond the support.
+
+        **Raises:** `NotImplementedError` for a distribution that does not say it.
+        """
+        raise NotImplementedError(f"{self!r} has no density")
+
+    def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Return the probability of a value at least as far out, on either side.
+
+        It is twice the probability of the smaller of both sides of the value.
+        """
+        with in_precision("float64"):
+            u = np.asarray(jax.vmap(self.probability)(jnp.ravel(jnp.asarray(value))), np.float64)
+        return (2 * np.minimum(u, 1 - u)).reshape(np.shape(value))
+
+    @property
     def levels(self) -> tuple[int, ...]:
         return (0,)
 
     def ends(self, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the greatest value in this precision; they may be infinite."""
-        return ends_within(*self.support, dtype)
+        return ends_within(*self.support, dtype, self.closed)
 
     def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
         value = self.quantile(u[0]).astype(u.dtype)
@@ -91,27 +119,45 @@ class Continuous(Domain):
 
     def rounded(self, value: Reals) -> Reals:
         """Return real numbers, those that their precision has rounded over an end at that end."""
-        return round_inwards(value, *self.support)
+        return round_inwards(value, *self.support, self.closed)
 
     @property
     def _bounded(self) -> bool:
         return bool(np.any(np.isfinite(self.support)))
 
+    def contains(self, numbers: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+        """Return which numbers of double precision are values, up to rounding."""
+        fits = np.abs(numbers) <= MOST_REAL
+        return np.asarray(is_inside(numbers, *self.support, self.closed) & fits)
+
     def check(self, value: object, name: str) -> None:
         number = as_numbers(value, name)
         if number.shape != ():
             raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
-        low, high = self.support
-        if not (is_inside(number, low, high) and np.isfinite(number)):
-            raise ValueError(f"{name} must {_bounds_text(low, high)}; got {short(number.item())}")
-        if self._is_central(number.item()):
+        if not self.contains(number):
+            # A value of double precision that single precision cannot hold is none.
+            first, last = (end.item() for end in self.ends(np.float32))
+            bounds = _bounds_text(*self.support, self.closed)
+            if MOST_REAL < abs(number) < math.inf and not math.isfinite(sum(self.support)):
+                bounds = "fit into float32"
+            raise ValueError(
+                f"{name} must {bounds}; got {short(number.item())}"
+                f"{nearest(number.item(), max(first, -MOST_REAL), min(last, MOST_REAL))}"
+            )
+
+    def check_reachable(self, value: float, name: str) -> None:
+        """Check that a coordinate of the unit cube reaches a value nearly, where only that will do.
+
+        **Raises:** `ValueError` for a value so far in a tail that none does.
+        """
+        if self._is_central(value):
             return  # What follows takes JAX a second the first time.
-        nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
+        reached = np.float64(self.from_unit(self.to_unit(jnp.float32(value))))
         lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))
-        if abs(nearest - number) > 0.1 * (upper - lower) + 1e-5 * abs(number):
+        if not abs(reached - value) <= 0.1 * (upper - lower) + 1e-5 * abs(value):
             raise ValueError(
                 f"{name} is so far in the tail of {self!r} that a float32 coordinate cannot reach "
-                f"it; the nearest value is {nearest:.6g}; got {short(number.item())}"
+                f"it; the nearest value is {reached:.6g}; got {short(value)}"
             )
 
     def _is_central(self, value: float) -> bool:
@@ -151,8 +197,8 @@ class Normal(Continuous):
     std: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "mean", "std")
-        _check_scale(self, self.mean, self.std)
+        check_numbers(self, "mean", "std")
+        check_scale(self, self.mean, self.std)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -163,7 +209,7 @@ class Normal(Continuous):
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         left = u < 0.5
-        z = ndtri(_at_least(jnp.where(left, u, 1 - u), OUTERMOST))
+        z = ndtri(at_least(jnp.where(left, u, 1 - u), OUTERMOST))
         return self.mean + self.std * jnp.where(left, z, -z)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
@@ -196,9 +242,9 @@ class TruncatedNormal(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "mean", "std", "low", "high")
-        _check_scale(self, self.mean, self.std)
-        _check_ends(self, self.low, self.high)
+        check_numbers(self, "mean", "std", "low", "high")
+        check_scale(self, self.mean, self.std)
+        check_ends(self, self.low, self.high)
         if self.high - self.low < 0.05 * self.std:
             raise ValueError(
                 "low and high are less than 0.05 standard deviations apart, where the "
@@ -242,8 +288,8 @@ class TruncatedNormal(Continuous):
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         below, _, _, above = self._tails
         left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
-        p = below + self._inside * _at_least(left, OUTERMOST)
-        q = above + self._inside * _at_least(right, OUTERMOST)
+        p = below + self._inside * at_least(left, OUTERMOST)
+        q = above + self._inside * at_least(right, OUTERMOST)
         lower = p < 0.5
         z = ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
@@ -283,12 +329,12 @@ class LogUniform(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "low", "high")
+        check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < LEAST_REAL:
             raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:g}; got {self!r}")
-        _check_ends(self, self.low, self.high)
+        check_ends(self, self.low, self.high)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -324,8 +370,9 @@ class Distribution(Continuous):
 
         Distribution(lambda u: 3 * jnp.sqrt(u), lambda x: (x / 3) ** 2, name="triangle")
 
-    Where `inverse_cdf` or its derivative is infinite at 0 or 1, the outermost float32 coordinates
-    are used there instead.
+    `inverse_cdf` is never evaluated at 0 or 1, but at 2^-26 and 1 - 2^-24 there, the outermost
+    probabilities that float32 tells from these: what would be infinite, or a limit that no value
+    has, is never simulated.
 
     **Arguments:**
 
@@ -340,7 +387,6 @@ class Distribution(Continuous):
     inverse_cdf: Callable[[Array], Array]
     cdf: Callable[[Array], Array]
     name: str = "custom"
-    _range: tuple[float, float] = field(default=(0.0, 1.0), init=False, compare=False)
     _ends: tuple[float, float] = field(default=(-math.inf, math.inf), init=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -351,11 +397,11 @@ class Distribution(Continuous):
         if not isinstance(self.name, str) or not self.name.strip():
             raise ValueError(f"name of a Distribution must be a text; got {self.name!r}")
         with jax.ensure_compile_time_eval():
-            object.__setattr__(self, "_range", self._measured_range())
+            self._check_inverse()
             object.__setattr__(self, "_ends", self._measured_ends())
 
-    def _measured_range(self) -> tuple[float, float]:
-        """Check both functions and return the probabilities that the coordinates 0 and 1 mean."""
+    def _check_inverse(self) -> None:
+        """Check that both functions fit each other."""
         u = np.linspace(0, 1, 129, dtype=np.float32)[1:-1]
         values = self._sampled("inverse_cdf", self.inverse_cdf, u)
         for i in range(len(u)):
@@ -373,10 +419,6 @@ class Distribution(Continuous):
                 f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:.3g}) "
                 f"is {values[worst]:.3g} and cdf({values[worst]:.3g}) is {back[worst]:.3g}"
             )
-        ends = np.array([0, 1], np.float32)
-        finite = np.isfinite(self._sampled("inverse_cdf", self.inverse_cdf, ends))
-        finite &= np.isfinite(self._sampled("inverse_cdf", jax.grad(self.inverse_cdf), ends))
-        return 0.0 if finite[0] else OUTERMOST, 1.0 if finite[1] else 1 - 2.0**-24
 
     def _measured_ends(self) -> tuple[float, float]:
         """Return the values at 0 and 1 in double precision, infinite where there is no end."""
@@ -408,8 +450,9 @@ class Distribution(Continuous):
         return self._ends
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        low, high = self._range
-        return jnp.asarray(self.inverse_cdf(replace_where(_at_least(u, low), u > high, high)))
+        # Never at 0 and 1, where a value of probability zero may stand, such as exp(-inf).
+        inner = replace_where(at_least(u, OUTERMOST), u > HIGHEST, HIGHEST)
+        return jnp.asarray(self.inverse_cdf(inner))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.asarray(self.cdf(value))
@@ -418,16 +461,19 @@ class Distribution(Continuous):
         return f"Distribution(name={self.name!r})"
 
 
-def _bounds_text(low: float, high: float) -> str:
+def _bounds_text(low: float, high: float, closed: str) -> str:
     """Describe the ends of a distribution for a message."""
+    left, right = closed in ("both", "left"), closed in ("both", "right")
     if math.isfinite(low) and math.isfinite(high):
-        return f"lie in [{short(low)}, {short(high)}]"
+        return f"lie in {'[' if left else '('}{short(low)}, {short(high)}{']' if right else ')'}"
     if math.isfinite(low):
-        return f"be finite and at least {short(low)}"
-    return f"be finite and at most {short(high)}" if math.isfinite(high) else "be finite"
+        return f"be finite and {'at least' if left else 'above'} {short(low)}"
+    if math.isfinite(high):
+        return f"be finite and {'at most' if right else 'below'} {short(high)}"
+    return "be finite"
 
 
-def _check_numbers(domain: Domain, *names: str) -> None:
+def check_numbers(domain: Domain, *names: str) -> None:
     kind = type(domain).__name__
     for name in names:
         given = as_number(getattr(domain, name), f"{name} of a {kind}")
@@ -436,7 +482,7 @@ def _check_numbers(domain: Domain, *names: str) -> None:
         object.__setattr__(domain, name, given)
 
 
-def _check_scale(domain: Domain, mean: float, std: float) -> None:
+def check_scale(domain: Domain, mean: float, std: float) -> None:
     if std <= 0:
         hint = f" (a single value is Constant({short(mean)}))" if std == 0 else ""
         raise ValueError(f"the standard deviation must be positive{hint}; got {domain!r}")
@@ -444,7 +490,7 @@ def _check_scale(domain: Domain, mean: float, std: float) -> None:
         raise ValueError(f"its values must fit into float32; got {domain!r}")
 
 
-def _check_ends(domain: Domain, low: float, high: float) -> None:
+def check_ends(domain: Domain, low: float, high: float) -> None:
     if low == high:
         raise ValueError(
             f"an interval of zero width has one value: use Constant({short(low)}); got {domain!r}"
@@ -455,5 +501,5 @@ def _check_ends(domain: Domain, low: float, high: float) -> None:
         raise ValueError(f"low and high must be different float32 numbers; got {domain!r}")
 
 
-def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
+def at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
     return replace_where(x, x < least, least)

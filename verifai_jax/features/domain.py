@@ -280,6 +280,13 @@ def dotted(name: str, field: str) -> str:
     return f"{name}.{field}" if name else field
 
 
+def nearest(number: float, low: float, high: float) -> str:
+    """Return the end of a message that names the value nearest to a number; empty without one."""
+    if not math.isfinite(number):
+        return ""
+    return f"; the nearest value is {short(np.clip(number, low, high).item())}"
+
+
 def format_choices(choices: Sequence[object]) -> str:
     """Format choices for a message."""
     return ", ".join(map(repr, choices))

@@ -10,6 +10,7 @@ from typing import Any
 from jaxtyping import PyTree
 
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.precision import in_precision
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box, DiscreteBox
@@ -114,7 +115,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
             return Categorical(*data["choices"], weights=data["weights"])
         case "Fixed":
             domain = from_plain(data["domain"], distributions)
-            return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
+            with in_precision("float64"):
+                return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
         case "Distribution":
             if data["name"] not in distributions:
                 raise ValueError(
