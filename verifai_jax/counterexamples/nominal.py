@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names
 from verifai_jax.features import Domain, FeatureSpace, Signal
-from verifai_jax.features.distributions import Continuous
+from verifai_jax.features.continuous import Continuous
 from verifai_jax.problem.problem import Problem
 
 

@@ -21,7 +21,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.features.arrays import Array
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Continuous
+from verifai_jax.features.continuous import Continuous
 from verifai_jax.features.domain import Domain, dotted
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace

@@ -16,11 +16,14 @@ from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Distribution, LogUniform, Normal, TruncatedNormal
+from verifai_jax.features.custom import Distribution
+from verifai_jax.features.distributions import LogUniform, Normal, TruncatedNormal
 from verifai_jax.features.domain import Domain
+from verifai_jax.features.families import Exponential, LogNormal, Triangular, Weibull
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.reactive import Reactive
 from verifai_jax.features.signal import Signal
+from verifai_jax.features.tabulated import Beta, Empirical, Gamma
 
 FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Box: ("low", "high"),
@@ -28,6 +31,13 @@ FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Normal: ("mean", "std"),
     TruncatedNormal: ("mean", "std", "low", "high"),
     LogUniform: ("low", "high"),
+    LogNormal: ("mean", "std"),
+    Exponential: ("mean",),
+    Weibull: ("shape", "scale"),
+    Gamma: ("shape", "scale"),
+    Beta: ("a", "b", "low", "high"),
+    Triangular: ("low", "mode", "high"),
+    Empirical: ("values", "ranks", "count"),
     Constant: ("value",),
     Signal: ("domain", "knots", "hold", "duration"),
     Array: ("domain", "length"),
@@ -133,6 +143,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
         for name in FIELDS[KINDS[kind]]
     }
+    if kind == "Empirical":
+        return Empirical.from_ranks(**arguments)
     if kind == "Box" and "closed" in data:
         arguments["closed"] = data["closed"]
     if kind == "Signal":

@@ -26,7 +26,7 @@ from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Distribution
+from verifai_jax.features.custom import Distribution
 from verifai_jax.features.domain import Domain, Numbers, Row, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
