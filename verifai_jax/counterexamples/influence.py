@@ -36,9 +36,9 @@ class Influence:
     robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
     back; `slopes` `[k]`: derivative of the smooth robustness by each of its real numbers, in their
     own unit, at the row; `gradient` `[k]`: the same over the whole range of each, which of a
-    distribution is twice that of its middle half. What is not known is NaN. `gone`: whether the failure vanishes with
-    the whole feature back; `departs`: whether the feature is not nominal; `each_gone`: whether the
-    failure vanishes with one coordinate back.
+    distribution is twice that of its middle half. What is not known is NaN. `gone`: whether the
+    failure vanishes with the whole feature back; `departs`: whether the feature is not nominal;
+    `each_gone`: whether the failure vanishes with one coordinate back.
     """
 
     name: str

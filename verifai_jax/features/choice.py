@@ -165,7 +165,7 @@ class Categorical(Domain):
         if self.numeric:
             return as_real(value) if self._dtype == np.float64 else jnp.asarray(value, self._dtype)
         if _is_index(value):
-            return on_device(value)
+            return on_device(value if isinstance(value, jax.Array) else np.asarray(value))
         values = np.asarray(value, dtype=object)
         places = []
         for choice in values.ravel():

@@ -1,4 +1,4 @@
-"""How probable the prior makes features: densities, and probabilities of values as far out.
+"""The probability of features under the prior: densities of rows, and tails of single values.
 
 log_density(space, run.table.all)                   # [n], of whole rows
 tails(space, run.table.all)                         # {"wind": [n], ...}, column by column

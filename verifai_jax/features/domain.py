@@ -250,6 +250,8 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
+            if any(isinstance(each, str | bytes) for each in numbers.ravel()):
+                raise TypeError
             numbers = numbers.astype(np.float64)
     except (TypeError, ValueError):
         numbers = np.asarray("")

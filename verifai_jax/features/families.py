@@ -52,8 +52,9 @@ def _at_positive(value: Float[np.ndarray, "*n"], density: object) -> Float[np.nd
 
 
 def _positive(value: Float[np.ndarray, "*n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values in double precision, and the same with 1 for those that are not positive."""
+    """Return values in double precision, -1 for infinity, and the same with 1 for those below 0."""
     value = np.asarray(value, np.float64)
+    value = np.where(np.isfinite(value), value, -1.0)
     return value, np.where(value > 0, value, 1.0)
 
 

@@ -18,11 +18,11 @@ from jaxtyping import Float, PyTree
 
 from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.precision import in_precision
-from verifai_jax.features.arrays import Array
+from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
 from verifai_jax.features.continuous import Continuous
-from verifai_jax.features.domain import Domain, dotted
+from verifai_jax.features.domain import Domain, as_numbers, dotted
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.space import FeatureSpace
 
@@ -108,18 +108,36 @@ def check_columns(
         if name not in columns:
             raise unknown_name("column", name, columns)
     own = {name: np.asarray(columns[name]) for name in space.columns}
-    features = space.features_of(own, "float64")
+    features = _converted(space, own, "float64")
     for name, domain in space.domains.items():
         if held or domain.size:
-            _check_batch(domain, features[name], name)
+            _check_batch(domain, features[name], own, name)
     return features
+
+
+def _converted(
+    space: FeatureSpace, columns: Mapping[str, np.ndarray], precision: str
+) -> dict[str, Any]:
+    """Return the features of columns, or say which row has none."""
+    try:
+        return space.features_of(columns, precision)
+    except ValueError:
+        count = len(next(iter(columns.values())))
+        for row in range(count if count > 1 else 0):
+            one = {name: entries[row : row + 1] for name, entries in columns.items()}
+            try:
+                space.features_of(one, precision)
+            except ValueError as error:
+                raise ValueError(f"{_at(row, count)}{error}") from error
+        raise
 
 
 def _of_columns(space: FeatureSpace, columns: Mapping[str, Any], precision: str) -> dict[str, Any]:
     features = check_columns(space, columns)
+    _check_absent(space, columns)
     if precision != "float64":
         own = {name: np.asarray(columns[name]) for name in space.columns}
-        features = space.features_of(own, precision)
+        features = _converted(space, own, precision)
     count = len(jax.tree.leaves(features)[0])
     if space.where is not None and count:
         with in_precision(precision):
@@ -161,22 +179,27 @@ def _features_of(row: Mapping[str, Any], known: Iterable[str]) -> list[str]:
     ]
 
 
-def _check_batch(domain: Domain, values: PyTree, name: str) -> None:
-    """Check values `[n, ...]` of a feature, as `features_of` gives them in double precision."""
+def _check_batch(
+    domain: Domain, values: PyTree, columns: Mapping[str, np.ndarray], name: str
+) -> None:
+    """Check values `[n, ...]` of a feature: its columns, or what `features_of` gives of them."""
     if isinstance(domain, Box | Continuous):
-        inside = domain.contains(values).reshape(len(values), -1).all(axis=1)
+        # As it is written: a value is rounded to an end that is near when it is converted.
+        each = [as_numbers(columns[column], column) for column in domain.columns(name)]
+        written = each[0] if np.ndim(values) == 1 else np.stack(each, axis=1)
+        inside = domain.contains(written).reshape(len(written), -1).all(axis=1)
         if not inside.all():
-            _check_one(domain, values, int(np.argmin(inside)), name)
+            _check_one(domain, written, int(np.argmin(inside)), name)
     elif isinstance(domain, Signal):
         for i in range(domain.knots):
-            _check_batch(domain.domain, values.knots[:, i], f"{name}[{i}]")
+            _check_batch(domain.domain, values.knots[:, i], columns, f"{name}[{i}]")
     elif isinstance(domain, Struct):
         for field, inner in domain.fields:
-            _check_batch(inner, values[field], dotted(name, field))
+            _check_batch(inner, values[field], columns, dotted(name, field))
     elif isinstance(domain, Array):
         for i in range(domain.length):
             item = jax.tree.map(lambda leaf, i=i: leaf[:, i], values)
-            _check_batch(domain.domain, item, f"{name}[{i}]")
+            _check_batch(domain.domain, item, columns, f"{name}[{i}]")
     else:
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(values)]
         known: set[tuple[bytes, ...]] = set()
@@ -185,6 +208,24 @@ def _check_batch(domain: Domain, values: PyTree, name: str) -> None:
             if content not in known:
                 known.add(content)
                 _check_one(domain, values, i, name)
+
+
+def _check_absent(space: FeatureSpace, columns: Mapping[str, Any]) -> None:
+    """Refuse values of items beyond the length of their array: they would be left out unsaid."""
+    for name, domain in space.domains.items():
+        if not (isinstance(domain, VariableArray) and f"{name}.length" in space.columns):
+            continue
+        lengths = np.asarray(columns[f"{name}.length"], np.float64)
+        for i in range(domain.least, domain.most):
+            for column in domain.domain.columns(f"{name}[{i}]"):
+                entries = np.asarray(columns[column], object)
+                present = np.array([entry is not None and entry == entry for entry in entries])
+                if (beyond := present & (lengths <= i)).any():
+                    row = int(np.argmax(beyond))
+                    raise ValueError(
+                        f"{_at(row, len(lengths))}{column} must be empty where {name}.length is "
+                        f"{lengths[row]:g}; got {entries[row]!r}"
+                    )
 
 
 def _check_one(domain: Domain, values: PyTree, row: int, name: str) -> None:

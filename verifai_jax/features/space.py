@@ -312,7 +312,7 @@ class FeatureSpace:
 
     @property
     def breaks_constraint(self) -> str:
-        """What a message says of features that the constraint refuses."""
+        """End of a message on features that the constraint refuses."""
         assert self.where is not None
         return f"breaks the constraint of this space, {_source(self.where)}"
 

@@ -141,9 +141,10 @@ class Gamma(Positive):
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value = np.asarray(value, np.float64)
-        log = np.log(np.where(value > 0, value, 1.0))
+        inside = (value > 0) & np.isfinite(value)
+        log = np.log(np.where(inside, value, 1.0))
         density = self._log_density_of_log(log - math.log(self.scale)) - log
-        return np.where(value > 0, density, -np.inf)
+        return np.where(inside, density, -np.inf)
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         x = np.maximum(np.asarray(value, np.float64), 0) / self.scale
