@@ -352,7 +352,8 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
         raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
     check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, columns))
     try:
-        check_columns(problem.space, {str(name): frame[name] for name in columns}, held=False)
+        rows = cast("pd.DataFrame", frame)
+        check_columns(problem.space, {str(name): rows[name] for name in columns}, held=False)
     except ValueError as error:
         raise ValueError(f"warm_start holds what this space does not: {error}") from error
     return cast("pd.DataFrame", frame)

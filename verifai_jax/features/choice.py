@@ -188,7 +188,7 @@ class Categorical(Domain):
                 if np.isfinite(value):
                     closest = f"; the nearest value is {self.choices[int(np.argmin(gaps))]!r}"
         elif index:
-            if 0 <= value < len(self.choices):
+            if isinstance(value, int) and 0 <= value < len(self.choices):
                 return
         elif self._place(value) is not None:
             return
