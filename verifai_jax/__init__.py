@@ -52,18 +52,25 @@ if TYPE_CHECKING:
     from verifai_jax.falsification import resume as resume
     from verifai_jax.falsification import simulate as simulate
     from verifai_jax.features import Array as Array
+    from verifai_jax.features import Beta as Beta
     from verifai_jax.features import Box as Box
     from verifai_jax.features import Categorical as Categorical
     from verifai_jax.features import Constant as Constant
     from verifai_jax.features import DiscreteBox as DiscreteBox
     from verifai_jax.features import Distribution as Distribution
+    from verifai_jax.features import Empirical as Empirical
+    from verifai_jax.features import Exponential as Exponential
     from verifai_jax.features import FeatureSpace as FeatureSpace
+    from verifai_jax.features import Gamma as Gamma
+    from verifai_jax.features import LogNormal as LogNormal
     from verifai_jax.features import LogUniform as LogUniform
     from verifai_jax.features import Normal as Normal
     from verifai_jax.features import Reactive as Reactive
     from verifai_jax.features import Signal as Signal
     from verifai_jax.features import Struct as Struct
+    from verifai_jax.features import Triangular as Triangular
     from verifai_jax.features import TruncatedNormal as TruncatedNormal
+    from verifai_jax.features import Weibull as Weibull
     from verifai_jax.fuzzing import FuzzCoverage as FuzzCoverage
     from verifai_jax.fuzzing import FuzzRun as FuzzRun
     from verifai_jax.fuzzing import fuzz as fuzz
@@ -173,18 +180,25 @@ _NAMES = {
     ),
     "features": (
         "Array",
+        "Beta",
         "Box",
         "Categorical",
         "Constant",
         "DiscreteBox",
         "Distribution",
+        "Empirical",
+        "Exponential",
         "FeatureSpace",
+        "Gamma",
+        "LogNormal",
         "LogUniform",
         "Normal",
         "Reactive",
         "Signal",
         "Struct",
+        "Triangular",
         "TruncatedNormal",
+        "Weibull",
     ),
     "fuzzing": (
         "FuzzCoverage",

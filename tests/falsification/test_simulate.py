@@ -27,9 +27,8 @@ def test_rows_of_a_table(problem):
     wanted = earlier.table.all.iloc[[7, 3, 41]]
     run = vj.simulate(problem, wanted, batch=2)
     assert (run.stopped, run.simulations) == ("budget", 3)
-    np.testing.assert_allclose(run.table.all["a"], wanted["a"], rtol=1e-6)
-    assert list(run.table.all["kind"]) == list(wanted["kind"])
-    np.testing.assert_allclose(run.table.all["rho"], wanted["rho"], atol=1e-5)
+    for column in ("a", "kind", "rho"):
+        assert list(run.table.all[column]) == list(wanted[column])
     assert run.failure_rate is None
 
 

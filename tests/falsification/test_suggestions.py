@@ -12,7 +12,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax import search
 from verifai_jax.core.cube import Cube
-from verifai_jax.falsification.suggestions import point_of
+from verifai_jax.falsification.suggestions import row_of
 from verifai_jax.reports.commands import run_python
 from verifai_jax.search import Absent
 
@@ -115,16 +115,19 @@ def test_what_cannot_be_simulated_is_left_out_and_said():
 def test_a_suggestion_may_be_a_row_of_a_table():
     wanted = np.asarray(PROBLEM.space.flatten(PROBLEM.space.coerce(GOOD)))
     row = {"a": 0.9, "b": 0.25, "kind": "fast", "gusts[0]": 0.0, "gusts[1]": 0.5, "rho": -1.0}
-    np.testing.assert_allclose(point_of(PROBLEM, GOOD), wanted, atol=1e-6)
-    np.testing.assert_allclose(point_of(PROBLEM, row), wanted, atol=1e-6)
+    for suggestion in (GOOD, row):
+        point = row_of(PROBLEM, suggestion, "float64")
+        np.testing.assert_allclose(point[: len(wanted)], wanted, atol=1e-6)
+        # Behind the point are the numbers themselves, which are simulated.
+        assert point[len(wanted) :].tolist() == [0.9, 0.25, 0.0, 0.5]
     with pytest.raises(ValueError, match=r"unknown column 'gusts\[2\]'; did you mean 'gusts"):
-        point_of(PROBLEM, row | {"gusts[2]": 0.1})
+        row_of(PROBLEM, row | {"gusts[2]": 0.1}, "float32")
     with pytest.raises(TypeError, match="must be a mapping"):
-        point_of(PROBLEM, [0.1, 0.2])
+        row_of(PROBLEM, [0.1, 0.2], "float32")
     space = vj.FeatureSpace(SPACE, where=lambda f: f["a"] > 0.95)
     narrow = vj.Problem("ramp", space, system, "always x < 0.9")
     with pytest.raises(ValueError, match="breaks the constraint"):
-        point_of(narrow, GOOD)
+        row_of(narrow, GOOD, "float32")
 
 
 @pytest.mark.thorough

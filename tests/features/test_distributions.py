@@ -191,7 +191,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("domain", "value", "message"),
         [
-            (Normal(0, 1), 7, "f is so far in the tail of Normal.*nearest value is 5.54.*; got 7"),
+            (Normal(0, 1), 1e39, r"f must fit into float32; got 1e\+39"),
             (Normal(0, 1), float("nan"), "f must be finite; got nan"),
             (Normal(0, 1), [1, 2], r"f must be one number; got shape \[2\]"),
             (Normal(0, 1), "x", "f must be a number; got 'x'"),
@@ -203,6 +203,14 @@ class TestRefused:
     def test_values_outside(self, domain, value, message):
         with pytest.raises(ValueError, match=message):
             domain.check(value, "f")
+
+    @pytest.mark.thorough
+    def test_a_tail_that_no_coordinate_reaches(self):
+        # It is simulated where it is given, and refused where only a coordinate will do.
+        Normal(0, 1).check(7, "f")
+        message = "f is so far in the tail of Normal.*nearest value is 5.54.*; got 7"
+        with pytest.raises(ValueError, match=message):
+            Normal(0, 1).check_reachable(7, "f")
 
 
 @pytest.mark.parametrize(

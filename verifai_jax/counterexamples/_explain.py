@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.precision import in_precision
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
 from verifai_jax.counterexamples.fixed_key import fix_key
@@ -139,7 +141,10 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     # Near the hard robustness, since the gradient is reported as a number.
     candidates.temperature = max(0.002 * float(spread), 1e-6)
     tangent = candidates.tangents(u[None])[0]
-    gradient = np.full(len(u), np.nan) if tangent is None else tangent.gradient
+    slopes = gradient = np.full(len(u), np.nan)
+    if tangent is not None:
+        slopes, ranges = slopes_of(problem.space, u, tangent.gradient, run.precision)
+        gradient = slopes * ranges
     if not known:
         only = "only gradients tell what matters"
         if tangent is None:
@@ -165,6 +170,7 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
                 each=rho[one],
                 each_gone=tuple(bool(gone) for gone in safe[one]),
                 gradient=gradient[places],
+                slopes=slopes[places],
             )
         )
     explained = Explained(
@@ -180,6 +186,47 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     ordered = sorted(influences, key=lambda i: (-i.gone, -abs(explained.effect(i))))
     object.__setattr__(explained, "influences", tuple(ordered))
     return explained
+
+
+def slopes_of(
+    space: FeatureSpace,
+    u: Float[np.ndarray, " d"],
+    gradient: Float[np.ndarray, " d"],
+    precision: str,
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Return derivatives by the real numbers of the features, and the ranges of these.
+
+    A gradient by coordinates is one by probabilities, of which a hundredth is much in the tail of a
+    distribution and little in its middle.
+
+    **Arguments:**
+
+    - `space`: of the features.
+    - `u`: the point at which the gradient was taken.
+    - `gradient`: by the coordinates.
+    - `precision`: in which it was taken.
+
+    **Returns:** the derivative for each coordinate, in the unit of its number, NaN for choices,
+    integers and lengths; and twice the width of the middle half, which is the whole of a Box.
+    """
+
+    def numbers(point: Array) -> Array:
+        leaves = jax.tree.leaves(space.unflatten(point))
+        real = [jnp.ravel(leaf) for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        return jnp.concatenate([*real, jnp.zeros(1, point.dtype)])
+
+    with in_precision(precision):
+        jacobian = np.asarray(jax.jit(jax.jacfwd(numbers))(jnp.asarray(u, precision)), np.float64)
+        quarters = np.repeat(u[None].astype(precision), 2 * len(u), axis=0)
+        for i in range(len(u)):
+            quarters[2 * i : 2 * i + 2, i] = 0.25, 0.75
+        there = np.asarray(jax.jit(jax.vmap(numbers))(quarters), np.float64)
+    each = np.arange(len(u))
+    own = np.argmax(np.abs(jacobian), axis=0)
+    moved = jacobian[own, each]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.where(moved == 0, np.nan, gradient / moved)
+    return slopes, 2 * (there[2 * each + 1, own] - there[2 * each, own])
 
 
 def values_of(space: FeatureSpace, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:

@@ -20,6 +20,7 @@ from verifai_jax.counterexamples.corpus import SavedCounterexample, read_corpus,
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.replays import HostReplays, Replays
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.given import given_features
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -256,6 +257,12 @@ def _misfit(space: FeatureSpace, columns: Mapping[str, Any]) -> str:
             advice = f"; if it was renamed, rename={{{unknown[0]!r}: {missing[0]!r}}}"
         return " and ".join(parts) + advice
     row = {name: np.nan if columns[name] is None else columns[name] for name in space.columns}
+    try:
+        # Exactly what was simulated, where no point of the cube is it.
+        given_features(space, row)
+        return ""
+    except ValueError:
+        pass  # Said with the nearest features that there are.
     try:
         # Some domains go on beyond the cube.
         u = np.clip(np.asarray(space.point_of(space.from_row(row))), 0.0, 1.0)

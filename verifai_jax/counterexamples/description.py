@@ -162,22 +162,23 @@ def format_spans(spans: list[Span]) -> str:
 
 def describe_gradient(influences: Sequence[Influence]) -> str:
     """Write which small change helps most; empty where no gradient is known."""
-    slopes = [
-        (abs(slope), slope, i, k)
+    changes = [
+        (abs(change), i, k)
         for i in influences
-        for k, slope in enumerate(i.gradient)
-        if np.isfinite(slope)
+        for k, change in enumerate(i.gradient)
+        if np.isfinite(change) and np.isfinite(i.slopes[k])
     ]
-    if not slopes or max(slopes, key=lambda entry: entry[0])[0] == 0:
+    if not changes or max(changes, key=lambda entry: entry[0])[0] == 0:
         return ""
-    size, slope, i, k = max(slopes, key=lambda entry: entry[0])
+    _, i, k = max(changes, key=lambda entry: entry[0])
+    slope = float(i.slopes[k])
     what = i.name if len(i.gradient) == 1 else i.coordinates[k]
     if i.spans is not None:
         what = f"{i.name} {format_spans([i.spans[k]])}"
     way = "less" if slope < 0 else "more"
     return (
-        f"A small change helps most in {what}: {way} of it, by a hundredth of its range, raises "
-        f"the robustness by about {format_number(0.01 * size, 2)}."
+        f"A small change helps most in {what}: {way} of it raises the robustness by about "
+        f"{format_number(abs(slope), 3)} for each unit, near this value."
     )
 
 

@@ -34,10 +34,11 @@ class Influence:
     **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
     when each coordinate acts, for the control points of a signal, else None; `reverted`: the
     robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
-    back; `gradient` `[k]`: change of the smooth robustness over the whole range of each coordinate,
-    by its gradient at the row. What is not known is NaN. `gone`: whether the failure vanishes with
-    the whole feature back; `departs`: whether the feature is not nominal; `each_gone`: whether the
-    failure vanishes with one coordinate back.
+    back; `slopes` `[k]`: derivative of the smooth robustness by each of its real numbers, in their
+    own unit, at the row; `gradient` `[k]`: the same over the whole range of each, which of a
+    distribution is twice that of its middle half. What is not known is NaN. `gone`: whether the
+    failure vanishes with the whole feature back; `departs`: whether the feature is not nominal;
+    `each_gone`: whether the failure vanishes with one coordinate back.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Influence:
     each: Float[np.ndarray, " k"]
     each_gone: tuple[bool, ...]
     gradient: Float[np.ndarray, " k"]
+    slopes: Float[np.ndarray, " k"]
 
     def effect(self, rho: float) -> float:
         """Return by how much the feature moves the robustness `rho` of the row.

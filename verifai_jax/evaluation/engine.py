@@ -451,13 +451,14 @@ def _one_key(keys: Key[Array, "*lanes"]) -> Key[Array, ""]:
 
 
 class EngineMode(NamedTuple):
-    """The options of one problem's engine; see `Engine`."""
+    """The options of one problem's engine; see `Engine`, and `CubePoints` for `given`."""
 
     batch: int
     gradient: bool
     precision: str
     clauses: bool
     steering: Steering
+    given: bool
 
 
 ENGINES: Slot[EngineMode, Engine] = Slot("engines")
@@ -471,13 +472,20 @@ def engine_for(
     precision: str = "float32",
     clauses: bool = False,
     steering: Steering = NOTHING,
+    given: bool = False,
 ) -> Engine:
     """Return the engine of this (problem, batch, mode), made once and kept with the problem."""
-    mode = EngineMode(batch, gradient, precision, clauses, steering)
+    mode = EngineMode(batch, gradient, precision, clauses, steering, given)
     return problem.programs.get(
         ENGINES,
         mode,
         lambda: Engine(
-            problem, batch, gradient, precision=precision, clauses=clauses, steering=steering
+            problem,
+            batch,
+            gradient,
+            precision=precision,
+            clauses=clauses,
+            steering=steering,
+            inputs=CubePoints(problem, given, precision),
         ),
     )

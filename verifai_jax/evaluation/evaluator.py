@@ -41,6 +41,7 @@ class Evaluator:
     - `steering`: what is computed for a search beside the robustness.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
     - `keep_traces`: whether verdicts come with traces; in this process.
+    - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
     """
 
     def __init__(
@@ -57,21 +58,29 @@ class Evaluator:
         target: str | None = None,
         steering: Steering = NOTHING,
         keep_traces: bool = False,
+        given: bool = False,
     ) -> None:
         self.problem, self.batch = problem, batch
+        self.given = given and problem.space.width > 0
+        # Points are float32 whatever the precision; what a person gives is not.
+        self._dtype = np.dtype(precision if self.given else "float32")
         self.engine: Engine | HostEngine | ExecutorEngine
         if executor is not None:
             self.engine = ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
                 precision=precision, journal=journal, target=target, steering=steering,
+                given=self.given,
             )  # fmt: skip
         elif problem.black_box:
             self.engine = HostEngine(
-                problem, precision, journal, steering=steering, keep_traces=keep_traces
-            )
+                problem, precision, journal, steering=steering, keep_traces=keep_traces,
+                given=self.given,
+            )  # fmt: skip
         else:
             steering = steering._replace(trace=keep_traces)
-            self.engine = engine_for(problem, batch, gradient, precision, clauses, steering)
+            self.engine = engine_for(
+                problem, batch, gradient, precision, clauses, steering, self.given
+            )
         self.key: Key[Array, ""] = run_keys(seed)[1]
         self.simulations = 0
 
@@ -108,11 +117,12 @@ class Evaluator:
 
         **Arguments:**
 
-        - `u`: points of the unit cube.
+        - `u`: points of the unit cube, or rows of given features.
         - `temperature`: of the smooth robustness that is differentiated, one for all or one each.
         - `first`: number of the first simulation; numbers go on from those before when left out.
         """
         start = self.simulations if first is None else first
+        u = self._with_values(u)
         count, parts = len(u), []
         if isinstance(self.engine, ExecutorEngine) and count:
             self.simulations = start + count
@@ -121,8 +131,8 @@ class Evaluator:
             block = slice(begin, begin + self.batch)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
             points = u if count <= self.batch else u[block]
-            if points.dtype != np.float32:
-                points = np.asarray(points, np.float32)
+            if points.dtype != self._dtype:
+                points = np.asarray(points, self._dtype)
             parts.append(self.engine.evaluate(points, self.key, start + begin, some))
         self.simulations = start + count
         if not parts:
@@ -136,4 +146,10 @@ class Evaluator:
         """
         if not isinstance(self.engine, ExecutorEngine):
             raise TypeError("points are sent to workers only by an evaluator with an executor")
-        return self.engine.submit(u, self.key, first)
+        return self.engine.submit(self._with_values(u), self.key, first)
+
+    def _with_values(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
+        """Return points as rows without given numbers, where the engine takes such rows."""
+        if not self.given or u.shape[1] != self.problem.space.dim:
+            return u
+        return np.pad(u, ((0, 0), (0, self.problem.space.width)), constant_values=np.nan)

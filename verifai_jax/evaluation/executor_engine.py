@@ -61,6 +61,7 @@ class ExecutorEngine:
     - `batch`: rows of a batch on one machine, which says how many lanes go together.
     - `executor`: with `submit`.
     - `gradient`, `clauses`, `precision`, `steering`: as of `engine.Engine`.
+    - `given`: whether points are rows of given features, as of `CubePoints`.
     - `journal`: of rows in flight, for a problem on the host.
     - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
 
@@ -80,6 +81,7 @@ class ExecutorEngine:
         journal: Journal | None = None,
         target: str | None = None,
         steering: Steering = NOTHING,
+        given: bool = False,
     ) -> None:
         check_executor(executor)
         self.problem, self.executor, self.precision = problem, executor, precision
@@ -95,7 +97,8 @@ class ExecutorEngine:
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
         least = 1 << (batch - 1).bit_length()
         backend = problem.system.backend if problem.system.backends else None
-        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering)
+        self.mode = BlockMode(lanes, gradient, clauses, precision, least, backend, steering, given)
+        self._dtype = np.dtype(precision if given else "float32")
         self.unit = lanes
         if problem.black_box:
             self.unit = TOGETHER if problem.system.can_simulate_batch else 1
@@ -147,7 +150,7 @@ class ExecutorEngine:
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
     ) -> "Pending":
         """Send rows to the workers, and return what waits for their verdicts."""
-        u = np.ascontiguousarray(rows, np.float32)
+        u = np.ascontiguousarray(rows, self._dtype)
         pending = Pending(self, u, key, first, np.asarray(temperature, np.float32))
         pending.send()
         return pending
@@ -188,6 +191,7 @@ class ExecutorEngine:
                 self._journal,
                 least=self.mode.least,
                 steering=self.mode.steering,
+                given=self.mode.given,
             )
         return self._recalling.evaluate(u, key, first)
 

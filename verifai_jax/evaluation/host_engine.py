@@ -99,6 +99,7 @@ class HostEngine:
     - `steering`: what is computed for a search beside the robustness; that of the monitor where one
       is given.
     - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
+    - `given`: whether points are rows of given features, as of `CubePoints`.
 
     `simulation_seconds` is what the last simulations took, with the verdicts between them.
     """
@@ -114,7 +115,9 @@ class HostEngine:
         least: int = 1,
         steering: Steering = NOTHING,
         keep_traces: bool = False,
+        given: bool = False,
     ) -> None:
+        self.given = given
         self.problem, self.precision, self.journal = problem, precision, journal
         self.least, self.keep_traces = least, keep_traces
         self.system = problem.system if system is None else system
@@ -194,8 +197,12 @@ class HostEngine:
 
     def _prepared(self, u: Array, key: Array, first: Array) -> tuple[PyTree, Array, Array]:
         keys = jax.vmap(lambda i: simulation_key(key, first + i))(jnp.arange(len(u)))
-        u = u.astype(self.precision)
-        return jax.vmap(self.problem.space.unflatten)(u), keys, jax.vmap(jax.random.bits)(keys)
+        u, space = u.astype(self.precision), self.problem.space
+        if self.given:
+            features = jax.vmap(space.unflatten_given)(u[:, : space.dim], u[:, space.dim :])
+        else:
+            features = jax.vmap(space.unflatten)(u)
+        return features, keys, jax.vmap(jax.random.bits)(keys)
 
     def _together(self, features: PyTree, keys: Key[Array, " n"], rows: "_Rows") -> None:
         count = len(rows.messages)

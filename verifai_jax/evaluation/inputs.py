@@ -1,6 +1,7 @@
 """The inputs of a simulation, as an engine takes them: how they become features and a system.
 
     CubePoints(problem)                                 # points of the unit cube
+    CubePoints(problem, given=True)                     # or features that somebody gave
     TableRows(refiner, formats)                         # features of a table, at a finer step
     WithParameters(problem, size, system_of)            # points, and parameters that all share
 
@@ -47,24 +48,38 @@ class Inputs(abc.ABC):
 
 
 class CubePoints(Inputs):
-    """Points of the unit cube of a problem's feature space."""
+    """Points of the unit cube of a problem's feature space.
+
+    **Arguments:**
+
+    - `problem`: that says the space.
+    - `given`: whether rows are those of `given_rows`: points, and behind them the real numbers of
+      features that somebody gave, which are simulated as they are; NaN for those of the point.
+    - `precision`: of what is given.
+    """
 
     keeps_features = True
     streaming = True
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, given: bool = False, precision: str = "float32") -> None:
+        self.problem, self.given = problem, given
         self.dim = problem.space.dim
-        self.row_form = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
+        size = self.dim + (problem.space.width if given else 0)
+        dtype = jnp.dtype(precision if given else "float32")
+        self.row_form = jax.ShapeDtypeStruct((size,), dtype)
 
     def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
-        return row.astype(precision)
+        return row[: self.dim].astype(precision)
 
     def simulated(
         self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
     ) -> tuple[PyTree, Callable[..., Any]]:
+        space = self.problem.space
         with lifting():
-            features = self.problem.space.unflatten(coordinates)
+            if self.given:
+                features = space.unflatten_given(coordinates, row[self.dim :])
+            else:
+                features = space.unflatten(coordinates)
         return features, self.problem.system
 
 

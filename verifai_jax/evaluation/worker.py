@@ -22,6 +22,7 @@ from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.inputs import CubePoints
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -47,6 +48,7 @@ class BlockMode(NamedTuple):
     - `least`: rows that a host system's features are computed of together.
     - `backend`: of a system that has several.
     - `steering`: what is computed for a search beside the robustness.
+    - `given`: whether points are rows of given features, as of `CubePoints`.
     """
 
     lanes: int
@@ -56,6 +58,7 @@ class BlockMode(NamedTuple):
     least: int
     backend: str | None
     steering: Steering
+    given: bool = False
 
 
 ENGINES: Slot[tuple[BlockMode, int], Engine] = Slot("engines of blocks")
@@ -116,7 +119,9 @@ def _on_host(
     engine = problem.programs.get(
         HOST_ENGINES,
         mode,
-        lambda: HostEngine(problem, mode.precision, least=mode.least, steering=mode.steering),
+        lambda: HostEngine(
+            problem, mode.precision, least=mode.least, steering=mode.steering, given=mode.given
+        ),
     )
     started = time.perf_counter()
     verdicts = engine.evaluate(u, as_key(key), first)
@@ -144,6 +149,7 @@ def _compiled(
             devices,
             mode.precision,
             mode.clauses,
+            inputs=CubePoints(problem, mode.given, mode.precision),
             lanes=mode.lanes,
             steering=mode.steering,
         ),

@@ -65,6 +65,7 @@ from verifai_jax.falsification.validation import (
     new_folder,
     points_of,
     recorded_search,
+    rows_of_first,
     slow_search,
     space_as_data,
     usual_batch,
@@ -78,7 +79,7 @@ from verifai_jax.statistics.stopping import StoppingRule
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.falsification.validation import Rows
+    from verifai_jax.features.given import Rows
 
 
 class RunError(RuntimeError):
@@ -173,7 +174,7 @@ def falsify(
     search = check_search(problem, "portfolio" if default else search)
     check_rule(search, stop_when)
     check_guide(problem, search)
-    given = check_first(problem, first, stop_when)
+    given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)
     in_precision(precision)
@@ -200,10 +201,11 @@ def falsify(
     with new_folder(folder) as place:
         table = ErrorTable(tuple(problem.space.columns), place)
         rounds = Rounds(
-            problem, search, batch, seed, table, precision, place, confirm, executor, target, given
-        )
+            problem, search, batch, seed, table, precision, place, confirm, executor, target, given,
+            suggests=asking is not None,
+        )  # fmt: skip
         if asking is not None:
-            rounds.suggestions = Suggestions(replace(asking, search=search), problem)
+            rounds.suggestions = Suggestions(replace(asking, search=search), problem, precision)
 
         def prepare() -> None:
             if earlier is not None:
@@ -242,18 +244,21 @@ def simulate(
     **Arguments:**
 
     - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
-      file), or features as a person writes them, one or several.
+      file), a row of one, or features as a person writes them, one or several.
     - the others as in `falsify`.
 
-    Features pass through the unit cube, which changes the last digit of some real ones.
+    All are checked before anything is simulated, and simulated with exactly these numbers, in the
+    run's precision; those of a table give its bits again.
 
     **Returns:** the run, with a row of its table for each of these.
 
     **Raises:** `ValueError` for features that are missing or outside the space; as `falsify`.
     """
-    points = points_of(problem, rows)
+    in_precision(precision)
+    given = points_of(problem, rows, precision)
+    points = np.asarray(given[:, : problem.space.dim], np.float32)
     return falsify(
-        problem, searches.PointList(points), len(points),
+        problem, searches.PointList(points), len(points), first=given,
         batch=batch, seed=seed, folder=folder, precision=precision, backend=backend,
         confirm=False, progress=progress, target=target, executor=executor,
     )  # fmt: skip
@@ -360,11 +365,11 @@ def _resume(
         table = run.table.resumed(rows, run.folder)
     rounds = Rounds(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
-        executor, run.target, np.asarray(run.first, np.float32).reshape(-1, problem.space.dim),
+        executor, run.target, rows_of_first(run.first, problem), suggests=asking is not None,
     )  # fmt: skip
 
     if asking is not None:
-        rounds.suggestions = Suggestions(replace(asking, search=search), problem)
+        rounds.suggestions = Suggestions(replace(asking, search=search), problem, run.precision)
         rounds.suggestions.restore(checkpoint)
         rounds.suggestions.check_source()
 

@@ -51,8 +51,8 @@ class Rounds:
 
     `found` counts the counterexamples that are claimed, `violating` the simulations that violate
     the property, and `without_verdict` those that have none; `best` is the least robustness.
-    `first` are points that are simulated before the search proposes any, and `suggestions` those
-    that somebody gives on the way, None where nobody is asked.
+    `first` are rows of given features (`given_rows`) that are simulated before the search proposes
+    any, and `suggestions` those that somebody gives on the way, None where nobody is asked.
     `record_checksum` is that of the run's record, for the checkpoints.
     `checked` says in words which closer replays there were. `watch` has the seconds of all: to
     `COMPILE`; to `SEARCH`, which the search took for its proposals and to learn, and whoever
@@ -72,7 +72,8 @@ class Rounds:
         confirm: bool = False,
         executor: Executor | None = None,
         target: str | None = None,
-        first: Float[np.ndarray, "n d"] | None = None,
+        first: Float[np.ndarray, "n row"] | None = None,
+        suggests: bool = False,
     ) -> None:
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
         self.problem, self.search, self.batch, self.table = problem, search, batch, table
@@ -95,6 +96,7 @@ class Rounds:
             target=target,
             steering=self.steering,
             keep_traces=self._surrogate is not None,
+            given=suggests or self.first.shape[1] > problem.space.dim,
         )
         self._marks = MarkBook(problem) if search.wants_marks else None
         self.found = self.violating = self.without_verdict = 0
@@ -267,6 +269,9 @@ class Rounds:
             return
         if verdicts is None:
             verdicts = self._verdicts(points, first, given=len(given) > 0)
+        if len(given):
+            # What follows knows points alone: the nearest ones.
+            points = given = np.asarray(given[:, : self.problem.space.dim], np.float32)
         columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
         if self.suggestions is not None:
             columns["suggested"] = np.full(len(points), suggested)

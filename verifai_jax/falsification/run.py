@@ -48,6 +48,8 @@ from verifai_jax.falsification.record import (
 )
 from verifai_jax.falsification.table import FINISHED, ErrorTable
 from verifai_jax.falsification.tail import TAIL
+from verifai_jax.features import FeatureSpace
+from verifai_jax.features.density import log_density, tails
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
@@ -269,6 +271,50 @@ class Run:
             "no file of its model has changed: the system has memory, chance or state of its own, "
             "or reads what is not recorded"
         )
+
+    def improbability(self, rows: "pd.DataFrame | None" = None) -> "pd.DataFrame":
+        """Return how improbable the prior makes rows of the table: a failure that is never met.
+
+        **Arguments:**
+
+        - `rows`: of the table, all counterexamples when left out.
+
+        **Returns:** by the numbers of the rows `log_density`, the natural logarithm of the prior's
+        density (of a constrained space without the share that is accepted), and for each column
+        with a distribution `tail.NAME`, the probability of a value at least as far out. The
+        density is NaN where a feature has none, such as an automaton.
+
+        **Raises:** `ValueError` for a run of which neither the problem nor the space is known, and
+        for a row outside the space.
+        """
+        import pandas as pd
+
+        rows = self.table.counterexamples if rows is None else rows
+        space = self.space
+        columns = {str(name): rows[name].to_numpy() for name in rows}
+        try:
+            density = log_density(space, columns)
+        except ValueError as error:
+            if "has no density" not in str(error):
+                raise
+            density = np.full(len(rows), np.nan)
+        found = {f"tail.{name}": tail for name, tail in tails(space, columns).items()}
+        return pd.DataFrame({"log_density": density, **found}, index=rows.index)
+
+    @property
+    def space(self) -> FeatureSpace:
+        """The feature space, of the problem or as it was recorded.
+
+        **Raises:** `ValueError` where neither is known.
+        """
+        if self.problem is not None:
+            return self.problem.space
+        if self.space_data is None or self.space_data.get("where") is not None:
+            raise ValueError(
+                f"the run of {self.name!r} was loaded without its problem, and its record does not "
+                "describe its space; give it: vj.load(path, problem)"
+            )
+        return FeatureSpace.from_json(self.space_data)
 
     def analyze(self, **options: Any) -> Any:
         """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""

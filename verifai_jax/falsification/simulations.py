@@ -43,7 +43,8 @@ class Simulations:
     - `search`: what it wants decides what is computed beside the robustness.
     - `batch`: simulations of a round at most.
     - `seed`: of the run.
-    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`: as for `Evaluator`.
+    - `precision`, `journal`, `executor`, `target`, `steering`, `keep_traces`, `given`: as for
+      `Evaluator`.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Simulations:
         target: str | None,
         steering: Steering,
         keep_traces: bool,
+        given: bool = False,
     ) -> None:
         self.batch, self.keep_traces = batch, keep_traces
         evaluator = partial(
@@ -77,6 +79,7 @@ class Simulations:
             clauses=search.wants_clauses and goals_of(problem.formulas.values()).most > 1,
             journal=journal,
             keep_traces=keep_traces,
+            given=given,
         )
         self._differentiate: Evaluator | None = None
         if search.wants_clauses:

@@ -1,9 +1,9 @@
 """Questions to whoever suggests points, and the suggestions that were made.
 
-    suggestions = Suggestions(search, problem)          # of a `search.Suggested`
+    suggestions = Suggestions(search, problem, 'float32')   # of a `search.Suggested`
     suggestions.due(rows)                               # whether it is time for a question
     suggestions.ask(question(...), rows)                # checks what comes back, and keeps it
-    suggestions.waiting(rows)                           # points to simulate next, [n, d]
+    suggestions.waiting(rows)                           # rows to simulate next, [n, row]
 
 What was suggested is in the checkpoint, written before the first of it is simulated: a run that
 goes on asks again for nothing that it was told.
@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.errors import check_names
 from verifai_jax.core.text import format_error, one_line
+from verifai_jax.features.given import given_features, given_rows
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Suggested
 from verifai_jax.search.suggested import Absent
 
 POINTS, ASKED, REFUSED = "suggested.points", "suggested.asked", "suggested.refused"
-"""Entries of a checkpoint: all points that were suggested, `[n, d]`; of each question the row at
+"""Entries of a checkpoint: all rows that were suggested, `[n, row]`; of each question the row at
 which it was asked and how many points came, `[k, 2]`; and what was wrong with others."""
 
 
@@ -36,9 +36,9 @@ class Suggestions:
     - `refused`: what was wrong with suggestions that were left out, one text each.
     """
 
-    def __init__(self, search: Suggested, problem: Problem) -> None:
-        self.search, self.problem = search, problem
-        self.points = np.zeros((0, problem.space.dim), np.float32)
+    def __init__(self, search: Suggested, problem: Problem, precision: str) -> None:
+        self.search, self.problem, self.precision = search, problem, precision
+        self.points = np.zeros((0, problem.space.dim + problem.space.width))
         self.asked = np.zeros((0, 2), np.int64)
         self.refused: tuple[str, ...] = ()
         self.last_refused: tuple[str, ...] = ()
@@ -71,8 +71,8 @@ class Suggestions:
             return False
         return not len(self.asked) or rows >= int(self.asked[-1, 0]) + self.search.every
 
-    def waiting(self, rows: int) -> Float[np.ndarray, "n d"]:
-        """Return the suggested points that are not among the first `rows` rows yet."""
+    def waiting(self, rows: int) -> Float[np.ndarray, "n row"]:
+        """Return the suggested rows that are not among the first `rows` rows yet."""
         if not len(self.asked):
             return self.points[:0]
         begin, count = self.asked[-1]
@@ -91,14 +91,14 @@ class Suggestions:
             try:
                 if i >= self.search.points:
                     raise SuggestionError(f"only {self.search.points} were asked for")
-                points.append(point_of(self.problem, each))
+                points.append(row_of(self.problem, each, self.precision))
             except (TypeError, ValueError) as error:
                 why = f"number {i + 1} of question {number}: {one_line(format_error(error), 400)}"
                 if self.search.strict:
                     raise SuggestionError(f"{self.search.source} suggested {why}") from error
                 wrong.append(why)
-        dim = self.problem.space.dim
-        self.points = np.concatenate([self.points, np.reshape(points, (-1, dim))], dtype=np.float32)
+        rows_now = np.reshape(points, (-1, self.points.shape[1]))
+        self.points = np.concatenate([self.points, rows_now])
         self.asked = np.concatenate([self.asked, [[rows, len(points)]]]).astype(np.int64)
         self.last_refused = tuple(wrong)
         self.refused = (*self.refused, *wrong)
@@ -111,48 +111,29 @@ class Suggestions:
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on with the suggestions of a checkpoint."""
         if ASKED in checkpoint:
-            self.points = np.asarray(checkpoint[POINTS], np.float32)
+            self.points = np.asarray(checkpoint[POINTS], np.float64)
             self.asked = np.asarray(checkpoint[ASKED], np.int64)
             self.refused = tuple(str(why) for why in checkpoint[REFUSED])
             last = f" of question {len(self.asked)}: "
             self.last_refused = tuple(why for why in self.refused if last in why)
 
 
-def point_of(problem: Problem, suggestion: object) -> Float[np.ndarray, " d"]:
-    """Return the point of the unit cube that a suggestion means.
+def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.ndarray, " row"]:
+    """Return the row that simulates a suggestion exactly; see `given_rows`.
 
     **Arguments:**
 
     - `problem`: the one that is falsified.
     - `suggestion`: features by name, as a person writes them, or by the columns of the table;
       columns that are none of features are ignored.
+    - `precision`: of the run.
 
     **Raises:** `TypeError` for what is no mapping; `ValueError` that names the feature for one that
     is missing, unknown or outside its domain, and for features that break the constraint.
     """
     if not isinstance(suggestion, Mapping):
         raise TypeError(f"a suggestion must be a mapping of names to values; got {suggestion!r}")
-    space = problem.space
-    flat = set(space.columns) - set(space.domains)
-    if flat and flat & set(suggestion):
-        names = [name for name in suggestion if name not in _COLUMNS]
-        check_names("column", names, space.columns)
-        features = space.from_row({name: suggestion[name] for name in names})
-        space.check(features)
-    else:
-        names = [name for name in suggestion if name not in _COLUMNS or name in space.domains]
-        check_names("feature", names, space.domains)
-        features = space.coerce({name: suggestion[name] for name in names})
-    point = np.asarray(space.flatten(features), np.float32)
-    if not np.all(np.isfinite(point)):
-        raise ValueError(f"the suggestion {dict(suggestion)!r} is no point of the space")
-    if space.constraint is not None and not np.asarray(space.constraint(point[None]))[0]:
-        raise ValueError(f"the constraint of the space refuses {dict(suggestion)!r}")
-    return point
-
-
-_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
-"""Columns of a table beside its features, which a suggestion made of a row may hold."""
+    return given_rows(problem.space, given_features(problem.space, suggestion, precision))[0]
 
 
 def _listed(given: object, source: str) -> list[Any]:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +16,7 @@ from verifai_jax.core.locks import LOCK, write_lock
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.falsification.run import RECORD, Run
 from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -260,43 +261,40 @@ def check_rule(search: Search, rule: StoppingRule | None) -> None:
         )
 
 
-Rows: TypeAlias = "pd.DataFrame | Sequence[Mapping[str, Any]] | Mapping[str, Any]"
-"""Features: the feature columns of a table, or as a person writes them, one or several."""
+def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray, "n row"]:
+    """Return given features as rows that an engine simulates with exactly these numbers.
 
-
-def points_of(problem: Problem, rows: Rows) -> Float[np.ndarray, "n d"]:
-    """Return given features as points of the unit cube.
-
-    **Raises:** `ValueError` for features that are missing or outside the space.
+    **Raises:** as `given_features`.
     """
-    if hasattr(rows, "columns"):
-        check_names("column", problem.space.columns, map(str, rows.columns))  # pyright: ignore[reportAttributeAccessIssue]
-        return np.asarray(problem.space.points(rows), np.float32)  # pyright: ignore[reportArgumentType]
-    listed: list[Any] = [rows] if isinstance(rows, Mapping) else list(rows)
-    points = [problem.space.flatten(problem.space.coerce(row)) for row in listed]
-    return np.asarray(points, np.float32).reshape(-1, problem.space.dim)
+    return given_rows(problem.space, given_features(problem.space, rows, precision))
 
 
 def check_first(
-    problem: Problem, first: "Rows | None", rule: StoppingRule | None
-) -> Float[np.ndarray, "n d"]:
-    """Return the points that are simulated before the search begins; none where none are given.
+    problem: Problem,
+    first: "Rows | Float[np.ndarray, 'n row'] | None",
+    rule: StoppingRule | None,
+    precision: str,
+) -> Float[np.ndarray, "n row"]:
+    """Return the rows that are simulated before the search begins; none where none are given.
 
-    **Raises:** `ValueError` for features that are missing, outside the space, or that its
-    constraint refuses, and together with a rule that needs independent samples.
+    **Raises:** as `points_of`; `ValueError` together with a rule that needs independent samples.
     """
     if first is None:
-        return np.zeros((0, problem.space.dim), np.float32)
-    points = points_of(problem, first)
-    if rule is not None and len(points):
+        return rows_of_first([], problem)
+    # `simulate` has made rows of them already.
+    rows = first if isinstance(first, np.ndarray) else points_of(problem, first, precision)
+    if rule is not None and len(rows):
         raise ValueError(
             "stop_when needs independent samples of the space, which those of first= are not"
         )
-    if problem.space.constraint is not None and len(points):
-        refused = np.flatnonzero(~np.asarray(problem.space.constraint(points)))
-        if len(refused):
-            raise ValueError(f"the constraint of the space refuses entry {refused[0]} of first=")
-    return points
+    return rows
+
+
+def rows_of_first(first: Sequence[Sequence[float]], problem: Problem) -> np.ndarray:
+    """Return the rows that a run recorded as its first ones, `[n, row]`."""
+    if not len(first):
+        return np.zeros((0, problem.space.dim), np.float32)
+    return np.asarray(first, np.float64)
 
 
 def space_as_data(problem: Problem) -> dict[str, Any] | None:
@@ -353,6 +351,11 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
     if columns is None:
         raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
     check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, columns))
+    try:
+        rows = cast("pd.DataFrame", frame)
+        check_columns(problem.space, {str(name): rows[name] for name in columns}, held=False)
+    except ValueError as error:
+        raise ValueError(f"warm_start holds what this space does not: {error}") from error
     return cast("pd.DataFrame", frame)
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.core.lifting import is_lifting, lifted
 from verifai_jax.features.domain import (
@@ -22,6 +22,7 @@ from verifai_jax.features.domain import (
     as_numbers,
     as_real,
     indexed,
+    nearest,
     on_device,
     real_numbers,
     short,
@@ -135,19 +136,25 @@ class Box(Domain):
         """Return real numbers, those that their precision has rounded over an end at that end."""
         return round_inwards(value, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
 
+    def contains(self, numbers: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+        """Return which numbers of double precision lie in the box, up to rounding."""
+        return is_inside(numbers, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
+
     def check(self, value: object, name: str) -> None:
         numbers = as_numbers(value, name)
         _check_shape(numbers, self.low, name)
-        inside = is_inside(numbers, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
+        inside = self.contains(numbers)
         opening = "[" if self.closed in ("both", "left") else "("
         closing = "]" if self.closed in ("both", "right") else ")"
-        for column, ok, x, low, high in zip(
-            self.columns(name), *map(np.ravel, (inside, numbers, self.low, self.high)), strict=True
-        ):
+        ends = np.ravel(self.low), np.ravel(self.high)
+        for column, ok, x, low, high, first, last in zip(
+            self.columns(name), np.ravel(inside), np.ravel(numbers), *ends,
+            *map(np.ravel, self.ends(np.float64)), strict=True,
+        ):  # fmt: skip
             if not ok:
                 raise ValueError(
                     f"{column} must lie in {opening}{short(low.item())}, "
-                    f"{short(high.item())}{closing}; got {short(x.item())}"
+                    f"{short(high.item())}{closing}; got {short(x.item())}{nearest(x, first, last)}"
                 )
 
     def columns(self, name: str) -> tuple[str, ...]:
@@ -253,7 +260,8 @@ class DiscreteBox(Domain):
         ):
             if not (low <= x <= high and x == np.floor(x)):
                 raise ValueError(
-                    f"{column} must be an integer from {low} to {high}; got {short(x.item())}"
+                    f"{column} must be an integer from {low} to {high}; got "
+                    f"{short(x.item())}{nearest(np.round(x), low, high)}"
                 )
 
     def columns(self, name: str) -> tuple[str, ...]:
@@ -270,6 +278,8 @@ class DiscreteBox(Domain):
             number = as_numbers(row[column], column).item()
             if not math.isfinite(number) or number != int(number):
                 raise ValueError(f"{column} must be an integer; got {number!r}")
+            if not -(2**31) <= number < 2**31:
+                raise ValueError(f"{column} must fit into 32 bits; got {short(number)}")
             entries.append(int(number))
         return jnp.asarray(entries[0] if np.ndim(self.low) == 0 else entries, jnp.int32)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +35,8 @@ class Categorical(Domain):
     """One of several choices without an order: `Categorical("ppo", "sac", weights=[0.9, 0.1])`.
 
     Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
-    value is its place in `choices`, an `int32`. The table always shows the choice itself.
+    value is its index in `choices`, an `int32`. The table always shows the choice itself. A person
+    writes the choice; an integer that is none is an index only where no choice reads as a number.
 
     **Arguments:**
 
@@ -162,23 +164,35 @@ class Categorical(Domain):
     def coerce(self, value: PyTree) -> Shaped[Array, "*shape"]:
         if self.numeric:
             return as_real(value) if self._dtype == np.float64 else jnp.asarray(value, self._dtype)
-        if isinstance(value, jax.Array):
-            return value
+        if _is_index(value):
+            return on_device(value if isinstance(value, jax.Array) else np.asarray(value))
         values = np.asarray(value, dtype=object)
-        places = [self._place(choice) for choice in values.ravel()]
+        places = []
+        for choice in values.ravel():
+            if (place := self._place(choice)) is None:
+                raise ValueError(f"{choice!r} is none of {format_choices(self.choices)}")
+            places.append(place)
         return on_device(np.array(places, np.int32).reshape(values.shape))
 
     def check(self, value: object, name: str) -> None:
         known = f"one of {format_choices(self.choices)}"
         if np.ndim(np.asarray(value, dtype=object)) != 0:
             raise ValueError(f"{name} must be {known}; got {value!r}")
-        value = as_scalar(value)
+        index, value = _is_index(value), as_scalar(value)
+        closest = ""
         if self.numeric:
-            if isinstance(value, bool | int | float) and self._nearest(float(value)) is not None:
+            if isinstance(value, bool | int | float):
+                if self._nearest(float(value)) is not None:
+                    return
+                gaps = np.abs(self._shown.astype(np.float64) - value)
+                if np.isfinite(value):
+                    closest = f"; the nearest value is {self.choices[int(np.argmin(gaps))]!r}"
+        elif index:
+            if isinstance(value, int) and 0 <= value < len(self.choices):
                 return
         elif self._place(value) is not None:
             return
-        raise ValueError(f"{name} must be {known}; got {value!r}")
+        raise ValueError(f"{name} must be {known}; got {value!r}{closest}")
 
     def columns(self, name: str) -> tuple[str, ...]:
         return (name,)
@@ -198,9 +212,8 @@ class Categorical(Domain):
     def from_columns(self, row: Row, name: str) -> Shaped[Array, ""]:
         shown = as_scalar(row[name])
         if not self.numeric:
-            places = {text: i for i, text in enumerate(self._shown)}
-            if str(shown) in places:
-                return on_device(np.asarray(places[str(shown)], np.int32))
+            if (place := self._choice(shown)) is not None:
+                return on_device(np.asarray(place, np.int32))
         else:
             place = self._nearest(shown) if isinstance(shown, bool | int | float) else None
             if place is not None:
@@ -208,11 +221,30 @@ class Categorical(Domain):
         raise ValueError(f"{name} must be one of {format_choices(self.choices)}; got {shown!r}")
 
     def _place(self, value: object) -> int | None:
-        """Return the place of a choice; integers are places already, as systems see them."""
-        if type(value) in (int, np.int32, np.int64):
-            place = int(value)  # pyright: ignore[reportArgumentType]
-            return place if 0 <= place < len(self.choices) else None
-        return self.choices.index(value) if value in self.choices else None
+        """Return the index of what a person writes, a choice or the text that the table shows.
+
+        An integer is an index, as systems see it, only where no choice can be read as a number.
+        """
+        value = as_scalar(value)
+        place = self._choice(value)
+        if place is None and type(value) is int and not self._has_numbers:
+            return value if 0 <= value < len(self.choices) else None
+        return place
+
+    def _choice(self, value: object) -> int | None:
+        """Return the index of a choice, or of the text that the table shows of it."""
+        if type(value) is float and value.is_integer() and str(value) not in self._shown:
+            value = int(value)  # So pandas reads integers beside empty entries.
+        found = np.flatnonzero(self._shown == str(value))
+        if len(found):
+            return int(found[0])
+        same = (i for i, each in enumerate(self.choices) if type(each) is type(value))
+        return next((i for i in same if bool(self.choices[i] == value)), None)
+
+    @cached_property
+    def _has_numbers(self) -> bool:
+        """True where a choice is a number, or a text that reads as one."""
+        return any(_reads_as_number(choice) for choice in self.choices)
 
     def _nearest(self, value: float) -> int | None:
         """Return the place of the choice that is this number in float32."""
@@ -225,6 +257,19 @@ class Categorical(Domain):
         if self.probabilities is not None:
             weights = f", weights={short(self.probabilities)}"
         return f"Categorical({format_choices(self.choices)}{weights})"
+
+
+def _is_index(value: object) -> TypeGuard[Any]:
+    """Return whether a value is an index as `from_unit` gives it, and no number of a person."""
+    return isinstance(value, jax.Array) or getattr(value, "dtype", None) == np.int32
+
+
+def _reads_as_number(choice: object) -> bool:
+    try:
+        float(choice)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 @dataclass(frozen=True, repr=False)

@@ -1,4 +1,4 @@
-"""Distributions of real numbers: `Normal`, `TruncatedNormal`, `LogUniform`, one of your own.
+"""Normal, truncated normal and log-uniform distributions of real numbers.
 
     FeatureSpace({"wind": Normal(0, 2), "mass": LogUniform(0.01, 10)})
 
@@ -7,128 +7,33 @@ distribution (inverse transform sampling). Both tails are computed from the smal
 0 and 1 give finite values, and derivatives there are finite and not zero.
 """
 
-import abc
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtr, ndtri
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from verifai_jax.core.precision import in_precision
-from verifai_jax.features.domain import (
-    LEAST_REAL,
-    MOST_REAL,
-    Domain,
-    Numbers,
-    Row,
-    as_number,
-    as_numbers,
-    as_real,
-    on_device,
-    real_numbers,
-    short,
+from verifai_jax.features.continuous import (
+    OUTERMOST,
+    Continuous,
+    at_least,
+    check_ends,
+    check_numbers,
+    check_scale,
+    normal_score,
+    scipy_special,
 )
-from verifai_jax.features.ends import (
-    Reals,
-    clip_to_ends,
-    ends_within,
-    is_inside,
-    replace_where,
-    round_inwards,
-)
+from verifai_jax.features.domain import LEAST_REAL, short
+from verifai_jax.features.ends import replace_where
 
-OUTERMOST = 2.0**-26
-"""The probability beyond the outermost points: what float32 rounds away when taken from 1."""
 CENTRAL = 4.0
 """Standard deviations from the mean within which float32 coordinates are closely spaced."""
+HALF_LOG_2PI = math.log(2 * math.pi) / 2
+"""Of the density of a normal distribution."""
 DEEPEST = 1e-29
 """Share of a normal distribution that has to lie between the ends of a truncated one."""
-
-
-class Continuous(Domain):
-    """A real number whose unit coordinate is its cumulative probability."""
-
-    @property
-    @abc.abstractmethod
-    def support(self) -> tuple[float, float]:
-        """The interval that holds all values; its ends may be infinite."""
-
-    @abc.abstractmethod
-    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the value with this probability to its left; finite at 0 and 1."""
-
-    @abc.abstractmethod
-    def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the probability to the left of this value."""
-
-    @property
-    def levels(self) -> tuple[int, ...]:
-        return (0,)
-
-    def ends(self, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the least and the greatest value in this precision; they may be infinite."""
-        return ends_within(*self.support, dtype)
-
-    def from_unit(self, u: Float[Array, "1"]) -> Float[Array, ""]:
-        value = self.quantile(u[0]).astype(u.dtype)
-        return clip_to_ends(value, *self.ends(u.dtype)) if self._bounded else value
-
-    def to_unit(self, value: Numbers) -> Float[Array, "1"]:
-        value = as_real(value)
-        u = jnp.clip(self.probability(value), 0, 1)
-        if self._bounded:
-            first, last = self.ends(value.dtype)
-            u = replace_where(replace_where(u, value == first, 0.0), value == last, 1.0)
-        return u[None]
-
-    def coerce(self, value: Numbers) -> Float[Array, "*shape"]:
-        return on_device(self.rounded(real_numbers(value)))
-
-    def rounded(self, value: Reals) -> Reals:
-        """Return real numbers, those that their precision has rounded over an end at that end."""
-        return round_inwards(value, *self.support)
-
-    @property
-    def _bounded(self) -> bool:
-        return bool(np.any(np.isfinite(self.support)))
-
-    def check(self, value: object, name: str) -> None:
-        number = as_numbers(value, name)
-        if number.shape != ():
-            raise ValueError(f"{name} must be one number; got shape {list(number.shape)}")
-        low, high = self.support
-        if not (is_inside(number, low, high) and np.isfinite(number)):
-            raise ValueError(f"{name} must {_bounds_text(low, high)}; got {short(number.item())}")
-        if self._is_central(number.item()):
-            return  # What follows takes JAX a second the first time.
-        nearest = np.float64(self.from_unit(self.to_unit(jnp.float32(number))))
-        lower, upper = (float(self.quantile(jnp.float32(u))) for u in (0.25, 0.75))
-        if abs(nearest - number) > 0.1 * (upper - lower) + 1e-5 * abs(number):
-            raise ValueError(
-                f"{name} is so far in the tail of {self!r} that a float32 coordinate cannot reach "
-                f"it; the nearest value is {nearest:.6g}; got {short(number.item())}"
-            )
-
-    def _is_central(self, value: float) -> bool:
-        """Return whether a float32 coordinate surely reaches a value of the support."""
-        return False
-
-    def columns(self, name: str) -> tuple[str, ...]:
-        return (name,)
-
-    def to_columns(
-        self, values: Float[Array, " n"] | Float[np.ndarray, " n"], name: str
-    ) -> dict[str, np.ndarray]:
-        return {name: np.asarray(values)}
-
-    def from_columns(self, row: Row, name: str) -> Float[Array, ""]:
-        number = as_numbers(row[name], name).astype(jnp.result_type(float))
-        return on_device(self.rounded(number))
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,8 +56,8 @@ class Normal(Continuous):
     std: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "mean", "std")
-        _check_scale(self, self.mean, self.std)
+        check_numbers(self, "mean", "std")
+        check_scale(self, self.mean, self.std)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -162,12 +67,19 @@ class Normal(Continuous):
         return abs(value - self.mean) <= CENTRAL * self.std
 
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        left = u < 0.5
-        z = ndtri(_at_least(jnp.where(left, u, 1 - u), OUTERMOST))
-        return self.mean + self.std * jnp.where(left, z, -z)
+        return self.mean + self.std * normal_score(u)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         return ndtr((value - self.mean) / self.std)
+
+    def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        z = (np.asarray(value, np.float64) - self.mean) / self.std
+        return -(z**2) / 2 - HALF_LOG_2PI - math.log(self.std)
+
+    def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        return 2 * scipy_special().ndtr(
+            -np.abs((np.asarray(value, np.float64) - self.mean) / self.std)
+        )
 
     def __repr__(self) -> str:
         return f"Normal({short(self.mean)}, {short(self.std)})"
@@ -196,9 +108,9 @@ class TruncatedNormal(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "mean", "std", "low", "high")
-        _check_scale(self, self.mean, self.std)
-        _check_ends(self, self.low, self.high)
+        check_numbers(self, "mean", "std", "low", "high")
+        check_scale(self, self.mean, self.std)
+        check_ends(self, self.low, self.high)
         if self.high - self.low < 0.05 * self.std:
             raise ValueError(
                 "low and high are less than 0.05 standard deviations apart, where the "
@@ -242,8 +154,8 @@ class TruncatedNormal(Continuous):
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
         below, _, _, above = self._tails
         left, right = (1 - u, u) if self._mirrored else (u, 1 - u)
-        p = below + self._inside * _at_least(left, OUTERMOST)
-        q = above + self._inside * _at_least(right, OUTERMOST)
+        p = below + self._inside * at_least(left, OUTERMOST)
+        q = above + self._inside * at_least(right, OUTERMOST)
         lower = p < 0.5
         z = ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
@@ -262,6 +174,11 @@ class TruncatedNormal(Continuous):
         left, right = (right, left) if self._mirrored else (left, right)
         u = jnp.where(left < 0.5, left, 1 - right)
         return replace_where(replace_where(u, value <= low, 0), value >= high, 1)
+
+    def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        value = np.asarray(value, np.float64)
+        whole = Normal(self.mean, self.std).log_density(value) - math.log(self._inside)
+        return np.where(self.contains(value), whole, -np.inf)
 
     def __repr__(self) -> str:
         shown = ", ".join(short(x) for x in (self.mean, self.std, self.low, self.high))
@@ -283,12 +200,12 @@ class LogUniform(Continuous):
     high: float
 
     def __post_init__(self) -> None:
-        _check_numbers(self, "low", "high")
+        check_numbers(self, "low", "high")
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < LEAST_REAL:
             raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:g}; got {self!r}")
-        _check_ends(self, self.low, self.high)
+        check_ends(self, self.low, self.high)
 
     @property
     def support(self) -> tuple[float, float]:
@@ -314,146 +231,11 @@ class LogUniform(Continuous):
         middle = math.sqrt(self.low) * math.sqrt(self.high)
         return jnp.where(value < middle, from_low, 1 + from_high)
 
+    def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        value = np.asarray(value, np.float64)
+        inside = self.contains(value)
+        density = -np.log(np.where(inside, value, 1.0)) - math.log(self._width)
+        return np.where(inside, density, -np.inf)
+
     def __repr__(self) -> str:
         return f"LogUniform({short(self.low)}, {short(self.high)})"
-
-
-@dataclass(frozen=True, repr=False)
-class Distribution(Continuous):
-    """A distribution of your own, by two JAX functions of one number that are each other's inverse.
-
-        Distribution(lambda u: 3 * jnp.sqrt(u), lambda x: (x / 3) ** 2, name="triangle")
-
-    Where `inverse_cdf` or its derivative is infinite at 0 or 1, the outermost float32 coordinates
-    are used there instead.
-
-    **Arguments:**
-
-    - `inverse_cdf`: probability -> value, increasing.
-    - `cdf`: value -> probability.
-    - `name`: for people and JSON.
-
-    **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
-    finite inside, or are not each other's inverse.
-    """
-
-    inverse_cdf: Callable[[Array], Array]
-    cdf: Callable[[Array], Array]
-    name: str = "custom"
-    _range: tuple[float, float] = field(default=(0.0, 1.0), init=False, compare=False)
-    _ends: tuple[float, float] = field(default=(-math.inf, math.inf), init=False, compare=False)
-
-    def __post_init__(self) -> None:
-        for role in ("inverse_cdf", "cdf"):
-            function = getattr(self, role)
-            if not callable(function):
-                raise TypeError(f"{role} of a Distribution must be a function; got {function!r}")
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise ValueError(f"name of a Distribution must be a text; got {self.name!r}")
-        with jax.ensure_compile_time_eval():
-            object.__setattr__(self, "_range", self._measured_range())
-            object.__setattr__(self, "_ends", self._measured_ends())
-
-    def _measured_range(self) -> tuple[float, float]:
-        """Check both functions and return the probabilities that the coordinates 0 and 1 mean."""
-        u = np.linspace(0, 1, 129, dtype=np.float32)[1:-1]
-        values = self._sampled("inverse_cdf", self.inverse_cdf, u)
-        for i in range(len(u)):
-            if not np.isfinite(values[i]):
-                raise ValueError(f"inverse_cdf of {self!r} gives {values[i]} at u = {u[i]:.3g}")
-            if i and values[i] <= values[i - 1]:
-                raise ValueError(
-                    f"inverse_cdf of {self!r} must increase; it gives {values[i - 1]:.3g} at "
-                    f"u = {u[i - 1]:.3g} and {values[i]:.3g} at u = {u[i]:.3g}"
-                )
-        back = self._sampled("cdf", self.cdf, values)
-        worst = int(np.argmax(np.nan_to_num(np.abs(back - u), nan=np.inf)))
-        if not abs(back[worst] - u[worst]) <= 1e-3:
-            raise ValueError(
-                f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:.3g}) "
-                f"is {values[worst]:.3g} and cdf({values[worst]:.3g}) is {back[worst]:.3g}"
-            )
-        ends = np.array([0, 1], np.float32)
-        finite = np.isfinite(self._sampled("inverse_cdf", self.inverse_cdf, ends))
-        finite &= np.isfinite(self._sampled("inverse_cdf", jax.grad(self.inverse_cdf), ends))
-        return 0.0 if finite[0] else OUTERMOST, 1.0 if finite[1] else 1 - 2.0**-24
-
-    def _measured_ends(self) -> tuple[float, float]:
-        """Return the values at 0 and 1 in double precision, infinite where there is no end."""
-        with in_precision("float64"):
-            low, high = self._sampled("inverse_cdf", self.inverse_cdf, np.array([0.0, 1.0]))
-        return (
-            float(low) if np.isfinite(low) else -math.inf,
-            float(high) if np.isfinite(high) else math.inf,
-        )
-
-    def _sampled(
-        self, role: str, function: Callable[[Array], Array], points: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, " n"]:
-        try:
-            array = np.asarray(jax.vmap(function)(jnp.asarray(points)))
-        except Exception as error:
-            raise ValueError(
-                f"{role} of {self!r} raised {type(error).__name__} on a number: {error}"
-            ) from error
-        if array.shape != points.shape or array.dtype.kind != "f":
-            raise ValueError(
-                f"{role} of {self!r} must give one real number for one; got {array.dtype} of shape "
-                f"{list(array.shape[1:])}"
-            )
-        return array
-
-    @property
-    def support(self) -> tuple[float, float]:
-        return self._ends
-
-    def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:
-        low, high = self._range
-        return jnp.asarray(self.inverse_cdf(replace_where(_at_least(u, low), u > high, high)))
-
-    def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        return jnp.asarray(self.cdf(value))
-
-    def __repr__(self) -> str:
-        return f"Distribution(name={self.name!r})"
-
-
-def _bounds_text(low: float, high: float) -> str:
-    """Describe the ends of a distribution for a message."""
-    if math.isfinite(low) and math.isfinite(high):
-        return f"lie in [{short(low)}, {short(high)}]"
-    if math.isfinite(low):
-        return f"be finite and at least {short(low)}"
-    return f"be finite and at most {short(high)}" if math.isfinite(high) else "be finite"
-
-
-def _check_numbers(domain: Domain, *names: str) -> None:
-    kind = type(domain).__name__
-    for name in names:
-        given = as_number(getattr(domain, name), f"{name} of a {kind}")
-        if not math.isfinite(given):
-            raise ValueError(f"{name} of a {kind} must be finite; got {given!r}")
-        object.__setattr__(domain, name, given)
-
-
-def _check_scale(domain: Domain, mean: float, std: float) -> None:
-    if std <= 0:
-        hint = f" (a single value is Constant({short(mean)}))" if std == 0 else ""
-        raise ValueError(f"the standard deviation must be positive{hint}; got {domain!r}")
-    if std < LEAST_REAL or abs(mean) + 6 * std > MOST_REAL:
-        raise ValueError(f"its values must fit into float32; got {domain!r}")
-
-
-def _check_ends(domain: Domain, low: float, high: float) -> None:
-    if low == high:
-        raise ValueError(
-            f"an interval of zero width has one value: use Constant({short(low)}); got {domain!r}"
-        )
-    if low > high:
-        raise ValueError(f"low must be below high; got {domain!r}")
-    if max(abs(low), abs(high)) > MOST_REAL or np.float32(low) == np.float32(high):
-        raise ValueError(f"low and high must be different float32 numbers; got {domain!r}")
-
-
-def _at_least(x: Float[Array, ""], least: float) -> Float[Array, ""]:
-    return replace_where(x, x < least, least)

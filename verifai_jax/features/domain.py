@@ -254,6 +254,8 @@ def as_numbers(value: object, name: str) -> Float[np.ndarray, "*shape"]:
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
+            if any(isinstance(each, str | bytes) for each in numbers.ravel()):
+                raise TypeError
             numbers = numbers.astype(np.float64)
     except (TypeError, ValueError):
         numbers = np.asarray("")
@@ -282,6 +284,13 @@ def indexed(name: str, count: int) -> tuple[str, ...]:
 def dotted(name: str, field: str) -> str:
     """Return the full name of a field of the feature called `name`."""
     return f"{name}.{field}" if name else field
+
+
+def nearest(number: float, low: float, high: float) -> str:
+    """Return the end of a message that names the value nearest to a number; empty without one."""
+    if not math.isfinite(number):
+        return ""
+    return f"; the nearest value is {short(np.clip(number, low, high).item())}"
 
 
 def format_choices(choices: Sequence[object]) -> str:

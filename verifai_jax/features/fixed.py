@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from verifai_jax.core.precision import in_precision
 from verifai_jax.features.domain import Domain, Row, as_scalar
 
 
@@ -58,7 +59,10 @@ class Fixed(Domain):
 
     def check(self, value: object, name: str) -> None:
         self.domain.check(value, name)
-        if _row(self.domain, value) != self.row:
+        # A row of a table has the number in the precision of its run.
+        if _row(self.domain, value) != self.row and _row(self.domain, value, single=True) != _row(
+            self.domain, self.value, single=True
+        ):
             raise ValueError(f"{name} is fixed, {self._format()}; got {value!r}")
 
     def columns(self, name: str) -> tuple[str, ...]:
@@ -85,9 +89,12 @@ class Fixed(Domain):
         return f"{self._format()}, fixed in {self.domain!r}"
 
 
-def _row(domain: Domain, value: PyTree) -> tuple[tuple[str, object], ...]:
-    """Return a value as the table shows it, with None for absent items: NaN is not equal to NaN."""
-    with jax.ensure_compile_time_eval():
+def _row(domain: Domain, value: PyTree, single: bool = False) -> tuple[tuple[str, object], ...]:
+    """Return a value as the table shows it, with None for absent items: NaN is not equal to NaN.
+
+    In double precision as it was written, unless a `single` one is wanted.
+    """
+    with jax.ensure_compile_time_eval(), in_precision("float32" if single else "float64"):
         batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], domain.coerce(value))
         columns = domain.to_columns(batch, "")
     entries = ((column, as_scalar(column_entries[0])) for column, column_entries in columns.items())

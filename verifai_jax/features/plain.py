@@ -10,16 +10,20 @@ from typing import Any
 from jaxtyping import PyTree
 
 from verifai_jax.core.errors import unknown_name
+from verifai_jax.core.precision import in_precision
 from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Distribution, LogUniform, Normal, TruncatedNormal
+from verifai_jax.features.custom import Distribution
+from verifai_jax.features.distributions import LogUniform, Normal, TruncatedNormal
 from verifai_jax.features.domain import Domain
+from verifai_jax.features.families import Exponential, LogNormal, Triangular, Weibull
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.reactive import Reactive
 from verifai_jax.features.signal import Signal
+from verifai_jax.features.tabulated import Beta, Empirical, Gamma
 
 FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Box: ("low", "high"),
@@ -27,6 +31,13 @@ FIELDS: dict[type[Domain], tuple[str, ...]] = {
     Normal: ("mean", "std"),
     TruncatedNormal: ("mean", "std", "low", "high"),
     LogUniform: ("low", "high"),
+    LogNormal: ("mean", "std"),
+    Exponential: ("mean",),
+    Weibull: ("shape", "scale"),
+    Gamma: ("shape", "scale"),
+    Beta: ("a", "b", "low", "high"),
+    Triangular: ("low", "mode", "high"),
+    Empirical: ("values", "ranks", "count"),
     Constant: ("value",),
     Signal: ("domain", "knots", "hold", "duration"),
     Array: ("domain", "length"),
@@ -114,7 +125,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
             return Categorical(*data["choices"], weights=data["weights"])
         case "Fixed":
             domain = from_plain(data["domain"], distributions)
-            return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
+            with in_precision("float64"):
+                return Fixed(domain, domain.from_columns(dict(data["row"]), ""))
         case "Distribution":
             if data["name"] not in distributions:
                 raise ValueError(
@@ -131,6 +143,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
         for name in FIELDS[KINDS[kind]]
     }
+    if kind == "Empirical":
+        return Empirical.from_ranks(**arguments)
     if kind == "Box" and "closed" in data:
         arguments["closed"] = data["closed"]
     if kind == "Signal":

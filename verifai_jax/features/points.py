@@ -13,7 +13,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.features.arrays import Array, Items, VariableArray
 from verifai_jax.features.box import Box
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Continuous
+from verifai_jax.features.continuous import Continuous
 from verifai_jax.features.domain import Domain, Numbers, as_numbers, dotted, indexed
 from verifai_jax.features.signal import Signal
 

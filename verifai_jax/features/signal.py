@@ -25,7 +25,7 @@ from verifai_jax.core.waveform import (
     refined_times,
 )
 from verifai_jax.features.box import Box
-from verifai_jax.features.distributions import Continuous
+from verifai_jax.features.continuous import Continuous
 from verifai_jax.features.domain import Domain, Row, as_numbers, indexed, on_device, short
 
 DEFAULT_KNOTS = 16

@@ -10,6 +10,7 @@ space.only("x0", nominal={"alg": "ppo"})                             # a view
 """
 
 import html
+import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,7 @@ from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
-from verifai_jax.features.distributions import Distribution
+from verifai_jax.features.custom import Distribution
 from verifai_jax.features.domain import Domain, Numbers, Row, as_real
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.plain import from_plain, to_plain
@@ -170,7 +171,7 @@ class FeatureSpace:
 
         **Returns:** the point, `[dim]`.
         """
-        return self.root.to_unit(self.root.coerce(self._completed(features)))
+        return self.root.to_unit(self.root.coerce(self.completed(features)))
 
     @cached_property
     def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
@@ -183,8 +184,34 @@ class FeatureSpace:
         return jax.jit(self.flatten)
 
     @cached_property
-    def _points_of(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
+    def points_at(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
+        """`flatten` as a compiled function of features `[n, ...]`, compiled once for each `n`."""
         return jax.jit(jax.vmap(self.flatten))
+
+    @cached_property
+    def width(self) -> int:
+        """Number of real numbers among the features of one simulation."""
+        leaves = jax.tree.leaves(self.feature_form)
+        return sum(math.prod(leaf.shape) for leaf in leaves if _is_real(leaf))
+
+    def unflatten_given(
+        self, u: Float[Array, " dim"], values: Float[Array, " width"]
+    ) -> dict[str, Any]:
+        """Return features with given real numbers, others as `unflatten` gives them. Pure JAX.
+
+        **Arguments:**
+
+        - `u`: the point of the unit cube nearest to the features.
+        - `values`: their real numbers, one after another; where one is NaN, that of the point.
+        """
+        leaves, form = jax.tree.flatten(self.unflatten(u))
+        start = 0
+        for i, leaf in enumerate(leaves):
+            if _is_real(leaf):
+                given = values[start : start + leaf.size].reshape(leaf.shape).astype(leaf.dtype)
+                leaves[i] = jnp.where(jnp.isnan(given), leaf, given)
+                start += leaf.size
+        return jax.tree.unflatten(form, leaves)
 
     @cached_property
     def cube(self) -> Cube:
@@ -207,7 +234,7 @@ class FeatureSpace:
         records = rows.loc[:, list(self.columns)].to_dict("records")
         features = [self.from_row(row) for row in records]
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *features)
-        return np.asarray(self._points_of(stacked))
+        return np.asarray(self.points_at(stacked))
 
     def features_of(
         self, rows: Mapping[str, Numbers], precision: str = "float32"
@@ -240,7 +267,7 @@ class FeatureSpace:
         **Raises:** as `check`.
         """
         self.check(features)
-        return self.root.coerce(self._completed(features))
+        return self.root.coerce(self.completed(features))
 
     def convert(self, features: Mapping[str, Any]) -> dict[str, Any]:
         """Convert features that a person wrote to those that a system sees; pure JAX.
@@ -256,7 +283,7 @@ class FeatureSpace:
         **Raises:** `ValueError` that names the first feature which is unknown, is missing or has
         another shape.
         """
-        complete = self._completed(features)
+        complete = self.completed(features)
         check_names("feature", complete, self.domains)
         missing = [name for name in self.domains if name not in complete]
         if missing:
@@ -278,12 +305,16 @@ class FeatureSpace:
         **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
         its domain, and for features that break the constraint.
         """
-        complete = self._completed(features)
+        complete = self.completed(features)
         self.root.check(complete, "")
         if self.where is not None and not bool(self.accepts(self.root.coerce(complete))):
-            raise ValueError(
-                f"{dict(features)!r} breaks the constraint of this space, {_source(self.where)}"
-            )
+            raise ValueError(f"{dict(features)!r} {self.breaks_constraint}")
+
+    @property
+    def breaks_constraint(self) -> str:
+        """End of a message on features that the constraint refuses."""
+        assert self.where is not None
+        return f"breaks the constraint of this space, {_source(self.where)}"
 
     def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
         """Return whether the constraint holds; True without one. Pure JAX."""
@@ -520,10 +551,11 @@ class FeatureSpace:
             features = self.from_row(features)  # Of pandas, which is no mapping.
         leaves = jax.tree.leaves(features, is_leaf=lambda leaf: isinstance(leaf, list | tuple))
         if not all(isinstance(leaf, jax.Array) for leaf in leaves):
-            self.root.check(self._completed(features), "")
+            self.root.check(self.completed(features), "")
         return self.flatten(features)
 
-    def _completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
+    def completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return features with the constant, fixed ones and events that were left out."""
         if not isinstance(features, Mapping):
             return features
         known = {n: d.value for n, d in self.root.fields if isinstance(d, Constant | Fixed)}
@@ -571,6 +603,10 @@ class FeatureSpace:
         if self.where is not None:
             rows.append(("where", _source(self.where), ""))
         return rows
+
+
+def _is_real(leaf: jax.Array | jax.ShapeDtypeStruct) -> bool:
+    return bool(jnp.issubdtype(leaf.dtype, jnp.floating))
 
 
 def _varied(domain: Domain) -> Domain:

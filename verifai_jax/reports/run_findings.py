@@ -3,10 +3,12 @@
 from collections.abc import Iterable
 
 from verifai_jax.core.errors import UnknownNameError
+from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.confirmation_verdicts import MEANING, NOT_CLAIMED, VERDICTS
 from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.summary import first_message
+from verifai_jax.features.density import tails
 from verifai_jax.plotting.scatter import plot_features
 from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
@@ -105,17 +107,23 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
     features = list(run.table.features)
     # Control points of signals by their time.
     labels = {} if run.problem is None else run.problem.space.labels(run.problem.duration)
+    rare = _improbability(run, failure.row)
     values = [
-        (labels.get(name, name), f"{number(row[name])} {about.units.get(name, '')}".strip())
+        (
+            labels.get(name, name),
+            f"{number(row[name])} {about.units.get(name, '')}".strip(),
+            *([format_percent(rare[name]) if name in rare else ""] if rare else []),
+        )
         for name in features[:MOST_FEATURES]
     ]
+    heads = ["feature", "value", *(["the prior has one as far out in"] if rare else [])]
     verdict = str(row.get("verdict", "") or "not looked at more closely")
     meaning = f", {MEANING[verdict]}" if verdict in MEANING else ""
     content: list[Child] = [
         element("h3", f"Failure {failure.number}: row {failure.row}, {failure.why}"),
         paragraph(f"Robustness {float(row['rho']):.6g}; closer replays: {verdict}{meaning}."),
         *(paragraph(text) for text in (failure.replay.warnings if failure.replay else ())),
-        table(["feature", "value"], values),
+        table(heads, values),
     ]
     if len(features) > MOST_FEATURES:
         content.append(paragraph(f"{len(features) - MOST_FEATURES} further features are left out."))
@@ -137,6 +145,16 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
         content.append(picture(studies.animation, caption, kind="gif"))
     content += [paragraph("To see it again:"), preformatted(replay_command(run, failure.row))]
     return element("div", content, class_="failure", id=f"failure-{failure.number}")
+
+
+def _improbability(run: Run, number: int) -> dict[str, float]:
+    """Return how probable a value as far out is, for each column of a failure that says it."""
+    try:
+        columns = {str(name): [value] for name, value in run.table.row(number).items()}
+        found = tails(run.space, columns)
+    except ValueError:
+        return {}  # The record does not describe the space.
+    return {name: float(tail[0]) for name, tail in found.items() if tail[0] == tail[0]}
 
 
 def reasons(studies: Studies) -> Section | None:

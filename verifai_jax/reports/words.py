@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from verifai_jax.core.text import format_percent, one_line
@@ -17,9 +18,13 @@ from verifai_jax.features.arrays import Array, VariableArray
 from verifai_jax.features.box import Box, DiscreteBox
 from verifai_jax.features.choice import Categorical, Constant
 from verifai_jax.features.compound import Struct
+from verifai_jax.features.continuous import Continuous
+from verifai_jax.features.custom import Distribution
 from verifai_jax.features.distributions import LogUniform, Normal, TruncatedNormal
+from verifai_jax.features.families import Exponential, LogNormal, Triangular, Weibull
 from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.signal import Signal
+from verifai_jax.features.tabulated import Beta, Empirical, Gamma
 from verifai_jax.mtl import Formula
 from verifai_jax.mtl.formula import Atom, Interval, Predicate, surface
 from verifai_jax.mtl.formula import Constant as Truth
@@ -123,6 +128,38 @@ def domain_words(domain: Domain) -> str:
             )
         case LogUniform():
             return f"log-uniform between {number(domain.low)} and {number(domain.high)}"
+        case LogNormal():
+            return (
+                f"log-normal with median {number(math.exp(domain.mean))}, its logarithm with mean "
+                f"{number(domain.mean)} and standard deviation {number(domain.std)}"
+            )
+        case Exponential():
+            return f"exponential with mean {number(domain.mean)}"
+        case Weibull():
+            return f"Weibull with shape {number(domain.shape)} and scale {number(domain.scale)}"
+        case Gamma():
+            return f"gamma with shape {number(domain.shape)} and scale {number(domain.scale)}"
+        case Beta():
+            return (
+                f"beta with a = {number(domain.a)} and b = {number(domain.b)} between "
+                f"{number(domain.low)} and {number(domain.high)}"
+            )
+        case Triangular():
+            return (
+                f"triangular between {number(domain.low)} and {number(domain.high)}, most likely "
+                f"{number(domain.mode)}"
+            )
+        case Empirical():
+            low, high = domain.support
+            return (
+                f"as {domain.count} measured numbers between {number(low)} and {number(high)}, "
+                f"{_quantile_words(domain)}"
+            )
+        case Distribution():
+            return (
+                f"the distribution {domain.name!r} of the user's own, {_quantile_words(domain)}; "
+                f"its quantiles are computed by {domain.source}"
+            )
         case Constant():
             return f"always {number(domain.value)}"
         case Categorical():
@@ -137,6 +174,19 @@ def domain_words(domain: Domain) -> str:
         case VariableArray():
             return f"{domain.least} to {domain.most} items, each {domain_words(domain.domain)}"
     return one_line(repr(domain))
+
+
+def _quantile_words(domain: Continuous) -> str:
+    """Write a distribution by its quantiles, the outermost that are simulated among them."""
+    u = np.array([0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0], np.float32)
+    least, low, first, median, third, high, most = np.asarray(
+        jax.vmap(domain.from_unit)(u[:, None])
+    )
+    return (
+        f"with median {number(median)}, half of it from {number(first)} to {number(third)}, 98 % "
+        f"from {number(low)} to {number(high)}, and no simulated value beyond {number(least)} and "
+        f"{number(most)}"
+    )
 
 
 def _choices(domain: Categorical) -> str:

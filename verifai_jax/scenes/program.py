@@ -154,7 +154,7 @@ class ScenicProgram:
         **Raises:** `ValueError` for features outside the space, and for those where Scenic refuses
         the scene.
         """
-        complete = self.space.root.coerce(self.space._completed(features))
+        complete = self.space.root.coerce(self.space.completed(features))
         self.space.root.check(complete, "")
         here = jax.tree.map(np.asarray, complete)
         try:

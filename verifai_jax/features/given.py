@@ -1,0 +1,267 @@
+"""Features that somebody gives: the one way in for all forms, and rows that carry them exactly.
+
+    features = given_features(space, {"x": 5.0}, "float32")     # checked, stacked [1, ...]
+    rows = given_rows(space, features)                  # [n, dim + width], points and values
+    space.unflatten_given(rows[0, :1], rows[0, 1:])     # {"x": 5.0}, not what the point stands for
+
+A point of the unit cube in float32 cannot address every value, so a given value travels beside its
+point. The point serves searches, which know nothing else; the value is what is simulated.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree
+
+from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.precision import in_precision
+from verifai_jax.features.arrays import Array, VariableArray
+from verifai_jax.features.box import Box
+from verifai_jax.features.compound import Struct
+from verifai_jax.features.continuous import Continuous
+from verifai_jax.features.domain import Domain, as_numbers, dotted
+from verifai_jax.features.signal import Signal
+from verifai_jax.features.space import FeatureSpace
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Rows: TypeAlias = "pd.DataFrame | pd.Series | Iterable[Any] | Mapping[str, Any]"
+"""Features of simulations: the feature columns of a table, a row of one, or dictionaries."""
+
+TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
+"""Columns of a table beside its features, which a dictionary made of a row may hold."""
+
+
+def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") -> dict[str, Any]:
+    """Check features in any form, and convert them to those that a system sees.
+
+    Everything is checked as it was written, in double precision, before it is converted.
+
+    **Arguments:**
+
+    - `space`: of the features.
+    - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
+      several) that hold features by name or by the columns of a table.
+    - `precision`: `"float32"` or `"float64"`, of their real numbers.
+
+    **Returns:** the features, stacked along a leading axis `[n, ...]`.
+
+    **Raises:** `ValueError` that names the first row and feature which is missing, unknown, outside
+    its domain or refused by the constraint; `TypeError` for rows of another form.
+    """
+    if _is_frame(rows):
+        return _of_columns(space, {str(name): rows[name] for name in rows}, precision)  # pyright: ignore[reportIndexIssue, reportCallIssue, reportArgumentType, reportGeneralTypeIssues]
+    listed = _listed(rows)
+    each = []
+    for i, row in enumerate(listed):
+        try:
+            each.append(_of_row(space, row, precision))
+        except ValueError as error:
+            if len(listed) == 1:
+                raise
+            raise ValueError(f"row {i}: {error}") from error
+    if not each:
+        return jax.tree.map(
+            lambda form: np.zeros((0, *form.shape), form.dtype), dict(space.feature_form)
+        )
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *each)
+
+
+def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.ndarray, "n row"]:
+    """Return rows that an engine simulates with exactly these features.
+
+    **Arguments:**
+
+    - `space`: of the features.
+    - `features`: `[n, ...]`, as `given_features` gives them.
+
+    **Returns:** the points of the unit cube nearest to the features, and behind each the real
+    numbers among its features; see `FeatureSpace.unflatten_given`.
+    """
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(features)]
+    count = len(leaves[0])
+    single = jax.tree.map(_single, features)
+    points = np.asarray(space.points_at(single), np.float64).reshape(count, -1)
+    points = np.clip(np.nan_to_num(points, nan=0.5), 0.0, 1.0)
+    values = [leaf.reshape(count, -1) for leaf in leaves if leaf.dtype.kind == "f"]
+    return np.concatenate([points, *values], axis=1, dtype=np.float64)
+
+
+def check_columns(
+    space: FeatureSpace, columns: Mapping[str, Any], *, held: bool = True
+) -> dict[str, Any]:
+    """Check rows of a table `[n]`, and return their features in double precision.
+
+    **Arguments:**
+
+    - `space`: of the features.
+    - `columns`: by name; others than those of features are ignored.
+    - `held`: whether features that the space holds at one value are checked too.
+
+    **Raises:** as `given_features`.
+    """
+    for name in space.columns:
+        if name not in columns:
+            raise unknown_name("column", name, columns)
+    own = {name: np.asarray(columns[name]) for name in space.columns}
+    features = _converted(space, own, "float64")
+    for name, domain in space.domains.items():
+        if held or domain.size:
+            _check_batch(domain, features[name], own, name)
+    return features
+
+
+def _converted(
+    space: FeatureSpace, columns: Mapping[str, np.ndarray], precision: str
+) -> dict[str, Any]:
+    """Return the features of columns, or say which row has none."""
+    try:
+        return space.features_of(columns, precision)
+    except ValueError:
+        count = len(next(iter(columns.values())))
+        for row in range(count if count > 1 else 0):
+            one = {name: entries[row : row + 1] for name, entries in columns.items()}
+            try:
+                space.features_of(one, precision)
+            except ValueError as error:
+                raise ValueError(f"{_at(row, count)}{error}") from error
+        raise
+
+
+def _of_columns(space: FeatureSpace, columns: Mapping[str, Any], precision: str) -> dict[str, Any]:
+    features = check_columns(space, columns)
+    _check_absent(space, columns)
+    if precision != "float64":
+        own = {name: np.asarray(columns[name]) for name in space.columns}
+        features = _converted(space, own, precision)
+    count = len(jax.tree.leaves(features)[0])
+    if space.where is not None and count:
+        with in_precision(precision):
+            accepted = np.asarray(jax.jit(jax.vmap(space.accepts))(features))
+        if not accepted.all():
+            row = int(np.argmin(accepted))
+            raise ValueError(f"{_at(row, count)}it {space.breaks_constraint}")
+    return features
+
+
+def _of_row(space: FeatureSpace, row: object, precision: str) -> dict[str, Any]:
+    """Return the features `[1, ...]` of one row."""
+    by_columns = _is_series(row)
+    if hasattr(row, "_asdict"):
+        row = row._asdict()  # pyright: ignore[reportAttributeAccessIssue]
+    elif by_columns:
+        row = {str(name): row[name] for name in row.keys()}  # noqa: SIM118  # pyright: ignore[reportAttributeAccessIssue, reportIndexIssue]
+    if not isinstance(row, Mapping):
+        raise ValueError(f"features must be a dictionary, or a row of a table; got {row!r}")
+    flat = set(space.columns) - set(space.domains)
+    if by_columns or flat & set(row):
+        if not by_columns:
+            check_names("column", _features_of(row, space.columns), space.columns)
+        return _of_columns(space, {name: [row[name]] for name in row}, precision)
+    written = {name: row[name] for name in _features_of(row, space.domains)}
+    space.check(written)
+    with in_precision(precision):
+        features = space.root.coerce(space.completed(written))
+        return jax.tree.map(lambda leaf: _as(np.asarray(leaf), precision)[None], features)
+
+
+def _features_of(row: Mapping[str, Any], known: Iterable[str]) -> list[str]:
+    """Return the names of a dictionary without those of a table's other columns."""
+    known = set(known)
+    return [
+        name
+        for name in row
+        if name in known or not (name in TABLE_COLUMNS or str(name).startswith("rho."))
+    ]
+
+
+def _check_batch(
+    domain: Domain, values: PyTree, columns: Mapping[str, np.ndarray], name: str
+) -> None:
+    """Check values `[n, ...]` of a feature: its columns, or what `features_of` gives of them."""
+    if isinstance(domain, Box | Continuous):
+        # As it is written: a value is rounded to an end that is near when it is converted.
+        each = [as_numbers(columns[column], column) for column in domain.columns(name)]
+        written = each[0] if np.ndim(values) == 1 else np.stack(each, axis=1)
+        inside = domain.contains(written).reshape(len(written), -1).all(axis=1)
+        if not inside.all():
+            _check_one(domain, written, int(np.argmin(inside)), name)
+    elif isinstance(domain, Signal):
+        for i in range(domain.knots):
+            _check_batch(domain.domain, values.knots[:, i], columns, f"{name}[{i}]")
+    elif isinstance(domain, Struct):
+        for field, inner in domain.fields:
+            _check_batch(inner, values[field], columns, dotted(name, field))
+    elif isinstance(domain, Array):
+        for i in range(domain.length):
+            item = jax.tree.map(lambda leaf, i=i: leaf[:, i], values)
+            _check_batch(domain.domain, item, columns, f"{name}[{i}]")
+    else:
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(values)]
+        known: set[tuple[bytes, ...]] = set()
+        for i in range(len(leaves[0]) if leaves else 0):
+            content = tuple(leaf[i].tobytes() for leaf in leaves)
+            if content not in known:
+                known.add(content)
+                _check_one(domain, values, i, name)
+
+
+def _check_absent(space: FeatureSpace, columns: Mapping[str, Any]) -> None:
+    """Refuse values of items beyond the length of their array: they would be left out unsaid."""
+    for name, domain in space.domains.items():
+        if not (isinstance(domain, VariableArray) and f"{name}.length" in space.columns):
+            continue
+        lengths = np.asarray(columns[f"{name}.length"], np.float64)
+        for i in range(domain.least, domain.most):
+            for column in domain.domain.columns(f"{name}[{i}]"):
+                entries = np.asarray(columns[column], object)
+                present = np.array([entry is not None and entry == entry for entry in entries])
+                if (beyond := present & (lengths <= i)).any():
+                    row = int(np.argmax(beyond))
+                    raise ValueError(
+                        f"{_at(row, len(lengths))}{column} must be empty where {name}.length is "
+                        f"{lengths[row]:g}; got {entries[row]!r}"
+                    )
+
+
+def _check_one(domain: Domain, values: PyTree, row: int, name: str) -> None:
+    count = len(jax.tree.leaves(values)[0])
+    try:
+        domain.check(jax.tree.map(lambda leaf: np.asarray(leaf)[row], values), name)
+    except ValueError as error:
+        raise ValueError(f"{_at(row, count)}{error}") from error
+
+
+def _at(row: int, count: int) -> str:
+    return f"row {row}: " if count > 1 else ""
+
+
+def _is_frame(rows: object) -> bool:
+    return hasattr(rows, "columns") and hasattr(rows, "to_dict")
+
+
+def _is_series(row: object) -> bool:
+    return hasattr(row, "to_dict") and hasattr(row, "index") and not hasattr(row, "columns")
+
+
+def _listed(rows: Rows) -> list[Any]:
+    if isinstance(rows, Mapping) or _is_series(rows) or hasattr(rows, "_asdict"):
+        return [rows]
+    if isinstance(rows, str | bytes) or not isinstance(rows, Iterable):
+        raise TypeError(
+            "features are a DataFrame, a row of one, or dictionaries of names to values (read a "
+            f"file with pandas.read_csv first); got {rows!r}"
+        )
+    return list(rows)
+
+
+def _single(leaf: Any) -> np.ndarray:
+    return _as(np.asarray(leaf), "float32")
+
+
+def _as(leaf: np.ndarray, precision: str) -> np.ndarray:
+    return leaf.astype(precision) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
