@@ -434,6 +434,15 @@ def features_of(value: object) -> Any:
     return np.asarray(value) if isinstance(value, list) else value
 
 
+def _with_gaps(value: object) -> np.ndarray:
+    """Return an array whose masked entries are NaN; NumPy's own conversion drops the mask."""
+    if not isinstance(value, np.ma.MaskedArray) or not np.ma.getmaskarray(value).any():
+        return np.asarray(value)
+    numbers = np.asarray(value.data)
+    numbers = np.where(numbers, 1.0, -1.0) if numbers.dtype == bool else numbers
+    return np.where(np.ma.getmaskarray(value), np.nan, numbers)
+
+
 def encoded(number: int, result: object) -> bytes:
     """Return a result as a frame whose arrays are raw bytes.
 
@@ -457,7 +466,7 @@ def encoded(number: int, result: object) -> bytes:
 
     def place(name: str, value: object) -> dict[str, Any]:
         nonlocal at
-        array = np.asarray(value)
+        array = _with_gaps(value)
         if array.dtype.kind not in "biuf":
             raise TypeError(f"{name} must be an array of numbers; got {array.dtype}")
         # The wire knows these; anything else (float16, unsigned) becomes a double.

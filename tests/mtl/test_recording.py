@@ -82,6 +82,98 @@ def test_bad_data_frames(flight):
         read([1.0])
 
 
+DATES = ["2026-05-01T12:00:00", "2026-05-01T12:00:00.5", "2026-05-01T12:00:01"]
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        DATES,
+        [date + "Z" for date in DATES],
+        [date + "+02:00" for date in DATES],
+        [date.replace("T", " ") for date in DATES],
+        ["12:00:00", "12:00:00.5", "12:00:01"],
+    ],
+)
+def test_dates_in_files_are_seconds_since_the_first(tmp_path, stamps):
+    rows = [f"{stamp},{x}" for stamp, x in zip(stamps, (1, 2, 3), strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,x", *rows]))
+    table = pa.table({"time": stamps, "x": [1.0, 2, 3]})
+    parquet.write_table(table, tmp_path / "text.parquet")
+    parquet.write_table(
+        table.set_column(0, "time", pa.array(pd.to_datetime(DATES, format="ISO8601"))),
+        tmp_path / "date.parquet",
+    )
+    frame = pd.DataFrame({"time": stamps, "x": [1.0, 2, 3]})
+    paths = [tmp_path / name for name in ("log.csv", "text.parquet", "date.parquet")]
+    for source in (*paths, frame):
+        trace = read(source)
+        assert trace.times.tolist() == [0, 0.5, 1]
+        assert robustness("F[0,1] x", trace) == 3
+
+
+def test_durations_days_and_missing_dates(tmp_path):
+    days = pa.table({"time": pd.to_datetime(["2026-05-01", "2026-05-03"]).date, "x": [1.0, 2.0]})
+    parquet.write_table(days, tmp_path / "days.parquet")
+    assert read(tmp_path / "days.parquet").times.tolist() == [0, 172_800]
+    frame = pd.DataFrame({"time": pd.to_timedelta([1, 1.5], unit="s"), "x": [1.0, 2.0]})
+    assert read(frame).times.tolist() == [0, 0.5]
+    (tmp_path / "gap.csv").write_text(f"time,x\n{DATES[0]},1\n,2\n{DATES[2]},3\n")
+    with pytest.raises(ValueError, match="sample times must be finite; row 2 has nan s"):
+        read(tmp_path / "gap.csv")
+
+
+def test_one_text_among_numbers_is_refused_by_its_row(tmp_path):
+    (tmp_path / "log.csv").write_text("time,x,y\n0,1,1\n1,2,\n2,3,off\n3,n/a,1\n")
+    frame = pd.DataFrame({"time": [0, 1], "y": pd.Series([1.0, "off"], dtype=object)})
+    for source, row in ((tmp_path / "log.csv", 3), (frame, 2)):
+        with pytest.raises(ValueError, match=f"column 'y' of .* holds 'off' in row {row}, where"):
+            read(source, columns=["y"])
+    trace = read(tmp_path / "log.csv")
+    assert list(trace.signals) == ["x"]
+    assert "column 'y' holds 'off' in row 3, where other rows hold numbers" in str(trace)
+    with pytest.raises(UnknownNameError, match=r"no signal 'y'.*column 'y' holds 'off' in row 3"):
+        robustness("G y > 0", trace)
+    (tmp_path / "log.csv").write_text("time,x\n0,1\nlater,2\n")
+    with pytest.raises(ValueError, match=r"column 'time' of .* holds 'later' in row 2"):
+        read(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize(
+    "kind", [pa.list_(pa.float32()), pa.list_(pa.float32(), 2), pa.large_list(pa.int64())]
+)
+def test_columns_of_lists_are_vectors(tmp_path, kind):
+    cells = [[1, 2], None, [3, 4]]
+    times = np.array([0, 1, 2], np.float32)
+    parquet.write_table(
+        pa.table({"time": times, "state": pa.array(cells, kind)}), tmp_path / "a.parquet"
+    )
+    wanted = [[1, 2], [np.nan, np.nan], [3, 4]]
+    np.testing.assert_array_equal(read(tmp_path / "a.parquet")["state"], wanted)
+    frame = pd.DataFrame({"time": times, "state": [np.array([1.0, 2]), None, [3.0, 4]]})
+    np.testing.assert_array_equal(read(frame)["state"], wanted)
+
+
+def test_lists_that_make_no_vector_are_told(tmp_path):
+    cells = {"a": [[1.0], [1.0, 2.0]], "b": [[[1.0]], [[2.0]]], "c": [["x"], ["y"]], "x": [1, 2]}
+    parquet.write_table(pa.table({"time": [0, 1], **cells}), tmp_path / "a.parquet")
+    trace = read(tmp_path / "a.parquet")
+    assert list(trace.signals) == ["x"]
+    assert len(trace.notes) == 3
+    with pytest.raises(ValueError, match=r"'a' of .* holds lists of different lengths \(1, 2\)"):
+        read(tmp_path / "a.parquet", columns=["a"])
+    with pytest.raises(ValueError, match=r"no vectors of numbers; in row 1 there is \[1\.0\]"):
+        read(tmp_path / "a.parquet", columns=["b"])
+
+
+def test_decimals_and_categories_are_numbers(tmp_path):
+    table = pa.table({"time": [0, 1], "x": pa.array([1, 2], pa.decimal128(5, 2))})
+    parquet.write_table(table, tmp_path / "a.parquet")
+    assert read(tmp_path / "a.parquet")["x"].tolist() == [1, 2]
+    frame = pd.DataFrame({"time": [0, 1], "x": pd.Categorical([3, 4])})
+    assert read(frame)["x"].tolist() == [3, 4]
+
+
 def test_resampling():
     trace = Trace({"x": np.array([0.0, 1.0, 3.0])}, times=np.array([1.0, 1.1, 1.4]))
     held = resample(trace, 0.1, "hold")

@@ -13,6 +13,7 @@ from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_stream import monitor_stream
 from verifai_jax.core.errors import UnknownNameError, missing_name, nearest_names
+from verifai_jax.core.text import printable
 
 if TYPE_CHECKING:
     from verifai_jax.core.trace import Trace
@@ -95,6 +96,9 @@ def monitor(
                 raise CommandError(str(error), BROKEN) from None
             raise
         click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:.10g}")
+        for note in trace.notes:
+            if any(repr(name) in note for name in parsed.signals()):
+                click.echo(f"note: {printable(note)}")
         if explain or plot is not None:
             why = mtl.explain(parsed, trace, end=end)
             if explain:

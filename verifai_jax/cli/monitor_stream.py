@@ -1,6 +1,7 @@
 """`tail -f log.csv | verifai-jax monitor FORMULA -`: a formula on samples as they come in."""
 
 import csv
+import datetime
 import functools
 import math
 from collections.abc import Iterable, Iterator
@@ -10,6 +11,7 @@ import click
 
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.core.errors import missing_name
+from verifai_jax.core.text import format_time
 
 if TYPE_CHECKING:
     from verifai_jax.mtl import Formula
@@ -35,7 +37,7 @@ def monitor_stream(
     **Arguments:**
 
     - `lines`: of CSV; the first has the names.
-    - `time`: the column of sample times in seconds.
+    - `time`: the column of sample times in seconds, or of dates (ISO 8601).
     - `dt`: the sampling period in seconds, instead of a column of times.
     - `show`: what prints a line.
 
@@ -52,11 +54,12 @@ def monitor_stream(
         count, begin = 0, None
         for count, sample in enumerate(samples, 1):
             begin = sample.time if begin is None else begin
-            now = (count - 1) * period if begin is None or sample.time is None else sample.time
-            if begin is not None and abs(now - begin - (count - 1) * period) > EVEN * period:
+            due = (count - 1) * period + (begin or 0.0)
+            now = due if sample.time is None else sample.time
+            if not abs(now - due) <= EVEN * period + math.ulp(now):
                 raise ValueError(
-                    f"line {sample.line} of {SOURCE} is at {now:g} s, where "
-                    f"{begin + (count - 1) * period:g} s is due: samples of a stream are evenly "
+                    f"line {sample.line} of {SOURCE} is at {format_time(now)} s, where "
+                    f"{format_time(due)} s is due: samples of a stream are evenly "
                     "spaced; if its times are rounded, give the period, --dt SECONDS; otherwise "
                     "record it, and use --resample"
                 )
@@ -67,7 +70,7 @@ def monitor_stream(
                 verdict = f"holds, with robustness at least {low:.10g}"
                 if most < 0:
                     verdict = f"fails, with robustness at most {high:.10g}"
-                show(f"whatever follows {now:.10g} s, it {verdict}")
+                show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
                 return least > 0
         rho, holds = (float(value) for value in finish(state))
     show(
@@ -103,6 +106,8 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
     """Return the samples and their period, which is the first step where it is not given."""
     import itertools
 
+    from verifai_jax.mtl.setting import plain_period
+
     if dt is not None:
         return samples, dt
     first = list(itertools.islice(samples, 2))
@@ -116,10 +121,11 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
     assert after is not None
     if not 0 < after - before < math.inf:
         raise ValueError(
-            f"sample times must increase; line {first[0].line} of {SOURCE} has {before:g} s and "
-            f"line {first[1].line} {after:g} s"
+            f"sample times must increase; line {first[0].line} of {SOURCE} has "
+            f"{format_time(before)} s and line {first[1].line} {format_time(after)} s"
         )
-    return itertools.chain(first, samples), after - before
+    # Stamps of a clock that began long ago are rounded, and their difference is off by as much.
+    return itertools.chain(first, samples), plain_period(after - before, math.ulp(after))
 
 
 def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iterator[Sample]:
@@ -137,6 +143,7 @@ def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iter
         )
     columns = _columns(names, formula)
     rows = csv.reader(lines, delimiter=separator)
+    first: list[datetime.datetime] = []
     for row in rows:
         if not row:
             continue
@@ -150,7 +157,26 @@ def _samples(lines: Iterable[str], formula: "Formula", time: str | None) -> Iter
             name: [number(part) for part in parts] if isinstance(parts, list) else number(parts)
             for name, parts in columns.items()
         }
-        yield Sample(line, None if time is None else number(time), signals)
+        stamp = None
+        if time is not None:
+            stamp = _seconds_since(first, row[names.index(time)])
+            stamp = number(time) if stamp is None else stamp
+        yield Sample(line, stamp, signals)
+
+
+def _seconds_since(first: list[datetime.datetime], cell: str) -> float | None:
+    """Return the seconds since the first date of the stream; None for a cell that is no date."""
+    from verifai_jax.mtl.columns import moment_of
+
+    text = cell.strip()
+    if not {"-", ":"} & set(text[1:]):
+        return None  # A number; the sign of one may be its first character.
+    try:
+        first.append(moment_of(text))
+        moment = first.pop() if len(first) > 1 else first[0]
+        return (moment - first[0]).total_seconds()
+    except (ValueError, TypeError):
+        return None
 
 
 def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]:
@@ -183,5 +209,5 @@ def _refuse_nan(sample: Sample, now: float) -> None:
     for name, value in sample.signals.items():
         values = value if isinstance(value, list) else [value]
         if any(math.isnan(v) for v in values):
-            message = f"no verdict: signal {name!r} is NaN at {now:g} s"
+            message = f"no verdict: signal {name!r} is NaN at {format_time(now)} s"
             raise CommandError(message, BROKEN)

@@ -21,6 +21,16 @@ def format_percent(share: float) -> str:
     return f"{percent:.3g} %"
 
 
+def format_time(seconds: float, digits: int = 6) -> str:
+    """Write an instant in seconds so that it can be told from its neighbours: `1700000003.5`.
+
+    A few digits suffice up to 1000 s; of later instants the microseconds are kept.
+    """
+    if abs(seconds) < 1000 or not math.isfinite(seconds):
+        return f"{seconds:.{digits}g}"
+    return repr(round(float(seconds), 6)).removesuffix(".0")
+
+
 MOST_ENTRIES = 4
 """Numbers of one feature that are written one by one; of more, their range."""
 

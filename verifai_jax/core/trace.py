@@ -11,7 +11,7 @@ A trace is a pytree, so `jax.vmap` over a system gives a batch of traces.
 import enum
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
@@ -21,7 +21,9 @@ from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
+from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import late
+from verifai_jax.core.text import format_time
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,13 +64,23 @@ class Trace:
       one, which saves the monitor a pass over the signals.
     - `finite`: names of signals that the producer vouches for: they are finite where the status
       is OK, which saves another.
+    - `between`: samples that were recorded after each sample and before the next one, the same
+      number for each: a trace of signals `[time * m]` or `[time * m, k]`, with sample times.
+      `mtl.resample` keeps there what its clock passes over, and verdicts count it.
+    - `notes`: what the producer says of this simulation or recording, with how often it happened,
+      `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
+      They are for the host: JAX's transformations drop them.
+
+    A signal with masked or missing samples (`numpy.ma`, `None`, `pandas.NA`) has gaps there: they
+    become NaN, and no verdict counts what lies under a mask.
 
     Whatever is known when the trace is made is checked then; what JAX traces shows in the status
     of its row (`ERROR`).
 
     **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, a clock
     that is missing, given twice, not positive or not finite, `valid` below 1 or beyond the samples,
-    or a status that is none; `TypeError` for complex signals.
+    or a status that is none, and for masked sample times; `TypeError` for signals that hold no
+    real numbers.
     """
 
     signals: Mapping[str, Samples]
@@ -78,12 +90,16 @@ class Trace:
     status: Int[Array | np.ndarray, "*batch"] | np.integer | int | None = None
     held: bool = False
     finite: tuple[str, ...] = ()
+    between: "Trace | None" = None
+    notes: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.signals:
             raise ValueError("a trace needs at least one signal; got none")
+        signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
+        object.__setattr__(self, "signals", signals)
         lengths = {}
-        for name, signal in self.signals.items():
+        for name, signal in signals.items():
             shape = _shape(name, signal)
             if len(shape) not in (1, 2):
                 raise ValueError(
@@ -105,10 +121,19 @@ class Trace:
             )
         if self.dt is not None:
             check_period(self.dt)
+        if isinstance(self.times, np.ma.MaskedArray):
+            object.__setattr__(self, "times", known_times(self.times))
         if self.times is not None and np.shape(self.times) != (length,):
             raise ValueError(
                 f"times must have shape [{length}], like the signals; "
                 f"got {list(np.shape(self.times))}"
+            )
+        if self.between is not None and (
+            self.between.signals.keys() != signals.keys() or self.between.length % length
+        ):
+            raise ValueError(
+                f"between must hold the signals {', '.join(signals)}, a multiple of {length} "
+                f"samples; got {self.between!r}"
             )
         self._check_codes(length)
 
@@ -152,12 +177,16 @@ class Trace:
         """Number of samples stored (valid or not)."""
         return np.shape(next(iter(self.signals.values())))[0]
 
-    def clock(self) -> Real[Array, " time"]:
-        """Return the sample times `[time]` in seconds."""
-        if self.times is not None:
-            return jnp.asarray(self.times)
-        assert self.dt is not None
-        return jnp.arange(self.length) * self.dt
+    def clock(self) -> Real[Array | np.ndarray, " time"]:
+        """Return the sample times `[time]` in seconds, in double precision where they are known.
+
+        Single precision does not tell apart the stamps of a clock that started long ago.
+        """
+        if self.dt is not None:
+            return np.arange(self.length) * float(self.dt)
+        if isinstance(self.times, Tracer):
+            return self.times
+        return np.asarray(self.times, float)
 
     def hold(self) -> "Trace":
         """Return the trace with every sample from `valid` on set to the last valid one."""
@@ -165,17 +194,65 @@ class Trace:
             return self
         index = jnp.minimum(jnp.arange(self.length), jnp.asarray(self.valid) - 1)
         signals = {name: as_array(signal)[index] for name, signal in self.signals.items()}
-        return replace(self, signals=signals, held=True)
+        return replace(self, signals=signals, held=True, between=self.between_until(self.valid))
+
+    def between_until(self, valid: Leaf) -> "Trace | None":
+        """Return what lies between the samples, from the last valid one on held there."""
+        if self.between is None or valid is None:
+            return self.between
+        last, more = jnp.asarray(valid) - 1, self.between.length // self.length
+        before = jnp.arange(self.between.length) // more < last
+        held = {}
+        for name, signal in self.between.signals.items():
+            each = as_array(signal)
+            known = before.reshape((-1,) + (1,) * (each.ndim - 1))
+            held[name] = jnp.where(known, each, as_array(self.signals[name])[last])
+        return replace(self.between, signals=held)
 
     def trim(self) -> "Trace":
         """Return the valid part only, as NumPy arrays; for people and plots, not under `jit`."""
         n = self.length if self.valid is None else int(self.valid)
-        return replace(
-            self,
-            signals={name: np.asarray(signal)[:n] for name, signal in self.signals.items()},
-            times=None if self.times is None else np.asarray(self.times)[:n],
-            valid=None,
-        )
+        between = self.between_until(self.valid)
+        if between is not None:
+            between = between._first(n * (between.length // self.length))
+        return replace(self._first(n), valid=None, between=between)
+
+    def _first(self, n: int) -> "Trace":
+        """Return the first samples as NumPy arrays."""
+        signals = {name: np.asarray(signal)[:n] for name, signal in self.signals.items()}
+        times = None if self.times is None else np.asarray(self.times)[:n]
+        return replace(self, signals=signals, times=times, between=None, valid=None)
+
+    def finely(self) -> "Trace":
+        """Return all samples in one sequence, those between the others among them.
+
+        Where nothing lies between, it is the trace itself. Its clock is not even: `between` may
+        repeat a sample so that there are equally many after each.
+        """
+        between = self.between
+        if between is None:
+            return self
+        more = between.length // self.length
+
+        def joined(own: Any, inner: Any) -> Array:
+            own, inner = as_array(own), as_array(inner)
+            inner = inner.reshape((self.length, more, *inner.shape[1:])).astype(own.dtype)
+            both = jnp.concatenate([own[:, None], inner], axis=1)
+            return both.reshape((-1, *own.shape[1:]))
+
+        signals = {n: joined(signal, between.signals[n]) for n, signal in self.signals.items()}
+        times = None
+        if _is_known(between.times):
+            rows = np.asarray(between.times, float).reshape(self.length, more)
+            times = np.concatenate([self.clock()[:, None], rows], axis=1).reshape(-1)
+        dt = self.dt if times is None else None
+        valid = None if self.valid is None else (jnp.asarray(self.valid) - 1) * (more + 1) + 1
+        return replace(self, signals=signals, dt=dt, times=times, valid=valid, between=None)
+
+    @property
+    def stride(self) -> int:
+        """Number of samples of `finely` that stand for one of this trace."""
+        return 1 if self.between is None else 1 + self.between.length // self.length
 
     def __getitem__(self, name: str) -> Samples:
         return self.signals[name]
@@ -187,6 +264,7 @@ class Trace:
         width = max(map(len, self.signals))
         lines = [f"trace of {self._span()}"]
         lines += [f"  {n:<{width}}  {_range(s, self.valid)}" for n, s in self.signals.items()]
+        lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
 
     def _span(self) -> str:
@@ -196,8 +274,10 @@ class Trace:
             text = f"{count} every {self.dt:g} s"
         else:
             known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
-            ends = f" from {self.times[0]:.4g} s to {self.times[-1]:.4g} s" if known else ""  # pyright: ignore[reportOptionalSubscript]
-            text = f"{count}{ends}"
+            text = count
+            if known:
+                first, last = (format_time(self.clock()[i]) for i in (0, -1))
+                text += f" from {first} s to {last} s"
         for name in ("valid", "status"):
             code = getattr(self, name)
             if code is None or np.shape(code) or not _is_known(code):
@@ -229,7 +309,7 @@ def without_wrapping(signal: Samples) -> Samples:
     """
     if isinstance(signal, jax.Array | jax.ShapeDtypeStruct):
         return signal
-    numbers = np.asarray(signal)
+    numbers = np.asarray(with_gaps("", signal))
     wide = numbers.dtype.kind in "iu" and numbers.dtype.itemsize > 4
     return numbers.astype(jnp.result_type(float)) if wide else numbers
 
@@ -282,7 +362,7 @@ def _range(signal: Samples, valid: Leaf) -> str:
     return f"{text}{f'{low:.4g}' if low == high else f'{low:.4g} to {high:.4g}'}{some}"
 
 
-_CHILDREN = ("times", "valid", "status")
+_CHILDREN = ("times", "valid", "status", "between")
 
 
 def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], Any]:
@@ -299,7 +379,7 @@ def _unflatten(static: Any, children: Any) -> Trace:
     names, dt, held, finite = static
     values = tuple(children)
     fields = {"signals": dict(zip(names, values, strict=False))}
-    fields |= {"dt": dt, "held": held, "finite": finite}
+    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

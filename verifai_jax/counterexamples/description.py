@@ -1,9 +1,11 @@
 """An explanation in words that somebody who knows the robot, and not the logic, can read."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from verifai_jax.core.text import format_time
 from verifai_jax.counterexamples.influence import Influence, Span
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl._explain import heading
@@ -69,7 +71,7 @@ def describe(
 
 def describe_verdict(name: str, row: int, why: Explanation) -> str:
     """Write which predicate decides, when, by how much, and through which sub-formulas."""
-    at = f"{why.time:.4g} s"
+    at = f"{format_time(why.time, 4)} s"
     formula = str(why.formula)
     first = f"Row {row} of {name} breaks  {formula}  with robustness {why.robustness:.4g}"
     predicate = why.predicate
@@ -102,9 +104,11 @@ def describe_predicate(predicate: Predicate, why: Explanation, at: str) -> str:
 def value_at(expression: Term, why: Explanation) -> float:
     """Return the value of an expression at the instant that decides."""
     formula: Formula = Atom(expression)
-    signal = np.asarray(robustness_signal(formula, why.trace))
-    clock = np.asarray(why.trace.clock())
-    return float(signal[int(np.argmin(np.abs(clock - why.time)))])
+    trace = why.trace.finely()
+    place = int(np.argmin(np.abs(trace.clock() - why.time)))
+    # Only the value is wanted, so that the clock may be any.
+    signal = robustness_signal(formula, replace(trace, dt=1.0, times=None))
+    return float(np.asarray(signal)[place])
 
 
 def describe_reversals(matter: Sequence[Influence], rho: float) -> list[str]:

@@ -32,6 +32,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import chunks_and_lanes
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
 from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block
@@ -105,12 +106,13 @@ class ExecutorEngine:
         self.padded = lanes
         self._seconds: float | None = None  # Of a row, once one is known.
         self._notes: dict[str, None] = {}
+        self._remarks = Remarks()
         self._recalling: HostEngine | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Decisions of the workers' engines that a user may not expect, and other processors."""
-        return tuple(self._notes)
+        return (*self._notes, *self._remarks.texts)
 
     @property
     def block(self) -> int:
@@ -212,6 +214,8 @@ class ExecutorEngine:
                 f"processor here ({here}): their last digits may differ from those of a run here"
             ] = None
         self._notes.update(dict.fromkeys(result["notes"]))
+        if "remarks" in result:
+            self._remarks.join(result["remarks"])
         if self._journal is not None and result["seconds"] > WORTH_KEEPING * count:
             for i in range(count):
                 marks = None if verdicts.marks is None else verdicts.marks[i]

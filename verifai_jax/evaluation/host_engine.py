@@ -24,6 +24,7 @@ from verifai_jax.core.precision import in_precision
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
+from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.steering import NOTHING, Steering
 from verifai_jax.evaluation.verdicts import (
     RowVerdict,
@@ -124,8 +125,13 @@ class HostEngine:
         self.monitor = HostMonitor(problem, steering) if monitor is None else monitor
         self.compile_seconds = 0.0
         self.simulation_seconds = 0.0
-        self.notes: tuple[str, ...] = ()
+        self.remarks = Remarks()
         self._prepare = jax.jit(self._prepared)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes of the simulations so far, with their counts."""
+        return self.remarks.texts
 
     def begin_compiling(self) -> None:
         """Do nothing, as `compile`."""
@@ -208,6 +214,7 @@ class HostEngine:
         count = len(rows.messages)
         try:
             trace = _checked(self.system.simulate_batch(features, keys), count)
+            self.remarks.add(trace.notes, count)
             if _is_plain(trace):
                 rows.rho[:], rows.status[:], rows.holds[:], marks, rows.steering[:] = self.monitor(
                     trace, count, features
@@ -253,6 +260,8 @@ class HostEngine:
         try:
             for place, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
                 self.simulation_seconds = time.perf_counter() - started
+                said = outcome.trace.notes if isinstance(outcome.trace, Trace) else {}
+                self.remarks.add(said)
                 waiting.add(todo[place], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.
@@ -434,4 +443,14 @@ def pad_trace(trace: Trace) -> Trace:
     index = np.minimum(np.arange(length), valid - 1)
     signals = {name: np.asarray(signal)[index] for name, signal in trace.signals.items()}
     status = int(Status.OK if trace.status is None else trace.status)
-    return Trace(signals, trace.dt, valid=valid, status=status, held=True)
+    between = trace.between_until(valid)
+    if between is not None:
+        between = _longer(between, length * (between.length // trace.length))
+    return Trace(signals, trace.dt, valid=valid, status=status, held=True, between=between)
+
+
+def _longer(between: Trace, length: int) -> Trace:
+    """Return what lies between samples, its last repeated to a length."""
+    index = np.minimum(np.arange(length), between.length - 1)
+    signals = {name: np.asarray(signal)[index] for name, signal in between.signals.items()}
+    return Trace(signals, times=np.asarray(between.times)[index])

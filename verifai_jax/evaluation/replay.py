@@ -158,7 +158,7 @@ def replay(
             status=Status(int(status)),
             key=key,
             # Of the whole trace: what an early end leaves of it is shorter.
-            duration=float(np.asarray(read.clock())[-1]) or None,
+            duration=float(read.clock()[-1] - read.clock()[0]) or None,
         )
 
 

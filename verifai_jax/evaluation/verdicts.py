@@ -161,9 +161,9 @@ def trace_verdict(
             for formula in problem.formulas.values()
         ]
     )
-    finite = jnp.array(True)
+    finite, every = jnp.array(True), trace.finely()
     for name in problem.monitored:
-        signal = jnp.asarray(trace.signals[name])
+        signal = jnp.asarray(every.signals[name])
         if name not in trace.finite and jnp.issubdtype(signal.dtype, jnp.inexact):
             finite &= jnp.all(jnp.isfinite(signal))
     status = jnp.asarray(Status.OK if trace.status is None else trace.status, jnp.int32)

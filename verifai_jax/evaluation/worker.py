@@ -23,6 +23,7 @@ from verifai_jax.core.programs import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.evaluation.inputs import CubePoints
+from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.steering import Steering
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -91,21 +92,25 @@ def evaluate_block(
     - `temperature`: of the smooth robustness, one for all or one each.
 
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
-    `seconds` without compilation; the `processor`; the engine's `notes`.
+    `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the
+    simulations.
     """
     problem = shipment.thing
     if mode.backend is not None:
         problem = problem.on_backend(mode.backend)
     with _computing:
         if problem.black_box:
-            verdicts, seconds, notes = _on_host(problem, mode, key, first, u)
+            notes: tuple[str, ...] = ()
+            verdicts, seconds, remarks = _on_host(problem, mode, key, first, u)
         else:
+            remarks = Remarks()
             verdicts, seconds, notes = _compiled(problem, mode, key, first, u, temperature)
     result: dict[str, Any] = {
         name: value for name in ARRAYS if (value := getattr(verdicts, name)) is not None
     }
     result["leaves"] = [np.asarray(leaf) for leaf in jax.tree.leaves(verdicts.features)]
     result |= {"messages": verdicts.messages, "seconds": seconds, "notes": notes}
+    result["remarks"] = remarks.to_data()
     return result | {"processor": describe_processor()}
 
 
@@ -115,7 +120,7 @@ def _on_host(
     key: UInt32[np.ndarray, "2"],
     first: int,
     u: Float[np.ndarray, "n d"],
-) -> tuple[Verdicts, float, tuple[str, ...]]:
+) -> tuple[Verdicts, float, Remarks]:
     engine = problem.programs.get(
         HOST_ENGINES,
         mode,
@@ -123,9 +128,9 @@ def _on_host(
             problem, mode.precision, least=mode.least, steering=mode.steering, given=mode.given
         ),
     )
-    started = time.perf_counter()
+    started, engine.remarks = time.perf_counter(), Remarks()
     verdicts = engine.evaluate(u, as_key(key), first)
-    return verdicts, time.perf_counter() - started, engine.notes
+    return verdicts, time.perf_counter() - started, engine.remarks
 
 
 def _compiled(

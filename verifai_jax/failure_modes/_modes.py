@@ -24,6 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.text import format_time
 from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.selection import problem_of
 from verifai_jax.estimation._estimate import one_thread
@@ -335,7 +336,7 @@ def _cause(numbers: _Numbers, features: dict[str, Any], key: Any) -> tuple[float
         why = replayed.explain()
     except ValueError:
         return rho, ""
-    at = f"{why.time:.4g} s"
+    at = f"{format_time(why.time, 4)} s"
     predicate = why.predicate
     if isinstance(predicate, Predicate):
         return rho, describe_predicate(predicate, why, at)

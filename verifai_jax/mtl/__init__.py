@@ -32,7 +32,7 @@ from verifai_jax.mtl.operators import until as until
 from verifai_jax.mtl.plot import draw as draw
 from verifai_jax.mtl.recording import TimeColumnError as TimeColumnError
 from verifai_jax.mtl.recording import read as read
-from verifai_jax.mtl.recording import resample as resample
+from verifai_jax.mtl.resampling import resample as resample
 from verifai_jax.mtl.rewriting import nnf as nnf
 from verifai_jax.mtl.rewriting import simplify as simplify
 from verifai_jax.mtl.semantics import Semantics as Semantics

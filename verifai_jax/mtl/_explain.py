@@ -18,13 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.text import format_time
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import satisfied
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.formula import Formula, surface
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import Setting, prepare, seconds
+from verifai_jax.mtl.setting import Setting, evaluator_of, prepare
 
 
 @dataclass(frozen=True)
@@ -107,23 +108,25 @@ class Explanation:
     def __str__(self) -> str:
         lines = [
             f"{'Holds' if self.holds else 'Fails'} with robustness {self.robustness:.4g}, decided "
-            f"by  {self.predicate}  at {self.time:g} s",
+            f"by  {self.predicate}  at {format_time(self.time)} s",
             "",
         ]
         listed: set[int] = set()
-        for depth, node in self.tree.flat():
+        flat = self.tree.flat()
+        instants = [node.time for _, node in flat] + [i.time for i in self.critical]
+        width = max(8, *(len(format_time(instant)) for instant in instants))
+        for depth, node in flat:
             mark = "*" if node.decides else " "
             name = str(node.formula) if not node.children else heading(node.formula)
             if node.children and id(node) in listed:
                 name += "  (as above)"
             listed.add(id(node))
-            lines.append(
-                f"{mark} {node.robustness:>10.4g} at {node.time:<8.6g} {'  ' * depth}{name}"
-            )
+            at = format_time(node.time)
+            lines.append(f"{mark} {node.robustness:>10.4g} at {at:<{width}} {'  ' * depth}{name}")
         lines += ["", "Most critical instants:"]
         lines += [
-            f"  {i.share:>6.1%} at {i.time:<8.6g} {i.robustness:>10.4g}  {i.predicate}"
-            for i in self.critical
+            f"  {i.share:>6.1%} at {at:<{width}} {i.robustness:>10.4g}  {i.predicate}"
+            for i, at in zip(self.critical, map(format_time, instants[len(flat) :]), strict=True)
         ]
         return "\n".join(lines)
 
@@ -162,7 +165,7 @@ def explain(
     series = dict(
         zip(_distinct(formula), map(np.asarray, _all_values(setting, signals)), strict=True)
     )
-    walk = _Walk(Evaluator(signals, setting.length, setting.dt, end=end), series, trace)
+    walk = _Walk(evaluator_of(setting, signals, None, None, 0), series, trace)
     tree = walk.node(formula, 0, True)
     leaves: dict[Formula, np.ndarray] = {
         f: series[f] for f in series if isinstance(f, ast.Predicate | ast.Atom)
@@ -184,7 +187,7 @@ def _distinct(formula: Formula) -> tuple[Formula, ...]:
 @functools.partial(jax.jit, static_argnums=0)
 def _all_values(setting: Setting, signals: dict[str, Array]) -> list[Array]:
     """Compute every sub-formula, each to where it settles and at least to the last sample."""
-    e = Evaluator(signals, setting.length, setting.dt, end=setting.end)
+    e = evaluator_of(setting, signals, None, None, 0)
     values = []
     for f in _distinct(setting.formula):
         value = e.value(f, 0, max(e.settles(f), setting.length - 1))
@@ -208,6 +211,7 @@ def _influence(
             "smooth",
             jnp.asarray(tau, dtype),
             setting.end,
+            stride=setting.stride,
             nudges=dict(zip(leaves, nudges, strict=True)),
         )
         return e.value(setting.formula, 0, 0)[0]
@@ -223,7 +227,7 @@ class _Walk:
     ) -> None:
         self.evaluator = evaluator
         self.series = series
-        self.clock = seconds(trace)
+        self.clock = trace.finely().clock()
         self.last = evaluator.length - 1
         self._nodes: dict[tuple[Formula, int, bool], Node] = {}
 
@@ -251,9 +255,8 @@ class _Walk:
                 self.node(part, j, decides and k == deciding)
                 for k, (part, j) in enumerate(operands)
             )
-        return Node(
-            f, self.time(i), self.at(f, i), decides, children, self.series[f][: self.last + 1]
-        )
+        series = self.series[f][: self.last + 1 : self.evaluator.stride]
+        return Node(f, self.time(i), self.at(f, i), decides, children, series)
 
     def operands(self, f: Formula, i: int) -> list[tuple[Formula, int]]:
         """Return the operands at the instants that matter for `f` at `i`; none if vacuous."""
@@ -263,9 +266,11 @@ class _Walk:
             case ast.And(parts) | ast.Or(parts):
                 return [(p, i) for p in parts]
             case ast.Next(p):
-                return [(p, i + 1 if self.evaluator.end != "truncate" else min(i + 1, self.last))]
+                later = i + self.evaluator.stride
+                return [(p, later if self.evaluator.end != "truncate" else min(later, self.last))]
             case ast.Prev(p):
-                return [(p, i - 1)] if i > 0 else []
+                earlier = i - self.evaluator.stride
+                return [(p, earlier)] if earlier >= 0 else []
             case ast.Always(p, span) | ast.Eventually(p, span):
                 return self.best(p, self.ahead(span, i, p), isinstance(f, ast.Always))
             case ast.Historically(p, span) | ast.Once(p, span):

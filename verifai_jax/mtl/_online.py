@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from verifai_jax.core.errors import missing_name
+from verifai_jax.core.gaps import with_gaps
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator, samples
@@ -67,7 +68,8 @@ class Online:
         for name in self.formula.signals():
             if name not in sample:
                 raise missing_name("the sample", "signal", name, sample)
-        return _step(self, state, {name: sample[name] for name in self.formula.signals()})
+        own = {name: with_gaps(name, sample[name]) for name in self.formula.signals()}
+        return _step(self, state, own)
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the least and greatest robustness at time 0 that further samples allow."""

@@ -18,6 +18,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
+from verifai_jax.core.text import format_time
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import windows
 from verifai_jax.mtl._smoothing_error import error_of_setting
@@ -25,7 +26,7 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.lanes import in_chunks, on_lanes
 from verifai_jax.mtl.semantics import Semantics, boolean, hard
-from verifai_jax.mtl.setting import Setting, as_formula, evaluator_of, prepare, seconds
+from verifai_jax.mtl.setting import Setting, as_formula, evaluator_of, prepare
 
 
 def robustness(
@@ -68,9 +69,13 @@ def robustness_signal(
     end: End = "hold",
     compat: str | None = None,
 ) -> Float[Array, " time"]:
-    """Compute the robustness at every sample of the trace; see `robustness`. Reverse mode only."""
+    """Compute the robustness at every sample of the trace; see `robustness`. Reverse mode only.
+
+    NaN, no verdict, where `end` leaves none: under `"strict"` at samples from which the formula
+    looks beyond the end, and under `"truncate"` and `"strict"` behind the last valid sample.
+    """
     setting, signals, tau, valid = prepare(formula, trace, semantics, end, compat)
-    return _everywhere_compiled(setting, signals, tau, valid)
+    return _everywhere_compiled(setting, signals, tau, valid)[:: setting.stride]
 
 
 def satisfied(
@@ -93,12 +98,13 @@ def satisfied(
 
 
 def _first_nan(formula: Formula, trace: Trace) -> str:
-    clock = seconds(trace)
+    trace = trace.trim().finely()
+    clock = np.asarray(trace.clock())
     for name in formula.signals():
         signal = np.asarray(trace.signals[name])
         bad = np.isnan(signal.reshape(signal.shape[0], -1)).any(axis=1)
         if bad.any():
-            return f"signal {name!r} is NaN at {clock[int(np.argmax(bad))]:g} s"
+            return f"signal {name!r} is NaN at {format_time(clock[int(np.argmax(bad))])} s"
     return f"the value of {formula} is NaN"
 
 
@@ -125,13 +131,21 @@ def _values(
         if shift:
             assert tau is not None
             value = value + tau * shift
-    if setting.end == "strict" and valid is not None:
-        short = (valid - 1) * setting.dt < setting.formula.horizon(setting.dt) - 1e-9 * setting.dt
-        value = jnp.where(short, jnp.nan, value)
+    value = jnp.where(_open(setting, valid, value), jnp.nan, value)
     shape = jnp.broadcast_shapes(
         value.shape[1:], *(s.shape[1 : 1 + lanes] for s in signals.values())
     )
     return jnp.broadcast_to(value, (last + 1, *shape))
+
+
+def _open(setting: Setting, valid: Array | None, value: Array) -> Any:
+    """Return at which instants `end` leaves no verdict; False where it leaves one at all."""
+    if setting.end == "hold" or (valid is None and setting.end == "truncate"):
+        return False
+    count = setting.length if valid is None else valid
+    left = count - 1 - np.arange(len(value)).reshape((-1,) + (1,) * (value.ndim - 1))
+    reach = setting.formula.horizon(setting.dt) if setting.end == "strict" else 0.0
+    return left * (setting.dt / setting.stride) < reach - 1e-9 * setting.dt
 
 
 class _Root:

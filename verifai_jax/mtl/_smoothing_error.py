@@ -110,7 +110,7 @@ def _slack(e: Evaluator, f: Formula, first: int, last: int) -> _Slack:
             kind = "min" if isinstance(f, ast.Historically) else "max"
             return _past(e, operand, kind, *e.span(interval), first, last)
         case ast.Next(operand) | ast.Prev(operand):
-            step = 1 if isinstance(f, ast.Next) else -1
+            step = e.stride if isinstance(f, ast.Next) else -e.stride
             return _slack(e, operand, max(0, first + step), max(0, last + step))
         case ast.Until(left, right, interval):
             a, b = e.span(interval)

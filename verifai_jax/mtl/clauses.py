@@ -55,6 +55,8 @@ class Goals:
         The scale is the standard deviation along the trace, with a share of the size of what the
         predicate compares, for signals that are constant; it is not differentiated.
         """
+        # A search is guided by the samples of the clock; verdicts count all.
+        trace = replace(trace, between=None)
         if not self.leaves:
             return trace  # Constants alone.
         signals = {}

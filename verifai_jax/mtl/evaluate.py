@@ -50,7 +50,8 @@ class Evaluator:
 
     `kind` is the semantics' kind, `tau` its temperature (smooth only), `valid` the number of
     samples that count, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane
-    axes; `open_right` makes windows half-open, as in `compat="pymtl"`.
+    axes; `open_right` makes windows half-open, as in `compat="pymtl"`. `stride` samples stand for
+    one period `dt` (`Trace.finely`), so that windows, next and previous are as many times longer.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -62,6 +63,7 @@ class Evaluator:
     valid: Array | None = None
     open_right: bool = False
     lanes: int = 0
+    stride: int = 1
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
@@ -77,8 +79,8 @@ class Evaluator:
 
     def span(self, interval: Interval) -> tuple[int, float]:
         """Return the first and last sample of an interval, relative to now."""
-        a = samples(interval.start, self.dt, interval)
-        b = samples(interval.end, self.dt, interval)
+        a = samples(interval.start, self.dt, interval) * self.stride
+        b = samples(interval.end, self.dt, interval) * self.stride
         if self.open_right and b > a:
             b -= 1
         return int(a), b
@@ -101,9 +103,9 @@ class Evaluator:
             case ast.Always(_, interval) | ast.Eventually(_, interval):
                 return max(0, below[0] - self.span(interval)[0])
             case ast.Next():
-                return max(0, below[0] - 1)
+                return max(0, below[0] - self.stride)
             case ast.Prev():
-                return below[0] + 1
+                return below[0] + self.stride
             case ast.Historically(_, interval) | ast.Once(_, interval) | ast.Since(_, _, interval):
                 a, b = self.span(interval)
                 return max(below) + int(a if math.isinf(b) else b)
@@ -140,7 +142,7 @@ class Evaluator:
                 return self._past(operand, -1, *self.span(interval), first, last)
             case ast.Prev(operand, weak):
                 sign = -1 if weak else 1
-                return self._past(operand, sign, 1, 1, first, last)
+                return self._past(operand, sign, self.stride, self.stride, first, last)
             case ast.Until(left, right, interval):
                 return self._until(left, right, *self.span(interval), first, last)
             case ast.Since(left, right, interval):
@@ -301,7 +303,7 @@ class Evaluator:
 
     def _next(self, f: Formula, first: int, last: int) -> Array:
         end = self._last if not self._hold else self.settles(f)
-        x = self.value(f, min(first + 1, end), min(last + 1, end))
+        x = self.value(f, min(first + self.stride, end), min(last + self.stride, end))
         if x.shape[0] < last - first + 1:
             # Repeats the last value, so that next stays its own dual.
             x = jnp.concatenate(
@@ -310,7 +312,7 @@ class Evaluator:
         if self._hold or self.valid is None:
             return x
         index = self._index(first, x)
-        return jnp.where(index < self.valid - 1, x, self.value(f, first, last))
+        return jnp.where(index < self.valid - self.stride, x, self.value(f, first, last))
 
     def _index(self, first: int, x: Array) -> Array:
         return (first + jnp.arange(x.shape[0])).reshape((-1,) + (1,) * (x.ndim - 1))

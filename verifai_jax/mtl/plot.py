@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from verifai_jax.core.figure import Axes, Figure, new_figure
+from verifai_jax.core.text import format_time
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._explain import Explanation, Node, heading
 from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import prepare, seconds
+from verifai_jax.mtl.setting import prepare
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
 _MOST_ROWS = 14
@@ -51,7 +52,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     verdict = "holds" if explanation.holds else "fails"
     decided = (
         f"{verdict} with robustness {explanation.robustness:.4g}: decided by  "
-        f"{explanation.predicate}  at {explanation.time:g} s"
+        f"{explanation.predicate}  at {format_time(explanation.time)} s"
     )
     above, below = 1 - 0.15 / size[1], 1 - (head - 0.5) / size[1]
     color = HOLDS if explanation.holds else FAILS
@@ -60,7 +61,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     figure.text(
         0.02, 0.14 / size[1], "green: holds   red: fails   dashed: bound", fontsize=9, color=QUIET
     )
-    clock = seconds(explanation.trace)
+    clock = np.asarray(explanation.trace.clock())
     marks = []
     axes = []
     for k, (depth, node) in enumerate(rows):
@@ -144,7 +145,7 @@ def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> 
     figure.text(
         0.91,
         middle,
-        f"{value}\nat {node.time:.4g} s",
+        f"{value}\nat {format_time(node.time, 4)} s",
         va="center",
         fontsize=9,
         weight=weight,
@@ -203,7 +204,7 @@ def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarr
 
     def side(e: Term) -> np.ndarray:
         values = np.asarray(evaluator.expression(e, 0, last), float)
-        return np.broadcast_to(values, (last + 1,))
+        return np.broadcast_to(values, (last + 1,))[:: setting.stride]
 
     edges = _edges(clock)
     for first, after, good in _runs(node.series >= 0):
@@ -218,9 +219,9 @@ def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarr
         case ast.Predicate(_, left, right):
             main, bound = side(left), side(right)
         case ast.Atom(e):
-            main, bound = side(e), np.zeros(last + 1)
+            main, bound = side(e), np.zeros(len(clock))
         case _:  # TRUE and FALSE have nothing to plot.
-            main = bound = np.zeros(last + 1)
+            main = bound = np.zeros(len(clock))
     style: dict[str, Any] = {"color": PATH if node.decides else QUIET, "drawstyle": "default"}
     axis.plot(clock, main, lw=1.7, **style)
     axis.plot(clock, bound, lw=1.2, ls=(0, (4, 2)), **style)

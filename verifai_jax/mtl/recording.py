@@ -4,27 +4,21 @@ read("flight.csv")                                        # a column `time`
 read(frame, dt=0.02)                                      # a pandas.DataFrame
 read("flight.parquet", dt=0.02)                           # rows 0.02 s apart
 read("flight.csv", resample_to=0.1, method="linear")
-resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from verifai_jax.core.errors import missing_name
-from verifai_jax.core.trace import Trace, check_period
-from verifai_jax.mtl.setting import seconds
+from verifai_jax.core.trace import Trace
+from verifai_jax.mtl.columns import is_numeric, numbers_of, seconds_of
+from verifai_jax.mtl.resampling import Method, check_increasing, resample
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Method = Literal["hold", "linear"]
-
-MOST_SAMPLES = 100_000_000
-"""Samples that a resampled trace may have."""
 
 
 class TimeColumnError(ValueError):
@@ -41,51 +35,6 @@ class TimeColumnError(ValueError):
         )
 
 
-def resample(trace: Trace, dt: float, method: Method) -> Trace:
-    """Resample signals on an even clock, from the first sample time to the last.
-
-    **Arguments:**
-
-    - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
-    - `dt`: the new sampling period in seconds.
-    - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
-
-    **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
-    samples, an unknown method, or sample times that do not increase or are not finite.
-    """
-    if method not in ("hold", "linear"):
-        raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
-    check_period(dt)
-    trace = trace.trim()
-    times = seconds(trace)
-    _check_increasing(times)
-    with np.errstate(over="ignore"):
-        steps = np.floor((times[-1] - times[0]) / dt * (1 + 1e-9) + 1e-9)
-    if not steps < MOST_SAMPLES:
-        raise ValueError(
-            f"resampling {times[-1] - times[0]:g} s every {dt:g} s makes {steps + 1:.3g} samples, "
-            f"more than {MOST_SAMPLES}: take a longer period"
-        )
-    count = int(steps) + 1
-    clock = times[0] + dt * np.arange(count)
-    # A sample due at `t` counts from `t` on, whatever the last digit of the clock says.
-    index = np.searchsorted(times, clock + 1e-6 * dt, side="right") - 1
-    following = np.minimum(index + 1, len(times) - 1)
-    gap = times[following] - times[index]
-    share = np.clip(np.where(gap > 0, (clock - times[index]) / np.where(gap > 0, gap, 1), 0), 0, 1)
-    signals = {}
-    for name, values in trace.signals.items():
-        values = np.asarray(values)
-        here, there = values[index], values[following]
-        if method == "linear" and values.dtype != bool:
-            weight = share.reshape((-1,) + (1,) * (values.ndim - 1))
-            # Not a weighted sum, which would spread the NaN of a neighbour with no weight.
-            signals[name] = np.where(weight == 0, here, here + weight * (there - here))
-        else:
-            signals[name] = here
-    return replace(trace, signals=signals, dt=float(dt), times=None)
-
-
 def read(
     source: "str | Path | pd.DataFrame",
     *,
@@ -97,23 +46,24 @@ def read(
 ) -> Trace:
     """Read a trace from a CSV or Parquet file or a data frame, a column a signal, a row a sample.
 
-    Columns `p[0]`, `p[1]`, ... make one vector signal `p`. Columns that hold no numbers are left
-    out, unless named in `columns`. In a CSV file commas, semicolons or tabs separate the columns,
+    Columns `p[0]`, `p[1]`, ... make one vector signal `p`, and so does a column of lists of one
+    length. Columns that hold no numbers are left out, with a note, unless named in `columns`. An
+    empty cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns,
     whichever the first line has; numbers may have a decimal comma, if all of them do.
 
     **Arguments:**
 
     - `source`: the path of a `.csv` (first line: names) or `.parquet` file, or a
       `pandas.DataFrame`, whose index is read as a column if it has a name.
-    - `time`: the column of sample times in seconds; of a data frame also dates or durations, which
-      become seconds since the first.
+    - `time`: the column of sample times in seconds, or of dates (ISO 8601 where they are text) or
+      durations, which become seconds since the first.
     - `dt`: the sampling period, instead of a column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
 
     **Raises:** `FileNotFoundError`; `ValueError` for another kind of file, no rows, a column that
-    does not exist or holds no numbers, times that do not increase, or `resample_to` without
-    `method`.
+    does not exist or holds no numbers, a text among numbers, times that do not increase, or
+    `resample_to` without `method`.
     """
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
@@ -123,36 +73,23 @@ def read(
             raise FileNotFoundError(f"there is no recording {path}")
         name, table = str(path), _file_columns(path)
     else:
-        name, table = "the data frame", _frame_columns(source, time)
+        name, table = "the data frame", _frame_columns(source)
     if time not in table and dt is None:
         raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
     times = table.pop(time, None)
-    signals = _signals(name, table, columns)
+    signals, notes = _signals(name, table, columns)
     if dt is not None:
-        trace = Trace(signals, dt=dt)
+        trace = Trace(signals, dt=dt, notes=notes)
     else:
-        times = _numbers(name, time, times)
-        _check_increasing(times)
-        trace = Trace(signals, times=times)
+        stamps = seconds_of(name, time, times)
+        check_increasing(stamps)
+        trace = Trace(signals, times=stamps, notes=notes)
     if resample_to is not None and method is not None:
         return resample(trace, resample_to, method)
     return trace
 
 
-def _check_increasing(times: np.ndarray) -> None:
-    if not np.all(np.isfinite(times)):
-        k = int(np.argmin(np.isfinite(times)))
-        raise ValueError(f"sample times must be finite; row {k + 1} has {times[k]:g} s")
-    steps = np.diff(times)
-    if not np.all(steps > 0):
-        k = int(np.argmin(np.where(np.isnan(steps), -np.inf, steps)))
-        raise ValueError(
-            f"sample times must increase; row {k + 1} has {times[k]:g} s and row {k + 2} "
-            f"{times[k + 1]:g} s"
-        )
-
-
-def _frame_columns(frame: "pd.DataFrame", time: str) -> dict[str, Any]:
+def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
     """Return the columns of a data frame by name, as Arrow arrays."""
     import pandas as pd
     import pyarrow
@@ -170,13 +107,19 @@ def _frame_columns(frame: "pd.DataFrame", time: str) -> dict[str, Any]:
     table = {}
     for position, name in enumerate(names):
         column = frame.iloc[:, position]
-        if name == time and pd.api.types.is_datetime64_any_dtype(column):
-            column = column - column.iloc[0]
-        if name == time and pd.api.types.is_timedelta64_dtype(column):
-            column = column.dt.total_seconds()
-        plain = pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column)
-        table[name] = pyarrow.array(column if plain else column.astype(str), from_pandas=True)
+        if column.dtype == object:
+            column = list(column)  # Cells may be lists, or numbers with None among them.
+        try:
+            table[name] = pyarrow.array(column, from_pandas=True)
+        except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, pyarrow.ArrowNotImplementedError):
+            texts = [None if _is_missing(cell) else str(cell) for cell in column]
+            table[name] = pyarrow.array(texts, pyarrow.string())
     return table
+
+
+def _is_missing(cell: object) -> bool:
+    gap = isinstance(cell, float) and cell != cell
+    return cell is None or gap or type(cell).__name__ in ("NAType", "NaTType")
 
 
 def _refuse_repeated(source: str, names: Sequence[str]) -> None:
@@ -224,7 +167,7 @@ def _read_csv(path: Path) -> Any:
         path, parse_options=parsed, convert_options=csv.ConvertOptions(decimal_point=",")
     )
     for (name, before), after in zip(named, again.columns, strict=True):
-        if _numeric(before) and not _numeric(after):
+        if is_numeric(before) and not is_numeric(after):
             raise ValueError(
                 f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
                 f"{name!r}: write all numbers in one way"
@@ -243,45 +186,34 @@ def _decimal_commas(column: Any) -> bool:
     return bool(compute.all(fits, skip_nulls=True).as_py())  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _numeric(column: Any) -> bool:
-    from pyarrow import types
-
-    kind = column.type
-    return types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)
-
-
-def _numbers(source: str, name: str, column: Any) -> np.ndarray:
-    if not _numeric(column):
-        raise ValueError(
-            f"column {name!r} of {source} holds no numbers; it starts with {column[0].as_py()!r}"
-        )
-    chunked = hasattr(column, "chunks")
-    values = column.to_numpy() if chunked else column.to_numpy(zero_copy_only=False)
-    # A column of truth values with gaps comes as objects, in which None is a gap.
-    return values.astype(float) if values.dtype == object else values
-
-
 def _signals(
     source: str, table: dict[str, Any], columns: Sequence[str] | None
-) -> dict[str, np.ndarray]:
-    if columns is None:
-        table = {name: column for name, column in table.items() if _numeric(column)}
-        if not table:
-            raise ValueError(f"{source} has no column of numbers")
-    vectors = vector_columns(table)
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Return the signals by name, and notes on the columns that are left out."""
+    notes: dict[str, int] = {}
+    values: dict[str, np.ndarray] = {}
+    for name, column in table.items():
+        try:
+            values[name] = numbers_of(source, name, column)
+        except ValueError as error:
+            if columns is not None and name in columns:
+                raise
+            notes[f"{str(error).replace(f' of {source}', '', 1)}: it is left out"] = 1
+    if columns is None and not values:
+        raise ValueError(f"{source} has no column of numbers")
+    vectors = vector_columns([name for name in values if values[name].ndim == 1])
     in_vectors = {name for parts in vectors.values() for name in parts}
-    scalars = [name for name in table if name not in in_vectors]
+    scalars = [name for name in values if name not in in_vectors]
     wanted = [*scalars, *vectors] if columns is None else list(columns)
     signals = {}
     for name in wanted:
         if name in vectors:
-            parts = [_numbers(source, part, table[part]) for part in vectors[name]]
-            signals[name] = np.stack(parts, axis=1)
-        elif name in table:
-            signals[name] = _numbers(source, name, table[name])
+            signals[name] = np.stack([values[part] for part in vectors[name]], axis=1)
+        elif name in values:
+            signals[name] = values[name]
         else:
             raise missing_name(source, "column", name, [*scalars, *vectors])
-    return signals
+    return signals, notes
 
 
 def vector_columns(names: Collection[str]) -> dict[str, list[str]]:

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from verifai_jax.core.errors import missing_name
+from verifai_jax.core.text import format_time
 from verifai_jax.core.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
@@ -43,7 +44,11 @@ class SamplingError(ValueError):
 
 
 class Setting(NamedTuple):
-    """Everything static about one evaluation."""
+    """Everything static about one evaluation.
+
+    `length` counts samples, of which `stride` stand for one period `dt`: more than one where
+    something was recorded between the samples.
+    """
 
     formula: Formula
     length: int
@@ -53,6 +58,7 @@ class Setting(NamedTuple):
     bound: str
     end: End
     compat: str | None
+    stride: int = 1
 
 
 def as_formula(formula: Formula | str) -> Formula:
@@ -76,25 +82,31 @@ def prepare(
         raise TypeError(f"semantics is hard, boolean or smooth(tau); got {semantics!r}")
     for name in formula.signals():
         if name not in trace.signals:
-            raise missing_name("the trace", "signal", name, trace.signals)
-    dt = period(trace)
+            raise _missing_signal(name, trace)
+    dt, stride = period(trace), trace.stride
     if end == "strict":
         _check_horizon(formula, trace, dt)
-    valid = None
-    if trace.valid is not None:
-        if end == "hold":
-            trace = trace.hold()
-        else:
-            valid = jnp.asarray(trace.valid)
+    if trace.valid is not None and end == "hold":
+        trace = trace.hold()
+    trace = trace.finely()
+    valid = None if trace.valid is None or end == "hold" else jnp.asarray(trace.valid)
     signals = _numbers({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
-        formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat
-    )
+        formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
+        stride,
+    )  # fmt: skip
     tau = None
     if semantics.kind == "smooth" and semantics.error is None:
         dtype = next(iter(signals.values())).dtype if signals else jnp.result_type(float)
         tau = jax.lax.stop_gradient(jnp.asarray(semantics.tau, dtype))
     return setting, signals, tau, valid
+
+
+def _missing_signal(name: str, trace: Trace) -> Exception:
+    """Return the error for a signal that a trace lacks, with what its recording says of it."""
+    error = missing_name("the trace", "signal", name, trace.signals)
+    said = [note for note in trace.notes if note.startswith(f"column {name!r} ")]
+    return type(error)(f"{error}; {said[0]}") if said else error
 
 
 def _numbers(signals: dict[str, Samples]) -> dict[str, Array]:
@@ -119,37 +131,83 @@ def period(trace: Trace) -> float:
         raise ValueError(
             "the sample times of a trace must be known before compiling; give it a period dt"
         )
-    times = np.asarray(trace.times, float)
-    if not np.all(np.isfinite(times)):
-        k = int(np.argmin(np.isfinite(times)))
+    times = np.asarray(trace.times)
+    elapsed, resolution = since_first(times)
+    if not np.all(np.isfinite(elapsed)):
+        k = int(np.argmin(np.isfinite(elapsed)))
         raise ValueError(f"sample times must be finite; sample {k} is at {times[k]:g} s")
-    if len(times) == 1:
+    if len(elapsed) == 1:
         return 1.0
-    steps = np.diff(times)
-    dt = (times[-1] - times[0]) / (len(times) - 1)
+    steps = np.diff(elapsed)
+    dt = elapsed[-1] / (len(elapsed) - 1)
     if not np.all(steps > 0):
         k = int(np.argmin(steps))
+        single = np.asarray(trace.times).dtype.itemsize < 8 and steps[k] == 0
         raise ValueError(
-            f"sample times must increase; got {times[k]:g} s and then {times[k + 1]:g} s"
+            f"sample times must increase; got {_at(trace, k)} and then {_at(trace, k + 1)}"
+            f"{_too_coarse(trace, resolution) if single else ''}"
         )
-    # float32 times carry an error that grows with their size, not with the step.
-    slack = 1e-3 * dt + 4 * np.finfo(np.float32).eps * np.abs(times).max()
-    if np.any(np.abs(steps - dt) > slack):
+    if resolution > 0.1 * dt:
+        raise ValueError(
+            f"the sample times do not tell a period of {dt:g} s{_too_coarse(trace, resolution)}"
+        )
+    if np.any(np.abs(steps - dt) > EVEN * dt + resolution):
         k = int(np.argmax(np.abs(steps - dt)))
         raise SamplingError(
             f"the trace is not evenly sampled: steps of {steps.min():g} s to {steps.max():g} s, "
-            f"as at {times[k]:g} s",
+            f"as at {_at(trace, k)}",
             float(np.median(steps)),
         )
     check_period(dt)
-    return float(f"{dt:.9g}")
+    return plain_period(dt, resolution / (len(elapsed) - 1))
 
 
-def seconds(trace: Trace) -> Float[np.ndarray, " time"]:
-    """Return the sample times in double precision, whatever JAX computes in."""
-    if trace.dt is not None:
-        return np.arange(trace.length) * float(trace.dt)
-    return np.asarray(trace.times, float)
+EVEN = 1e-3
+"""Share of the period by which a step may differ: clocks of loggers and of simulators round."""
+
+
+def since_first(times: Real[np.ndarray, " time"]) -> tuple[Float[np.ndarray, " time"], float]:
+    """Return the seconds since the first sample time, and what the stamps can tell apart.
+
+    The origin is subtracted before anything is rounded. Stamps in single precision, as a JAX clock
+    gives them, are no better than that.
+    """
+    if times.dtype.kind in "iu":
+        # Integers are exact, whatever their width and their origin.
+        return np.array([int(t) - int(times[0]) for t in times], float), 0.0
+    stamps = times if times.dtype.kind == "f" else times.astype(float)
+    finite = stamps[np.isfinite(stamps)]
+    resolution = float(np.spacing(np.abs(finite).max())) if len(finite) else 0.0
+    stamps = stamps.astype(float)
+    return stamps - stamps[0], resolution
+
+
+def plain_period(dt: float, error: float) -> float:
+    """Return the period, or the rate, with the fewest digits that may be meant by `dt`.
+
+    Stamps are rounded, and so 0.1 s comes as 0.09999 s, and a thirtieth as 0.033333334 s.
+
+    **Arguments:**
+
+    - `error`: seconds by which `dt` may be off.
+    """
+    error = max(error, 1e-9 * dt)
+    for digits in range(1, 10):
+        for meant in (float(f"{dt:.{digits}g}"), 1 / float(f"{1 / dt:.{digits}g}")):
+            if abs(meant - dt) <= error:
+                return meant
+    return dt
+
+
+def _too_coarse(trace: Trace, resolution: float) -> str:
+    return (
+        f": at {_at(trace, -1)} they are {np.asarray(trace.times).dtype} numbers, which lie "
+        f"{resolution:.3g} s apart; give them in double precision, or in seconds since the first"
+    )
+
+
+def _at(trace: Trace, k: int) -> str:
+    return f"{format_time(float(np.asarray(trace.clock())[k]))} s"
 
 
 def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
@@ -180,4 +238,5 @@ def evaluator_of(
         valid,
         setting.compat == "pymtl",
         lanes,
+        stride=setting.stride,
     )

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.core.text import shorten
+from verifai_jax.core.text import format_time, shorten
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.evaluation.replay import Replay
@@ -27,7 +27,6 @@ from verifai_jax.mtl.expression import (
     expression,
 )
 from verifai_jax.mtl.formula import Atom, Predicate
-from verifai_jax.mtl.setting import seconds
 from verifai_jax.plotting.style import BOUND, FAILING, INPUT, SAFE, new_figure, show_or_save, tidy
 
 MOST_PANELS = 6
@@ -81,7 +80,7 @@ def plot_replay(
     needed = len(monitored) + min(len(inputs), MOST_INPUTS)
     shown = list(signals or ordered[: max(MOST_PANELS, needed)])
     name = replay.worst
-    clock = seconds(trace)
+    clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
     to_blame = _predicates_to_blame(replay)
 
@@ -134,7 +133,7 @@ def plot_replay(
 
 def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     """Return the features that are functions of time, at the samples of the trace."""
-    clock = seconds(replay.trace)
+    clock = np.asarray(replay.trace.clock())
     waveforms = {}
     leaves = jax.tree_util.tree_flatten_with_path(replay.features, is_leaf=is_waveform)[0]
     for keys, value in leaves:
@@ -171,7 +170,7 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     named = why.predicate.signals()
     if not named:
         return None
-    clock = seconds(trace)
+    clock = np.asarray(trace.clock())
     return named[0], int(np.argmin(np.abs(clock - why.time)))
 
 
@@ -282,7 +281,7 @@ def _draw_limits(
         if np.min(np.abs(course)) > 4 * reach and np.ptp(finite) > 0:
             continue
         if constant is None:
-            axes.plot(seconds(trace), np.asarray(course), **style)
+            axes.plot(trace.clock(), np.asarray(course), **style)
         else:
             axes.axhline(constant, **style)
 
@@ -340,7 +339,7 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]]) -> None:
 
 
 def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
-    time = float(seconds(trace)[sample])
+    time = float(trace.clock()[sample])
     value = np.asarray(trace.signals[signal])[sample]
     if np.ndim(value):
         value = value[int(np.argmax(np.abs(value)))]
@@ -348,7 +347,7 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
     right = sample > trace.length / 2
     low, high = axes.get_ylim()
     axes.annotate(
-        f"{signal} = {value:.4g} at {time:.4g} s",
+        f"{signal} = {value:.4g} at {format_time(time, 4)} s",
         (time, value),
         textcoords="offset points",
         xytext=(-12 if right else 12, -12 if value > (low + high) / 2 else 8),

@@ -16,7 +16,7 @@ from verifai_jax.core.errors import check_names
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import Formula, parse, robustness
 from verifai_jax.mtl.formula import Interval
-from verifai_jax.mtl.recording import resample
+from verifai_jax.mtl.resampling import resample
 from verifai_jax.mtl.rewriting import rebuild
 
 SIGNALS = ("return",)

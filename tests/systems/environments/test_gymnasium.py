@@ -304,7 +304,7 @@ def test_parts_that_do_not_fit_together(policy, options, match):
 
 
 def test_an_action_of_the_wrong_shape():
-    with pytest.raises(ValueError, match=r"an action of Pendulum-v1, shape \[1\]; got \[2\]"):
+    with pytest.raises(ValueError, match=r"action of Pendulum-v1; got .* of shape \[2\], where"):
         gymnasium("Pendulum-v1", lambda o: np.ones(2), steps=5)({}, 0)
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import Features, FunctionSystem, Outcome, Seed, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
@@ -305,7 +306,7 @@ class VectorisedBlackBox(System):
                     f"got {list(np.shape(value))}"
                 )
             whole[name] = np.broadcast_to(np.asarray(value), shape)
-        signals = {name: np.asarray(signal) for name, signal in trace.signals.items()}
+        signals = {n: np.asarray(with_gaps(n, signal)) for n, signal in trace.signals.items()}
         trace = stack_traces(signals, trace.dt, held=trace.held, finite=trace.finite, **whole)
         # Its signals and clock alone: a wrong `valid` or status is an error of its own row.
         times = None if trace.times is None else trace.times[0]
@@ -390,6 +391,7 @@ def stack_traces(
 
     **Raises:** as `Trace` does for the first of them.
     """
+    signals = {name: with_gaps(name, signal) for name, signal in signals.items()}
     first = None if times is None else np.asarray(times)[0]
     Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
     # A Trace is checked as one; unflattening is how JAX makes a batch of them.

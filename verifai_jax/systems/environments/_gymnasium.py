@@ -20,6 +20,7 @@ import numpy as np
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import require, suggests_options, unknown_name
+from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform, set_durations
@@ -33,6 +34,17 @@ from verifai_jax.systems.environments.episode import (
     policy_that_sees,
     read_signals,
     sampling_period,
+)
+from verifai_jax.systems.environments.spaces import (
+    Fitted,
+    Misfit,
+    check_observation,
+    check_space,
+    describe,
+    fit,
+    kind_of,
+    named_numbers,
+    no_action,
 )
 
 Env: TypeAlias = Any
@@ -66,6 +78,7 @@ class EpisodeFunction:
     dt: float | None
     observation_delay: Delay = NO_DELAY
     action_delay: Delay = NO_DELAY
+    clip: bool = True
 
     def __post_init__(self) -> None:
         self._env: Any = None
@@ -92,21 +105,23 @@ class EpisodeFunction:
         if callable(getattr(self.policy, "reset", None)):
             self.policy.reset()
         changes = any(is_waveform(features[name]) for name in self.features)
-        reward, over, rows = 0.0, False, []
+        reward, over, rows, overshoots = 0.0, False, [], 0
         wait, lag = (self._delay(d, features) for d in (self.observation_delay, self.action_delay))
-        observations, actions = [], [_no_action(env.action_space)] * lag
+        observations, actions = [], [Fitted(no_action(env.action_space), False)] * lag
         for k in range(self.steps + 1):
             # Copied: an environment may write its next observation into the same array.
             observations.append(copy.deepcopy(observation) if wait else observation)
             observed = observations[max(0, k - wait)]
             actions.append(self._act(env, observed, features, k * dt))
-            action = actions[k]
+            action = actions[k].action
             rows.append(self._sample(env, observation, action, reward, features))
             if over or k == self.steps:
                 break
             if changes:
                 self._set(features, k * dt)
+            overshoots += actions[k].outside
             observation, reward, terminated, truncated, _ = env.step(action)
+            self._check_observation(env, observation)
             over = bool(terminated or truncated)
         signals = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         finite = all(bool(np.all(np.isfinite(signal))) for signal in signals.values())
@@ -117,6 +132,7 @@ class EpisodeFunction:
             valid=len(rows),
             status=int(Status.OK if finite else Status.NONFINITE),
             held=True,
+            notes={self._overshoot(env): overshoots} if overshoots else {},
         )
 
     def check(self, features: Mapping[str, Any]) -> None:
@@ -140,6 +156,8 @@ class EpisodeFunction:
             if not hasattr(env, attribute):
                 known = [name for name in vars(env) if not name.startswith("_")]
                 raise unknown_name(f"attribute of {self.name}", attribute, known)
+        delayed = self.action_delay.most > 0
+        check_space(getattr(self.environment, "action_space", None), self.name, delayed)
         # Also refuses entries that the observation does not have.
         _ = self.known_signals
 
@@ -149,11 +167,12 @@ class EpisodeFunction:
 
         **Raises:** `UnknownNameError`, `ValueError` for entries that the observation does not have.
         """
-        draw = getattr(self.environment.observation_space, "sample", None)
-        if callable(self.signals) or not callable(draw):
+        env = self.environment
+        draws: list[Any] = [getattr(env, f"{n}_space", None) for n in ("observation", "action")]
+        if callable(self.signals) or not all(hasattr(space, "sample") for space in draws):
             return None
-        moment = Moment(self.environment, _arrays(draw()), np.zeros(()), np.array(False))
-        return tuple(read_signals(self.signals, moment, np.zeros(()), {}, {}, self.name))
+        observation, action = (space.sample() for space in draws)
+        return tuple(self._sample(env, observation, action, 0.0, {}))
 
     @property
     def environment(self) -> Any:
@@ -199,13 +218,34 @@ class EpisodeFunction:
         started = env.reset(seed=seed) if self.reset is None else self.reset(env, features, seed)
         if isinstance(started, tuple) and len(started) == 2 and isinstance(started[1], dict):
             started = started[0]
-        shape = getattr(env.observation_space, "shape", None)
-        if started is None or (shape is not None and np.shape(started) != shape):
+        space = getattr(env, "observation_space", None)
+        try:
+            if started is None:
+                raise Misfit("got None")
+            check_observation(space, started)
+        except Misfit as misfit:
             raise TypeError(
-                f"reset must return the first observation of {self.name}, "
-                f"{env.observation_space}; got {started!r}"
-            )
+                f"reset must return the first observation of {self.name}, {describe(space)}; "
+                f"{misfit}"
+            ) from None
         return started
+
+    def _check_observation(self, env: Env, observation: object) -> None:
+        space = getattr(env, "observation_space", None)
+        try:
+            check_observation(space, observation)
+        except Misfit as misfit:
+            raise ValueError(
+                f"step must return an observation of {self.name}, {describe(space)}; {misfit}"
+            ) from None
+
+    def _overshoot(self, env: Env) -> str:
+        """Say that actions lay outside their space, and what became of them."""
+        became = "was clipped to it, as in training" if self.clip else "was passed on (clip=False)"
+        return (
+            f"the policy's action lay outside the action space {describe(env.action_space)} of "
+            f"{self.name} and {became}"
+        )
 
     def _delay(self, delay: Delay, features: Mapping[str, Any]) -> int:
         """Return a delay in steps.
@@ -216,28 +256,21 @@ class EpisodeFunction:
             raise ValueError(refusal)
         return int(delay.steps(features))
 
-    def _act(self, env: Env, observation: object, features: Mapping[str, Any], time: float) -> Any:
+    def _act(
+        self, env: Env, observation: object, features: Mapping[str, Any], time: float
+    ) -> Fitted:
         if self._decide is None:
             self._decide = _policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
-        action, space = self._decide(observation, **options), env.action_space
-        array = np.asarray(action)
-        if hasattr(space, "n"):
-            first = int(getattr(space, "start", 0))
-            inside = array.shape == () and first <= array < first + space.n
-            if not inside or array != np.floor(array):
-                raise ValueError(
-                    f"policy must return one of the {space.n} actions of {self.name}; "
-                    f"got {action!r}"
-                )
-            return int(array)
-        if array.shape != space.shape and not (array.shape == () and space.shape == (1,)):
-            raise ValueError(
-                f"policy must return an action of {self.name}, shape {list(space.shape)}; "
-                f"got {list(array.shape)}"
-            )
-        return array.reshape(space.shape).astype(space.dtype)
+        action = self._decide(observation, **options)
+        try:
+            return fit(env.action_space, action, self.clip)
+        except Misfit as misfit:
+            space, kind = env.action_space, kind_of(env.action_space)
+            what = f"one of the {space.n} actions" if kind == "Discrete" else "an action"
+            of = f"{self.name}'s {describe(space)}" if kind in ("Dict", "Tuple") else self.name
+            raise ValueError(f"policy must return {what} of {of}; {misfit}") from None
 
     def _sample(
         self,
@@ -247,11 +280,19 @@ class EpisodeFunction:
         reward: float | np.number,
         features: Mapping[str, Any],
     ) -> dict[str, np.ndarray]:
-        now: Any = (env, _arrays(observation), np.asarray(reward, float), np.array(False))
-        moment = Moment(*now)
-        samples = read_signals(self.signals, moment, np.asarray(action), features, {}, self.name)
+        custom = callable(self.signals)
+        seen = _arrays(observation)
+        if isinstance(seen, Mapping | tuple) and not custom:
+            seen = _named_entries(seen)
+        taken = _arrays(action) if custom else np.zeros(())
+        moment = Moment(env, seen, np.asarray(reward, float), np.array(False))
+        samples = read_signals(self.signals, moment, taken, features, {}, self.name)
+        if not custom:
+            read, samples = samples, {}
+            for name, value in read.items():
+                samples |= named_numbers(name, action if name == "action" else value)
         # Copied: an environment may write its next observation into the same array.
-        return {name: np.array(value) for name, value in samples.items()}
+        return {name: np.array(with_gaps(name, value)) for name, value in samples.items()}
 
 
 @suggests_options
@@ -270,6 +311,7 @@ def gymnasium(
     retries: int = 1,
     observation_delay: DelayOption = 0,
     action_delay: DelayOption = 0,
+    clip: bool = True,
 ) -> BlackBox | PooledBlackBox:
     """Make a black box from an environment of Gymnasium and a policy.
 
@@ -299,6 +341,10 @@ def gymnasium(
     - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
       after which its action takes effect: a number, or `{feature: greatest number}` for one that a
       feature says. Before that it sees the first observation, and no action is zeros.
+    - `clip`: whether an action outside the bounds of a Box is set to the nearest bound before it
+      reaches the environment, as libraries do in training; False passes it on. Either way the run
+      counts it and says so among its notes. Whatever else is no action of the action space is an
+      error of its row.
 
     **Returns:** a black box, with `workers` one in processes of its own; one episode is one
     simulation.
@@ -320,6 +366,8 @@ def gymnasium(
     check_called_with("reset", reset, ("env", "features", "seed"))
     check_count("steps", steps)
     check_signals_option(signals, "env")
+    if not isinstance(clip, bool):
+        raise ValueError(f"clip is True or False; got {clip!r}")
     bindings = features if isinstance(features, Mapping) else {name: name for name in features}
     seconds = None if dt is None else sampling_period(dt)
     episode = EpisodeFunction(
@@ -333,20 +381,35 @@ def gymnasium(
         seconds,
         as_delay(observation_delay, "observation_delay"),
         as_delay(action_delay, "action_delay"),
+        clip,
     )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
 
 
-def _no_action(space: Any) -> Any:
-    """Return what an environment does before the first action has arrived."""
-    return 0 if hasattr(space, "n") else np.zeros(space.shape, space.dtype)
+def _arrays(value: object) -> Any:
+    """Return an observation or action with its numbers as arrays, in its own form."""
+    if isinstance(value, Mapping):
+        return {name: _arrays(part) for name, part in value.items()}
+    if isinstance(value, tuple):
+        return tuple(_arrays(part) for part in value)
+    return value if isinstance(value, str) else np.asarray(with_gaps("observation", value))
 
 
-def _arrays(observation: object) -> Any:
-    if isinstance(observation, Mapping):
-        return {name: np.asarray(value) for name, value in observation.items()}
-    return np.asarray(observation)
+def _named_entries(observation: Mapping[str, Any] | tuple[Any, ...]) -> dict[str, Any]:
+    """Return the parts of a nested observation by name: `height`, `arm.angle`, `observation.0`."""
+    entries: dict[str, Any] = {}
+    several = isinstance(observation, Mapping)
+    parts = observation.items() if several else enumerate(observation)
+    for key, part in parts:
+        name = str(key) if several else f"observation.{key}"
+        if isinstance(part, Mapping | tuple):
+            inner = _named_entries(part)
+            stem = "observation." if isinstance(part, tuple) else ""
+            entries |= {f"{name}.{k.removeprefix(stem)}": v for k, v in inner.items()}
+        else:
+            entries[name] = part
+    return entries
 
 
 def _policy_function(policy: object, compiled: bool = True) -> Callable[..., Any]:

@@ -1,0 +1,185 @@
+"""Recordings on an even clock, with nothing of them passed over.
+
+resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
+
+What was recorded between two samples of the new clock stays with the trace (`Trace.between`), and
+verdicts count it: a spike between two samples is not lost.
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from verifai_jax.core.text import format_time
+from verifai_jax.core.trace import Trace, check_period
+from verifai_jax.mtl.setting import since_first
+
+Method = Literal["hold", "linear"]
+
+MOST_SAMPLES = 100_000_000
+"""Samples that a resampled trace may have; its signals still fit into memory."""
+
+
+def resample(trace: Trace, dt: float, method: Method) -> Trace:
+    """Resample signals on an even clock, from the first sample time to the last.
+
+    Verdicts on the result are those of the new samples and of the recorded ones together: what was
+    recorded between two of them is kept in `between`. A missing sample (NaN) of a signal is no
+    sample of it, as in a log of topics that arrive at different times: `"hold"` keeps the signal's
+    last value, and a note says so; `"linear"` leaves a gap.
+
+    **Arguments:**
+
+    - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
+    - `dt`: the new sampling period in seconds.
+    - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
+
+    **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
+    samples, an unknown method, or sample times that do not increase or are not finite.
+    """
+    if method not in ("hold", "linear"):
+        raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
+    check_period(dt)
+    trace = _recorded(trace)
+    check_increasing(np.asarray(trace.clock() if trace.times is None else trace.times))
+    elapsed, resolution = np.asarray(trace.clock()), 0.0
+    if trace.times is not None:
+        elapsed, resolution = since_first(np.asarray(trace.times))
+    # A sample due at `t` counts from `t` on, whatever the last digit of the clock says.
+    tolerance = 1e-6 * dt + resolution
+    with np.errstate(over="ignore"):
+        steps = np.floor((elapsed[-1] * (1 + 1e-9) + 1e-9 * dt + resolution) / dt)
+    if not steps < MOST_SAMPLES:
+        raise ValueError(
+            f"resampling {elapsed[-1]:g} s every {dt:g} s makes {steps + 1:.3g} samples, "
+            f"more than {MOST_SAMPLES}: take a longer period"
+        )
+    clock = dt * np.arange(int(steps) + 1)
+    index = np.searchsorted(elapsed, clock + tolerance, side="right") - 1
+    cell = np.searchsorted(clock, elapsed + tolerance, side="right") - 1
+    on_clock = np.abs(clock[cell] - elapsed) <= tolerance
+    passed = np.flatnonzero(~((index[cell] == np.arange(len(elapsed))) & on_clock))
+
+    signals, inner, notes = {}, {}, dict(trace.notes)
+    for name, recorded in trace.signals.items():
+        values = np.asarray(recorded)
+        if values.dtype == bool or method == "hold":
+            missing = _missing(values)
+            if missing.any():
+                notes[
+                    f"signal {name!r} has no value in {missing.sum()} of {len(missing)} rows: "
+                    "its last one is held there"
+                ] = int(missing.sum())
+            values = _held(values)
+            signals[name], inner[name] = values[index], values[passed]
+        else:
+            signals[name] = _interpolated(values, elapsed, clock, index, tolerance)
+            inner[name] = _filled(values, elapsed)[passed]
+    between = None
+    if len(passed):
+        places = _places(cell[passed], len(clock))
+        times = np.concatenate([clock, elapsed[passed]])[places]
+        between = Trace(
+            {name: np.concatenate([signals[name], inner[name]])[places] for name in signals},
+            times=times,
+        )
+    return Trace(signals, dt=float(dt), status=trace.status, between=between, notes=notes)
+
+
+def _recorded(trace: Trace) -> Trace:
+    """Return the samples that count, each once, those between others among them."""
+    trace = trace.trim()
+    if trace.between is None:
+        return trace
+    fine = trace.finely()
+    new = np.append(True, np.diff(fine.clock()) > 0)
+    signals = {name: np.asarray(signal)[new] for name, signal in fine.signals.items()}
+    return Trace(signals, times=fine.clock()[new], status=trace.status, notes=trace.notes)
+
+
+def _places(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " places"]:
+    """Return which sample stands in each place between those of the clock, as many in each period.
+
+    - `cells`: the period in which each of the samples lies that the clock passes over.
+    - `count`: samples of the clock; they have the first numbers, those passed over the next.
+    """
+    rank = np.arange(len(cells)) - np.searchsorted(cells, cells)
+    # A power of two, less one, so that recordings share compiled monitors.
+    most = (1 << int(rank.max() + 1).bit_length()) - 1
+    if count * (most + 1) > MOST_SAMPLES:
+        raise ValueError(
+            f"resampling to {count} samples has up to {int(rank.max()) + 1} recorded samples "
+            "between two of them, more than can be judged: take a shorter period, or cut the "
+            "recording into parts"
+        )
+    places = np.repeat(np.arange(count)[:, None], most, axis=1)
+    places[cells, rank] = count + np.arange(len(cells))
+    # The sample before is repeated where fewer lie in a period.
+    return np.maximum.accumulate(places, axis=1).reshape(-1)
+
+
+def _missing(values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind != "f":
+        return np.zeros(len(values), bool)
+    return np.asarray(np.any(np.isnan(values).reshape(len(values), -1), axis=1))
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """Return each column with its last value in place of a missing one; none before the first."""
+    if not _missing(values).any():
+        return values
+    columns = values.reshape(len(values), -1)
+    last = np.maximum.accumulate(
+        np.where(np.isnan(columns), 0, np.arange(len(values))[:, None]), axis=0
+    )
+    return np.take_along_axis(columns, last, axis=0).reshape(values.shape)
+
+
+def _interpolated(
+    values: np.ndarray,
+    elapsed: Float[np.ndarray, " time"],
+    clock: Float[np.ndarray, " samples"],
+    index: Int[np.ndarray, " samples"],
+    tolerance: float,
+) -> np.ndarray:
+    following = np.minimum(index + 1, len(elapsed) - 1)
+    gap, ahead = elapsed[following] - elapsed[index], clock - elapsed[index]
+    share = np.clip(np.where(gap > 0, ahead / np.where(gap > 0, gap, 1), 0), 0, 1)
+    share = np.where(np.abs(ahead) <= tolerance, 0, share)
+    weight = share.reshape((-1,) + (1,) * (values.ndim - 1))
+    here, there = values[index], values[following]
+    # Not a weighted sum, which would spread the NaN of a neighbour with no weight.
+    return np.where(weight == 0, here, here + weight * (there - here))
+
+
+def _filled(values: np.ndarray, elapsed: Float[np.ndarray, " time"]) -> np.ndarray:
+    """Return a signal with its missing values on the line between its own neighbours.
+
+    A row in which a signal has no value hides none of it; the samples of the clock show the gap.
+    """
+    if not _missing(values).any():
+        return values
+    columns = []
+    for column in values.reshape(len(values), -1).T:
+        known = np.flatnonzero(~np.isnan(column))
+        columns.append(np.interp(elapsed, elapsed[known], column[known]) if len(known) else column)
+    return np.stack(columns, axis=1).reshape(values.shape)
+
+
+def check_increasing(times: np.ndarray) -> None:
+    """Raise `ValueError` that names the row whose time is not finite, or not after the one before.
+
+    Rows are counted from 1.
+    """
+    if not np.all(np.isfinite(times)):
+        k = int(np.argmin(np.isfinite(times)))
+        raise ValueError(f"sample times must be finite; row {k + 1} has {times[k]:g} s")
+    # Compared, and not subtracted: small integers would wrap.
+    rises = times[1:] > times[:-1]
+    if not np.all(rises):
+        k = int(np.argmin(rises))
+        first, second = (format_time(float(t)) for t in times[k : k + 2])
+        raise ValueError(
+            f"sample times must increase; row {k + 1} has {first} s and row {k + 2} {second} s"
+        )
