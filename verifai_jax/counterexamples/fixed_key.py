@@ -32,6 +32,9 @@ class FixedKey(System):
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         return self.system(features, self.key)
 
+    def may_draw(self, features: Features) -> bool:
+        return False
+
     def check(self, features: Features) -> None:
         self.system.check(features)
 

@@ -108,7 +108,7 @@ class ImportanceSamples:
     def _widened(self, x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
         """Widen the interval where a heavy tail hides a part of the variance of the samples."""
         mean = weighted_mean(x)
-        factor = 1 + SLOPE * float(np.clip(mean.tail - LIGHT, 0.0, 1.0))
+        factor = widening(mean.tail)
         low, high = skewed_interval(x, confidence)
         low = max(mean.mean - factor * (mean.mean - low), low / factor**2)
         return low, mean.mean + factor * (high - mean.mean)
@@ -127,11 +127,17 @@ class FittedProposal:
     - `proposal`: the fitted mixture.
     - `effective`: effective failures per simulation.
     - `tail`: tail index of their weights.
+    - `probability`: of a failure, by these samples.
     """
 
     proposal: Mixture
     effective: float
     tail: float
+    probability: float = 0.0
+
+    def promise(self, simulations: int) -> float:
+        """Return the failures that so many samples are worth, once a heavy tail has widened."""
+        return self.effective * simulations / widening(self.tail) ** 2
 
 
 def fit_proposal(
@@ -159,9 +165,9 @@ def fit_proposal(
     mixture, anchored = proposal, None if anchors is None else anchors.fit()
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposals, zs, failing = [], [], []
-    effective, tail, before, left = 0.0, np.inf, 0.0, simulations
+    effective, tail, before, left, probability = 0.0, np.inf, 0.0, simulations, 0.0
     for stage in range(MOST_STAGES):
-        z, _, scores, ratio = _draw(limit_state, rng, proposal, size)
+        z, _, scores, ratio = draw(limit_state, rng, proposal, size)
         left -= size
         proposals.append(proposal)
         zs.append(z)
@@ -170,6 +176,7 @@ def fit_proposal(
         if len(w) < 10:
             continue
         effective, tail = effective_size(w) / len(z), tail_index(w)
+        probability = float(w.sum()) / len(z)
         # All stages together are samples of the mean of their proposals.
         new = np.concatenate([z[f] for z, f in zip(zs, failing, strict=True)])
         counts = np.array([len(z) for z in zs], float)
@@ -192,7 +199,12 @@ def fit_proposal(
         if stage and tail < STEADY and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left
-    return FittedProposal(proposal, effective, tail)
+    return FittedProposal(proposal, effective, tail, probability)
+
+
+def widening(tail: float) -> float:
+    """Return the factor by which a heavy tail widens an interval."""
+    return 1 + SLOPE * float(np.clip(tail - LIGHT, 0.0, 1.0))
 
 
 def _share_out(
@@ -234,7 +246,7 @@ def sample_proposal(
     """
     started = limit_state.simulations
     acceptance = limit_state.acceptance(rng)
-    z, origin, scores, ratio = _draw(limit_state, rng, proposal, simulations)
+    z, origin, scores, ratio = draw(limit_state, rng, proposal, simulations)
     inverse = 1 / ratio
     x = np.where(scores.failing, inverse, 0.0)
     without = np.where(scores.proper, 0.0, inverse)
@@ -247,7 +259,7 @@ def sample_proposal(
     )  # fmt: skip
 
 
-def _draw(
+def draw(
     limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, n: int
 ) -> tuple[np.ndarray, np.ndarray, Scores, np.ndarray]:
     """Draw about `n` points of the proposal and simulate those that the constraint accepts.
