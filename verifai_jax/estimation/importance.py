@@ -27,6 +27,7 @@ from verifai_jax.estimation.intervals import (
     weighted_mean,
 )
 from verifai_jax.estimation.mixture import Mixture, fit_mixture, optimal_shares
+from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.normal_space import Ended, LimitState, Scores
 
 SHARE_OF_STAGE = 0.1
@@ -66,6 +67,7 @@ class ImportanceSamples:
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
     - `failures`: the points among them that fail.
+    - `keys`: numbers of the random keys with which these do.
     - `proposal`: the mixture that was sampled.
     - `coarse`: relative error by single precision at the end of a coordinate.
     - `acceptance`: share of the prior that the constraint accepts, and its relative error.
@@ -78,6 +80,7 @@ class ImportanceSamples:
     origin: Int[np.ndarray, " n"]
     failing: Bool[np.ndarray, " n"]
     failures: Float[np.ndarray, "failures d"]
+    keys: Int[np.ndarray, " failures"]
     proposal: Mixture
     coarse: float
     acceptance: tuple[float, float]
@@ -112,6 +115,12 @@ class ImportanceSamples:
         low, high = skewed_interval(x, confidence)
         low = max(mean.mean - factor * (mean.mean - low), low / factor**2)
         return low, mean.mean + factor * (high - mean.mean)
+
+    @property
+    def counts(self) -> Counts:
+        """Counts of these samples, where the proposal is the prior."""
+        missing = int(np.count_nonzero(self.without))
+        return Counts(self.simulations, int(self.failing.sum()), missing)
 
     @property
     def defensive_counts(self) -> tuple[int, int]:
@@ -167,7 +176,7 @@ def fit_proposal(
     proposals, zs, failing = [], [], []
     effective, tail, before, left, probability = 0.0, np.inf, 0.0, simulations, 0.0
     for stage in range(MOST_STAGES):
-        z, _, scores, ratio = draw(limit_state, rng, proposal, size)
+        z, _, scores, ratio, _ = draw(limit_state, rng, proposal, size)
         left -= size
         proposals.append(proposal)
         zs.append(z)
@@ -246,7 +255,7 @@ def sample_proposal(
     """
     started = limit_state.simulations
     acceptance = limit_state.acceptance(rng)
-    z, origin, scores, ratio = draw(limit_state, rng, proposal, simulations)
+    z, origin, scores, ratio, numbers = draw(limit_state, rng, proposal, simulations)
     inverse = 1 / ratio
     x = np.where(scores.failing, inverse, 0.0)
     without = np.where(scores.proper, 0.0, inverse)
@@ -254,17 +263,18 @@ def sample_proposal(
     outside = np.any((np.abs(z) > OUTERMOST) & clamped, axis=1)
     edge = np.where(outside, HIDDEN * x, 0.0)
     return ImportanceSamples(
-        x, without, edge, origin, scores.failing, z[scores.failing], proposal, _coarse(z, x),
-        acceptance, limit_state.simulations - started,
+        x, without, edge, origin, scores.failing, z[scores.failing], numbers[scores.failing],
+        proposal, _coarse(z, x), acceptance, limit_state.simulations - started,
     )  # fmt: skip
 
 
 def draw(
     limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, n: int
-) -> tuple[np.ndarray, np.ndarray, Scores, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, Scores, np.ndarray, np.ndarray]:
     """Draw about `n` points of the proposal and simulate those that the constraint accepts.
 
-    **Returns:** points, components, scores, and densities over the prior's; fewer where time ends.
+    **Returns:** points, components, scores, densities over the prior's, and numbers of random keys;
+    fewer where time ends.
     """
     if limit_state.constraint is not None and n:
         share = max(float(np.mean(limit_state.accepts(proposal.sample(rng, 4096)[0]))), 0.01)
@@ -273,17 +283,19 @@ def draw(
     z, origin = proposal.sample(rng, n)
     accepted = np.flatnonzero(limit_state.accepts(z))[: limit_state.left]
     scores = Scores(np.full(n, np.inf), np.zeros(n, bool), np.ones(n, bool))
+    numbers = np.zeros(n, int)
     size, done = limit_state.batch * AT_ONCE, 0
     try:
         for start in range(0, len(accepted), size):
             rows = accepted[start : start + size]
+            numbers[rows] = limit_state.evaluated + np.arange(len(rows))
             for column, values in zip(scores, limit_state(z[rows]), strict=True):
                 column[rows] = values
             done += len(rows)
     except Ended:
         n = int(accepted[done]) if done < len(accepted) else n
     scores = Scores(*(column[:n] for column in scores))
-    return z[:n], origin[:n], scores, proposal.ratio(z[:n])
+    return z[:n], origin[:n], scores, proposal.ratio(z[:n]), numbers[:n]
 
 
 def _coarse(z: Float[np.ndarray, "n d"], x: Float[np.ndarray, " n"]) -> float:

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
+from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
 from verifai_jax.estimation.exploration import Exploration, explore
 from verifai_jax.estimation.importance import DEFENSIVE, STEADY, FittedProposal
@@ -202,10 +203,10 @@ def estimate_by_importance_sampling(
             fitted = importance.fit_proposal(
                 limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
             )
-        promised = fitted.effective * limit_state.left
-        least = LEAST_OF_MOVED if by_chance else LEAST_EFFECTIVE
         counted = _promised_by_counting(limit_state, fitted, counts)
-        if promised < least or fitted.promise(limit_state.left) < counted:
+        least = max(counted, LEAST_OF_MOVED if by_chance else 0)
+        few = not by_chance and fitted.effective * limit_state.left < LEAST_EFFECTIVE
+        if few or fitted.promise(limit_state.left) < least:
             answer = _without_proposal(limit_state, rng, plan, run, counts, fitted, counted)
             return _with_chance(answer, again)
         # A little is left over to see whether the searches agree.
@@ -263,7 +264,10 @@ def _without_proposal(
         answer = _splitting_answer(limit_state, rng, plan, [run], counts)
         answer.notes.append(f"{why}, so the estimate is that of multilevel splitting")
         return answer
-    answer = _bound_only(limit_state, rng, plan, run, counts)
+    prior = Mixture((Prior(limit_state.dim),), np.ones(1))
+    samples = importance.sample_proposal(limit_state, rng, prior, limit_state.left, plan.clamped)
+    answer = _bound_only(limit_state, rng, plan, run, counts + samples.counts)
+    answer.samples = samples
     if answer.probability is not None:
         answer.notes.append(f"{why}, so failures are counted in samples of the prior")
     return answer

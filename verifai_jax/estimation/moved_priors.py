@@ -83,7 +83,7 @@ def share_out(
     proposals: list[Mixture] = []
     weight = np.zeros(0)
     for _ in range(MOST_STAGES - 2):
-        z, _, scores, _ = draw(limit_state, rng, proposal, size)
+        z, _, scores, *_ = draw(limit_state, rng, proposal, size)
         zs.append(z[scores.failing])
         counts.append(len(z))
         proposals.append(proposal)
