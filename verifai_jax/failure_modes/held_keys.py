@@ -5,9 +5,10 @@
 
 Where a point fails with a probability, a path of points is no path of failures: each simulation
 draws anew. Under one key, held, the system is a function of its features, and regions are found as
-for any other. The keys are those of failures under which most of the failures fail; further keys
-are taken where some of them do not. Regions of two keys are one where a path under either joins
-their likeliest points.
+for any other. The keys are those of failures: first one under which half of the failures fail, then one
+for half of the others, and so on. A key under which all fail would be a lucky one, under which
+regions that are apart under any other run together. Regions of two keys are one where a path under
+either joins their likeliest points.
 """
 
 from collections.abc import Callable
@@ -17,8 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.estimation.importance import ImportanceSamples
-from verifai_jax.estimation.normal_space import LimitState, fails_at
-from verifai_jax.estimation.paths import connected
+from verifai_jax.estimation.normal_space import LimitState, fails_at, squared_distances
+from verifai_jax.estimation.paths import COST_OF_PATHS, connected
 from verifai_jax.failure_modes.region_search import find_regions, share_explained
 from verifai_jax.failure_modes.regions import Regions
 
@@ -28,6 +29,8 @@ MOST_KEYS = 4
 """Keys that are held, at most."""
 ENOUGH = 0.9
 """Share of the failures from which on no further key is held."""
+TYPICAL = 0.5
+"""Share of the failures left that fail under the next key, at least."""
 FOLLOWED = 300
 """Failures of which those that fail under a held key are followed to their regions."""
 
@@ -93,28 +96,54 @@ def divide_under_keys(
     under = np.zeros(len(z), bool)
     for turn, key in enumerate(keys):
         own = held(key, limit_state.left // (len(keys) - turn))
-        failing = fails_at(own, z)
-        if not failing.any():
+        new = fails_at(own, z) & ~under
+        if not new.any():
             continue
-        share = np.full(int(failing.sum()), 1 / failing.sum())
+        share = np.full(int(new.sum()), 1 / new.sum())
         begin = starts[fails_at(own, starts)] if len(starts) else starts
-        found = find_regions(own, rng, z[failing], share, begin)
-        new = failing & ~under
-        if new.any():
-            even = np.full(int(new.sum()), 1 / new.sum())
-            parts = share_explained(own, rng, found, z[new], even)
-            joined, tried = joined + parts[0], tried + parts[1]
+        found = find_regions(own, rng, z[new], share, begin)
+        found, parts = _by_likeliest(own, rng, found, z[new])
+        joined, tried = joined + parts[0], tried + parts[1]
         known = regions.count
         same = _same_regions(held, regions, numbers, found, key)
         region = np.where(same >= 0, same, known + np.cumsum(same < 0) - 1)[found.region]
         regions.points = np.concatenate([regions.points, found.points])
         regions.region = np.append(regions.region, region).astype(int)
         numbers = np.append(numbers, np.full(len(found.points), key))
-        under |= failing
+        under |= new
         limit_state.simulations += own.simulations
     if not regions.count:
         return None
     return Divided(regions, numbers, joined, tried, float(under.mean()), len(keys))
+
+
+def _by_likeliest(
+    own: LimitState, rng: np.random.Generator, found: Regions, z: Float[np.ndarray, "n d"]
+) -> tuple[Regions, tuple[int, int]]:
+    """Tell failures apart by the likeliest failure that a path joins them to.
+
+    Under an unlucky key regions are near one another, and failures of both are frequent. So a path
+    to any failure of a region is no sign of it here, where there is one to its likeliest.
+
+    **Returns:** regions with these points alone, and how many of how many failures are joined to
+    one.
+    """
+    ends = found.design_points
+    z = z[: max(4, own.left // (2 * COST_OF_PATHS * max(1, len(ends))))]
+    region = np.full(len(z), -1)
+    order = np.argsort(squared_distances(z, ends), axis=1)
+    for column in order.T:
+        left = np.flatnonzero(region < 0)
+        region[left[connected(own, z[left], ends[column[left]])]] = -2
+        region = np.where(region == -2, column, region)
+    alone, joined = region < 0, int(np.sum(region >= 0))
+    if alone.any():
+        share = np.full(int(alone.sum()), 1 / alone.sum())
+        some, tried = share_explained(own, rng, found, z[alone], share)
+        joined += round(int(alone.sum()) * some / tried)
+        region[alone] = found.assign(z[alone])
+    numbers = np.append(np.arange(len(ends)), region)
+    return Regions(np.concatenate([ends, z]), numbers), (joined, len(z))
 
 
 def _choose_keys(
@@ -123,7 +152,7 @@ def _choose_keys(
     keys: Int[np.ndarray, " k"],
     z: Float[np.ndarray, "n d"],
 ) -> list[int]:
-    """Choose keys of failures so that nearly all of these fail under one; the best one first."""
+    """Choose keys of failures so that nearly all of these fail under one; see the module."""
     fails: dict[int, Bool[np.ndarray, " n"]] = {}
     for key in np.unique(keys).tolist():
         own = held(key, limit_state.left)
@@ -132,11 +161,13 @@ def _choose_keys(
     chosen: list[int] = []
     left = np.ones(len(z), bool)
     while len(chosen) < MOST_KEYS and left.mean() > 1 - ENOUGH:
-        best = max(fails, key=lambda key: int(np.sum(fails[key] & left)))
-        if not np.any(fails[best] & left):
+        share = {key: float(np.mean(failing[left])) for key, failing in fails.items()}
+        typical = [key for key in share if share[key] >= TYPICAL]
+        key = min(typical, key=share.__getitem__) if typical else max(share, key=share.__getitem__)
+        if not share[key]:
             break
-        chosen.append(best)
-        left &= ~fails[best]
+        chosen.append(key)
+        left &= ~fails[key]
     return chosen
 
 
