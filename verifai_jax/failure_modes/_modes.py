@@ -57,6 +57,8 @@ from verifai_jax.statistics.binomial import clopper_pearson
 DIVIDING, MOST_DIVIDING = 0.25, 6500
 """Share of the budget that divides the failures, and most of these simulations; the rest is for the
 probability."""
+MORE_DIVIDING = 2
+"""Factor on that share for a system that draws random numbers."""
 SHOWN = 200
 """Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
@@ -108,11 +110,14 @@ def modes(
     check_fraction("least_share", least_share)
     in_precision(precision)
     problem.space.check_where()
-    estimated = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
-    chains = chains_for(estimated, SHARE_OF_LEVEL)
+    least = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
+    chains = chains_for(least, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     chosen.problem.check()
+    draws = depends_on_key(chosen.problem)
+    # Under each of several keys the failures are divided.
+    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - least)
     simulated = DoublePrecisionEvaluator(chosen.problem, batch, precision, seed)
     simulated.compile()
     rng = np.random.default_rng(seed)
@@ -127,7 +132,7 @@ def modes(
             report=bar.update,
             gradient=simulated.gradient if _has_slopes(chosen.problem) else None,
             uniform=simulated.uniform,
-            draws=depends_on_key(chosen.problem),
+            draws=draws,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:

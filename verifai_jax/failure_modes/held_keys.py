@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from verifai_jax.estimation.importance import ImportanceSamples
 from verifai_jax.estimation.normal_space import LimitState, fails_at, squared_distances
 from verifai_jax.estimation.paths import COST_OF_PATHS, connected
-from verifai_jax.failure_modes.region_search import find_regions, share_explained
+from verifai_jax.failure_modes.region_search import find_regions
 from verifai_jax.failure_modes.regions import Regions
 
 ASKED = 24
@@ -92,58 +92,50 @@ def divide_under_keys(
     z = samples.failures[rows]
     keys = _choose_keys(limit_state, held, samples.keys[rows[:ASKED]], z[:ASKED])
     regions, numbers = Regions(z[:0], np.zeros(0, int)), np.zeros(0, int)
-    joined = tried = 0
-    under = np.zeros(len(z), bool)
+    region, looked_at, under = np.full(len(z), -1), np.zeros(len(z), bool), np.zeros(len(z), bool)
     for turn, key in enumerate(keys):
         own = held(key, limit_state.left // (len(keys) - turn))
-        new = fails_at(own, z) & ~under
-        if not new.any():
-            continue
-        share = np.full(int(new.sum()), 1 / new.sum())
-        begin = starts[fails_at(own, starts)] if len(starts) else starts
-        found = find_regions(own, rng, z[new], share, begin)
-        found, parts = _by_likeliest(own, rng, found, z[new])
-        joined, tried = joined + parts[0], tried + parts[1]
-        known = regions.count
-        same = _same_regions(held, regions, numbers, found, key)
-        region = np.where(same >= 0, same, known + np.cumsum(same < 0) - 1)[found.region]
-        regions.points = np.concatenate([regions.points, found.points])
-        regions.region = np.append(regions.region, region).astype(int)
-        numbers = np.append(numbers, np.full(len(found.points), key))
-        under |= new
+        failing = fails_at(own, z)
+        new = np.flatnonzero(failing & (region < 0))
+        if len(new):
+            share = np.full(len(new), 1 / len(new))
+            begin = starts[fails_at(own, starts)] if len(starts) else starts
+            found = find_regions(own, rng, z[new], share, begin)
+            new = new[: max(4, own.left // (2 * COST_OF_PATHS * max(1, found.count)))]
+            joined_to = _likeliest_of(own, found, z[new])
+            same = _same_regions(held, regions, numbers, found, key)
+            same = np.where(same >= 0, same, regions.count + np.cumsum(same < 0) - 1)
+            joined = joined_to >= 0
+            region[new[joined]] = same[joined_to[joined]]
+            points = np.concatenate([found.design_points, z[new[joined]]])
+            regions.add(points, np.append(same, region[new[joined]]).astype(int))
+            numbers = np.append(numbers, np.full(len(points), key))
+            looked_at[new] = True
+        under |= failing
         limit_state.simulations += own.simulations
     if not regions.count:
         return None
+    joined, tried = int(np.sum(region >= 0)), int(looked_at.sum())
     return Divided(regions, numbers, joined, tried, float(under.mean()), len(keys))
 
 
-def _by_likeliest(
-    own: LimitState, rng: np.random.Generator, found: Regions, z: Float[np.ndarray, "n d"]
-) -> tuple[Regions, tuple[int, int]]:
-    """Tell failures apart by the likeliest failure that a path joins them to.
+def _likeliest_of(
+    own: LimitState, found: Regions, z: Float[np.ndarray, "n d"]
+) -> Int[np.ndarray, " n"]:
+    """Return the region whose likeliest failure a path leads to from each failure; -1 for none.
 
     Under an unlucky key regions are near one another, and failures of both are frequent. So a path
-    to any failure of a region is no sign of it here, where there is one to its likeliest.
-
-    **Returns:** regions with these points alone, and how many of how many failures are joined to
-    one.
+    to any failure of a region counts only where there is none to a likeliest one.
     """
-    ends = found.design_points
-    z = z[: max(4, own.left // (2 * COST_OF_PATHS * max(1, len(ends))))]
-    region = np.full(len(z), -1)
-    order = np.argsort(squared_distances(z, ends), axis=1)
-    for column in order.T:
+    region, ends = np.full(len(z), -1), found.design_points
+    nearest = np.argsort(squared_distances(z, ends), axis=1)
+    ways = [(ends[column], column) for column in nearest.T]
+    ways += [(found.points[rows], found.region[rows]) for rows in found.candidates(z).T]
+    for points, number in ways:
         left = np.flatnonzero(region < 0)
-        region[left[connected(own, z[left], ends[column[left]])]] = -2
-        region = np.where(region == -2, column, region)
-    alone, joined = region < 0, int(np.sum(region >= 0))
-    if alone.any():
-        share = np.full(int(alone.sum()), 1 / alone.sum())
-        some, tried = share_explained(own, rng, found, z[alone], share)
-        joined += round(int(alone.sum()) * some / tried)
-        region[alone] = found.assign(z[alone])
-    numbers = np.append(np.arange(len(ends)), region)
-    return Regions(np.concatenate([ends, z]), numbers), (joined, len(z))
+        joined = left[connected(own, z[left], points[left])] if len(left) else left
+        region[joined] = number[joined]
+    return region
 
 
 def _choose_keys(
