@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
-from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
+from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.exploration import Exploration, explore
 from verifai_jax.estimation.importance import DEFENSIVE, STEADY, FittedProposal
 from verifai_jax.estimation.initial_proposal import (

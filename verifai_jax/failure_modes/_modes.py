@@ -345,10 +345,8 @@ def _columns(space: FeatureSpace, z: Float[np.ndarray, "n d"]) -> pd.DataFrame:
     return pd.DataFrame(space.rows(features))
 
 
-def _simulate(
-    numbers: _Numbers, design: Float[np.ndarray, "k d"]
-) -> list[tuple[Run, int | None]]:
-    """Simulate the likeliest failures and points just beyond; return run and failing row of each."""
+def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> list[tuple[Run, int | None]]:
+    """Simulate likeliest failures and points just beyond; return run and failing row of each."""
     count = len(design)
     points = np.concatenate([factor * design for factor in OUTWARD])
     frame = _columns(numbers.problem.space, points)
@@ -381,9 +379,7 @@ def _simulate_under(
     return [found[k] for k in range(len(design))]
 
 
-def _cause(
-    numbers: _Numbers, features: dict[str, Any], key: Any, number: int
-) -> tuple[float, str]:
+def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -> tuple[float, str]:
     """Return the robustness at features, and the formula and predicate that decide, in words."""
     replayed = replay(numbers.problem, features, key, number, numbers.precision)
     rho = min(replayed.rho.values())

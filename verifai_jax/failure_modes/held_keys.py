@@ -5,8 +5,8 @@
 
 Where a point fails with a probability, a path of points is no path of failures: each simulation
 draws anew. Under one key, held, the system is a function of its features, and regions are found as
-for any other. The keys are those of failures: first one under which half of the failures fail, then one
-for half of the others, and so on. A key under which all fail would be a lucky one, under which
+for any other. The keys are those of failures: first one under which half of the failures fail, then
+one for half of the others, and so on. A key under which all fail would be a lucky one, under which
 regions that are apart under any other run together. Regions of two keys are one where a path under
 either joins their likeliest points.
 """
