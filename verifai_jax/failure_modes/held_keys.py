@@ -58,7 +58,7 @@ class Divided:
 
     @property
     def note(self) -> str:
-        """What people have to know of these regions."""
+        """Say what people have to know of these regions."""
         which = "one random key" if self.held == 1 else f"{self.held} random keys"
         return (
             "the system draws random numbers, so that a point fails with a probability: the modes "
