@@ -258,7 +258,7 @@ def _without_proposal(
     why = (
         "no proposal fits the failures well enough for importance sampling (it promises "
         f"{fitted.effective * limit_state.left:.0f} effective failures, tail index "
-        f"{fitted.tail:.2f})"
+        f"{fitted.tail:.2f}; counting {counted:.0f})"
     )
     if run.stopped is None and not limit_state.draws and _promised_by(run, limit_state) > counted:
         answer = _splitting_answer(limit_state, rng, plan, [run], counts)
