@@ -96,7 +96,8 @@ def modes(
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
 
     **Returns:** the modes, the most probable first; none where no failure was found or failures
-    could not be weighed, and a note says so.
+    could not be weighed, and a note says so. Where the system draws random numbers, probabilities
+    are over these too, and each mode holds the random key under which its likeliest failure fails.
 
     **Raises:** `TypeError` for something that is no problem or run; `ValueError` for options out of
     range, or a run that was loaded without its problem.
