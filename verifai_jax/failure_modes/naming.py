@@ -52,7 +52,7 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     **Returns:** the conditions, the one that fewest samples of the prior fulfil first; `"anywhere"`
     without one that tells the failures apart.
     """
-    varying = [name for name in failures.columns if prior[name].astype(str).nunique() > 1]
+    varying = [name for name in failures.columns if len(set(prior[name].astype(str))) > 1]
     left = [each for name in varying for each in _conditions(failures, prior, name)]
     inside = np.ones(len(prior), bool)
     taken: list[Between | _Choice] = []
