@@ -35,7 +35,7 @@ BASE = make(0.9)
 @pytest.mark.thorough
 def test_a_pair_of_systems_that_draw_fails_again_under_its_key():
     sides = make(0.9, noise=0.4), make(0.8, name="candidate", noise=0.4)
-    result = vj.compare(*sides, budget=4000, margin=0.2)
+    result = vj.compare(*sides, budget=4000)
     pair, row = next(iter(result.candidates[0].discordant.iterrows()))
     features = {name: jnp.float32(row[name]) for name in SPACE}
     key = result.random_key(pair)
