@@ -33,6 +33,17 @@ BASE = make(0.9)
 
 
 @pytest.mark.thorough
+def test_a_pair_of_systems_that_draw_fails_again_under_its_key():
+    sides = make(0.9, noise=0.4), make(0.8, name="candidate", noise=0.4)
+    result = vj.compare(*sides, budget=4000)
+    pair, row = next(iter(result.candidates[0].discordant.iterrows()))
+    features = {name: jnp.float32(row[name]) for name in SPACE}
+    key = result.random_key(pair)
+    fails = [float(side.system(features, key).signals["x"].max()) >= 1 for side in sides]
+    assert fails == [not row["worse"], bool(row["worse"])]
+
+
+@pytest.mark.thorough
 def test_a_regression_is_found_and_lies_where_it_does():
     result = vj.compare(BASE, make(0.8))
     one = result.candidates[0]

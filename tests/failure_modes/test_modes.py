@@ -75,6 +75,23 @@ def test_names_are_conditions_that_the_prior_seldom_fulfils():
     assert name_mode(prior, prior) == "anywhere"
 
 
+def test_a_name_has_every_necessary_condition_and_no_feature_that_is_held():
+    rng = np.random.default_rng(0)
+    prior = pd.DataFrame(rng.standard_normal((1000, 10)), columns=[f"x{i}" for i in range(10)])
+    prior["held"], prior["gear"] = np.float32(0.15), rng.integers(0, 5, 1000)
+    own = prior.sample(200, random_state=1)
+    own["x8"] = 2.6 + rng.exponential(0.3, 200)
+    own["x9"] = -2.9 - rng.exponential(0.3, 200)
+    own["x1"] = 0.5 + 0.01 * rng.standard_normal(200)
+    own["gear"] = 3
+    parts = name_mode(own, prior).split(" and ")
+    assert parts[0].startswith(("x8 > 2.6", "x9 <= -2.9"))
+    assert sorted(part.split()[0] for part in parts if part[0] == "x") == ["x8", "x9"]
+    assert "gear > 2" in parts
+    assert any(part.startswith("0.48 < x1") or " < x1 <= 0.5" in part for part in parts)
+    assert "held" not in name_mode(own, prior)
+
+
 def planted():
     def system(features, key):
         x, y = features["x"], features["y"]

@@ -1,11 +1,12 @@
-"""Does the robustness depend on the features through a derivative? As JAX differentiates it."""
+"""Does the robustness depend on features through a derivative, and does a verdict on the key?"""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.problem.dependence import has_gradient
+from verifai_jax.problem.dependence import depends_on_key, has_gradient
 
 
 @jax.custom_jvp
@@ -107,3 +108,48 @@ def test_features_that_jump_have_no_derivative():
         space = {"x": domain, "more": vj.Box(0.0, 1.0)}
         assert not has_gradient(vj.Problem("p", space, system, "always y < 1"))
     assert has_gradient(vj.Problem("p", {"x": vj.Normal(0.0, 1.0)}, system, "always y < 1"))
+
+
+def walks(noisy):
+    """A walk that splits its key at every step, and draws from it where it is noisy."""
+
+    def system(features, key):
+        def step(carry, _):
+            x, key = carry
+            key, own = jax.random.split(key)
+            return (x + noisy * jax.random.normal(own) if noisy else x + 1.0, key), x
+
+        _, x = jax.lax.scan(step, (features["x"], key), None, length=4)
+        return vj.Trace({"x": x}, dt=1.0)
+
+    return system
+
+
+def beside(features, key):
+    return vj.Trace({"x": features["x"][None], "other": jax.random.normal(key)[None]}, dt=1.0)
+
+
+def ends_at_random(features, key):
+    x = jnp.broadcast_to(features["x"], 3)
+    return vj.Trace({"x": x}, dt=1.0, valid=1 + jax.random.randint(key, (), 0, 2))
+
+
+def on_the_host(features, seed=0):
+    return vj.Trace({"x": np.array([features["x"]])}, dt=1.0)
+
+
+@pytest.mark.parametrize(
+    ("system", "depends"),
+    [
+        (walks(0), False),
+        (walks(0.1), True),
+        (beside, False),
+        (ends_at_random, True),
+        (vj.blackbox(on_the_host), False),
+        (vj.blackbox(on_the_host, seeded=True), True),
+    ],
+    ids=["split", "drawn", "not monitored", "early end", "black box", "seeded black box"],
+)
+def test_a_verdict_depends_on_a_key_that_reaches_it(system, depends):
+    problem = vj.Problem("walk", {"x": vj.Normal(0.0, 1.0)}, system, "always x > -3")
+    assert depends_on_key(problem) is depends

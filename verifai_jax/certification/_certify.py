@@ -21,6 +21,7 @@ from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
@@ -136,8 +137,18 @@ def certify(
         budget=budget,
         stopped=stopped,
         seconds=time.perf_counter() - started,
-        notes=blocks.notes,
+        notes=(*blocks.notes, *_chance(blocks.problem, rows)),
     )
+
+
+def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
+    """Return what there is to say of counterexamples of a system that draws."""
+    if not any(row.counterexamples for row in rows) or not depends_on_key(problem):
+        return []
+    return [
+        "the systems draw random numbers: a counterexample failed under the random key of its "
+        "sample, and its features fail with a probability"
+    ]
 
 
 def _sample(

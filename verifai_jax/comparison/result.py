@@ -5,6 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxtyping import Array, Key
+
+from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
@@ -26,7 +29,8 @@ class Compared:
     - `both`: pairs in which both fail.
     - `margin`: difference that does not matter.
     - `discordant`: the pairs in which only one fails, a row each with the features; `worse` is true
-      where it is the candidate.
+      where it is the candidate. Its index is the number of the pair, of which
+      `Comparison.random_key` is the key.
     - `pairs`: features of all pairs, and `worse` and `better`; None where they were not kept.
     """
 
@@ -100,6 +104,13 @@ class Comparison:
     def __getitem__(self, name: str) -> Compared:
         """Return the candidate of this name."""
         return {candidate.name: candidate for candidate in self.candidates}[name]
+
+    def random_key(self, pair: int) -> Key[Array, ""]:
+        """Return the random key of both sides of a pair, by its index in `discordant`.
+
+        Where a system draws, its failure comes again under this key.
+        """
+        return simulation_key(run_keys(self.seed)[1], pair)
 
     @property
     def verdict(self) -> str:

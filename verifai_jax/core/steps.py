@@ -2,6 +2,7 @@
 
 traced = jax.jit(simulate).trace(features, key)
 again = as_traced(traced)                           # of the same pytrees; nothing is traced again
+used_inputs(jax.make_jaxpr(simulate)(features, key))    # of each array, whether results use it
 call, variables = as_function(program, step)        # one equation of a program, alone
 moving = of_some(call, values, [0, 2])              # of the first and third of its arguments
 """
@@ -12,6 +13,7 @@ from typing import Any
 import jax
 import jax.extend.core
 import jax.numpy as jnp
+from jax.interpreters import partial_eval
 
 PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
 """The class of a program with its constants; newer versions of JAX have one class of programs."""
@@ -22,6 +24,12 @@ def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
     known = jax.extend.core.jaxpr_as_fun(traced.jaxpr)
     form = jax.tree.structure(traced.out_info)
     return lambda *arguments: jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
+
+
+def used_inputs(program: jax.extend.core.ClosedJaxpr) -> list[bool]:
+    """Return which inputs of a program any of its results depends on."""
+    results = [True] * len(program.jaxpr.outvars)
+    return partial_eval.dce_jaxpr(program.jaxpr, results)[1]
 
 
 def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list[Any]]:

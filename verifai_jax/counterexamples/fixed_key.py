@@ -32,6 +32,9 @@ class FixedKey(System):
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         return self.system(features, self.key)
 
+    def may_draw(self, features: Features) -> bool:
+        return False
+
     def check(self, features: Features) -> None:
         self.system.check(features)
 
@@ -74,6 +77,11 @@ def key_of(run: Run, row: int | None) -> Key[Array, ""]:
     return simulation_key(run_keys(run.seed)[1], 0 if row is None else row)
 
 
+def hold_key(problem: Problem, key: Key[Array, ""]) -> Problem:
+    """Return the problem with every simulation on one random key."""
+    return replace(problem, system=FixedKey(problem.system, key))
+
+
 def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:
     """Return the problem with every simulation on the random key of one row.
 
@@ -82,4 +90,4 @@ def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:
     """
     if not problem.black_box and not problem.draws():
         return problem
-    return replace(problem, system=FixedKey(problem.system, key_of(run, row)))
+    return hold_key(problem, key_of(run, row))

@@ -36,6 +36,7 @@ from verifai_jax.estimation.normal_space import LimitState
 from verifai_jax.estimation.result import METHODS, Estimate
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
@@ -122,6 +123,7 @@ def estimate(
             together=1 if executor is None else AT_ONCE,
             gradient=simulated.gradient if _differentiates(choice.problem) else None,
             uniform=simulated.uniform,
+            draws=depends_on_key(choice.problem),
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:

@@ -8,17 +8,22 @@ its probabilities are multiples of 6e-8. So features are computed from the point
 precision, and simulated in that of the run.
 """
 
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from verifai_jax.core.executors import Executor
+from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.host_engine import HostEngine
+from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 
@@ -114,12 +119,7 @@ class DoublePrecisionEvaluator:
     def __call__(
         self, u: Float[np.ndarray, "n d"]
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        points: Any = u
-        if self._held:
-            padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
-            with in_precision("float64"):
-                points = np.asarray(self._numbers(padded))[: len(u)]
-        verdicts = self._evaluator(points)
+        verdicts = self._evaluator(self._plain(u))
         return verdicts.least, verdicts.violated, verdicts.proper
 
     def gradient(
@@ -140,23 +140,59 @@ class DoublePrecisionEvaluator:
                 self._problem, self._batch, gradient=True, precision=self._precision,
                 seed=self._seed,
             )  # fmt: skip
-        points: Any = u
-        padded = np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
-        if self._held:
-            with in_precision("float64"):
-                points = np.asarray(self._numbers(padded))[: len(u)]
         # Each simulation keeps a random key of its own, by its number.
         first = self._evaluator.simulations
-        verdicts = self._differentiated(points, TEMPERATURE, first)
+        verdicts = self._differentiated(self._plain(u), TEMPERATURE, first)
         self._evaluator.simulations = first + len(u)
-        slopes = verdicts.gradient
-        assert slopes is not None
-        slopes = np.asarray(slopes, np.float64)
+        return verdicts.least, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
+
+    def held(
+        self, u: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Evaluate points, each with the random key of an earlier simulation by its number."""
+        verdicts = self._held_keys(self._plain(u), numbers)
+        return verdicts.least, verdicts.violated, verdicts.proper
+
+    def gradient_held(
+        self, u: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"]
+    ) -> tuple[
+        Float[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Bool[np.ndarray, " n"],
+        Float[np.ndarray, "n d"],
+    ]:
+        """Evaluate points with the random keys of earlier simulations, and differentiate."""
+        verdicts = self._held_slopes(self._plain(u), numbers, TEMPERATURE)
+        return verdicts.least, verdicts.violated, verdicts.proper, self._by_cube(u, verdicts)
+
+    @cached_property
+    def _held_keys(self) -> "HeldKeys":
+        return HeldKeys(self._problem, self._batch, self._precision, self._seed)
+
+    @cached_property
+    def _held_slopes(self) -> "HeldKeys":
+        return HeldKeys(self._problem, self._batch, self._precision, self._seed, gradient=True)
+
+    def _padded(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "padded d"]:
+        return np.pad(u, ((0, -len(u) % self._batch), (0, 0)), mode="edge")
+
+    def _plain(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n numbers"]:
+        """Return the plain numbers of points; the points themselves where they are not held."""
+        if not self._held:
+            return u
+        with in_precision("float64"):
+            return np.asarray(self._numbers(self._padded(u)))[: len(u)]
+
+    def _by_cube(self, u: Float[np.ndarray, "n d"], verdicts: Verdicts) -> Float[Any, "n d"]:
+        """Return the derivatives by the coordinates of the cube."""
+        assert verdicts.gradient is not None
+        slopes = np.asarray(verdicts.gradient, np.float64)
         if self._held:
+            padded = self._padded(u)
             slopes = np.pad(slopes, ((0, len(padded) - len(u)), (0, 0)))
             with in_precision("float64"):
                 slopes = np.asarray(self._pullback(padded, slopes))[: len(u)]
-        return verdicts.least, verdicts.violated, verdicts.proper, slopes
+        return slopes
 
     def compile(self) -> None:
         """Compile the program of a batch now."""
@@ -183,6 +219,52 @@ class DoublePrecisionEvaluator:
         np.fill_diagonal(points, value)
         with in_precision("float64"):
             return np.asarray(self._numbers(points))
+
+
+class HeldKeys:
+    """Evaluates points with random keys of a run by their numbers; those of `Evaluator`.
+
+    **Arguments:** as of `Evaluator`.
+    """
+
+    def __init__(
+        self, problem: Problem, batch: int, precision: str, seed: int, *, gradient: bool = False
+    ) -> None:
+        self.batch, self.precision = batch, precision
+        self._keys = jax.jit(jax.vmap(partial(simulation_key, run_keys(seed)[1])))
+        self._engine: Engine | HostEngine
+        if problem.black_box:
+            self._engine = HostEngine(problem, precision)
+            self._features = jax.jit(jax.vmap(problem.space.unflatten))
+        else:
+            self._engine = Engine(
+                problem, batch, gradient, precision=precision, own_keys=True, effort="little"
+            )
+
+    def __call__(
+        self, points: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"], *temperature: float
+    ) -> Verdicts:
+        """Simulate points with the keys of these numbers."""
+        return Verdicts.concatenate(
+            [
+                self._block(points[i : i + self.batch], numbers[i : i + self.batch], *temperature)
+                for i in range(0, len(points), self.batch)
+            ]
+        )
+
+    def _block(self, points: Any, numbers: Any, temperature: float = 1.0) -> Verdicts:
+        count, size = len(points), self.batch
+        numbers = np.pad(numbers, (0, size - count), mode="edge").astype(np.int32)
+        keys = self._keys(numbers)
+        points = np.asarray(points, np.float32)
+        if isinstance(self._engine, Engine):
+            return self._engine.evaluate(points, keys[:count], temperature=temperature)
+        with in_precision(self.precision):
+            padded = np.pad(points, ((0, size - count), (0, 0)), mode="edge")
+            features = jax.tree.map(
+                lambda leaf: np.asarray(leaf)[:count], self._features(padded.astype(self.precision))
+            )
+        return self._engine.evaluate_features(features, keys[:count])
 
 
 def _flat(features: Any) -> Array:

@@ -27,6 +27,7 @@ from verifai_jax.estimation.intervals import (
     weighted_mean,
 )
 from verifai_jax.estimation.mixture import Mixture, fit_mixture, optimal_shares
+from verifai_jax.estimation.monte_carlo import Counts
 from verifai_jax.estimation.normal_space import Ended, LimitState, Scores
 
 SHARE_OF_STAGE = 0.1
@@ -66,6 +67,7 @@ class ImportanceSamples:
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
     - `failures`: the points among them that fail.
+    - `keys`: numbers of the random keys with which these do.
     - `proposal`: the mixture that was sampled.
     - `coarse`: relative error by single precision at the end of a coordinate.
     - `acceptance`: share of the prior that the constraint accepts, and its relative error.
@@ -78,6 +80,7 @@ class ImportanceSamples:
     origin: Int[np.ndarray, " n"]
     failing: Bool[np.ndarray, " n"]
     failures: Float[np.ndarray, "failures d"]
+    keys: Int[np.ndarray, " failures"]
     proposal: Mixture
     coarse: float
     acceptance: tuple[float, float]
@@ -108,10 +111,16 @@ class ImportanceSamples:
     def _widened(self, x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
         """Widen the interval where a heavy tail hides a part of the variance of the samples."""
         mean = weighted_mean(x)
-        factor = 1 + SLOPE * float(np.clip(mean.tail - LIGHT, 0.0, 1.0))
+        factor = widening(mean.tail)
         low, high = skewed_interval(x, confidence)
         low = max(mean.mean - factor * (mean.mean - low), low / factor**2)
         return low, mean.mean + factor * (high - mean.mean)
+
+    @property
+    def counts(self) -> Counts:
+        """Counts of these samples, where the proposal is the prior."""
+        missing = int(np.count_nonzero(self.without))
+        return Counts(self.simulations, int(self.failing.sum()), missing)
 
     @property
     def defensive_counts(self) -> tuple[int, int]:
@@ -127,11 +136,17 @@ class FittedProposal:
     - `proposal`: the fitted mixture.
     - `effective`: effective failures per simulation.
     - `tail`: tail index of their weights.
+    - `probability`: of a failure, by these samples.
     """
 
     proposal: Mixture
     effective: float
     tail: float
+    probability: float = 0.0
+
+    def promise(self, simulations: int) -> float:
+        """Return the failures that so many samples are worth, once a heavy tail has widened."""
+        return self.effective * simulations / widening(self.tail) ** 2
 
 
 def fit_proposal(
@@ -159,9 +174,9 @@ def fit_proposal(
     mixture, anchored = proposal, None if anchors is None else anchors.fit()
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposals, zs, failing = [], [], []
-    effective, tail, before, left = 0.0, np.inf, 0.0, simulations
+    effective, tail, before, left, probability = 0.0, np.inf, 0.0, simulations, 0.0
     for stage in range(MOST_STAGES):
-        z, _, scores, ratio = _draw(limit_state, rng, proposal, size)
+        z, _, scores, ratio, _ = draw(limit_state, rng, proposal, size)
         left -= size
         proposals.append(proposal)
         zs.append(z)
@@ -170,6 +185,7 @@ def fit_proposal(
         if len(w) < 10:
             continue
         effective, tail = effective_size(w) / len(z), tail_index(w)
+        probability = float(w.sum()) / len(z)
         # All stages together are samples of the mean of their proposals.
         new = np.concatenate([z[f] for z, f in zip(zs, failing, strict=True)])
         counts = np.array([len(z) for z in zs], float)
@@ -192,7 +208,12 @@ def fit_proposal(
         if stage and tail < STEADY and (effective * left > ENOUGH or effective * left < before):
             break
         before = effective * left
-    return FittedProposal(proposal, effective, tail)
+    return FittedProposal(proposal, effective, tail, probability)
+
+
+def widening(tail: float) -> float:
+    """Return the factor by which a heavy tail widens an interval."""
+    return 1 + SLOPE * float(np.clip(tail - LIGHT, 0.0, 1.0))
 
 
 def _share_out(
@@ -234,7 +255,7 @@ def sample_proposal(
     """
     started = limit_state.simulations
     acceptance = limit_state.acceptance(rng)
-    z, origin, scores, ratio = _draw(limit_state, rng, proposal, simulations)
+    z, origin, scores, ratio, numbers = draw(limit_state, rng, proposal, simulations)
     inverse = 1 / ratio
     x = np.where(scores.failing, inverse, 0.0)
     without = np.where(scores.proper, 0.0, inverse)
@@ -242,17 +263,18 @@ def sample_proposal(
     outside = np.any((np.abs(z) > OUTERMOST) & clamped, axis=1)
     edge = np.where(outside, HIDDEN * x, 0.0)
     return ImportanceSamples(
-        x, without, edge, origin, scores.failing, z[scores.failing], proposal, _coarse(z, x),
-        acceptance, limit_state.simulations - started,
+        x, without, edge, origin, scores.failing, z[scores.failing], numbers[scores.failing],
+        proposal, _coarse(z, x), acceptance, limit_state.simulations - started,
     )  # fmt: skip
 
 
-def _draw(
+def draw(
     limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, n: int
-) -> tuple[np.ndarray, np.ndarray, Scores, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, Scores, np.ndarray, np.ndarray]:
     """Draw about `n` points of the proposal and simulate those that the constraint accepts.
 
-    **Returns:** points, components, scores, and densities over the prior's; fewer where time ends.
+    **Returns:** points, components, scores, densities over the prior's, and numbers of random keys;
+    fewer where time ends.
     """
     if limit_state.constraint is not None and n:
         share = max(float(np.mean(limit_state.accepts(proposal.sample(rng, 4096)[0]))), 0.01)
@@ -261,17 +283,19 @@ def _draw(
     z, origin = proposal.sample(rng, n)
     accepted = np.flatnonzero(limit_state.accepts(z))[: limit_state.left]
     scores = Scores(np.full(n, np.inf), np.zeros(n, bool), np.ones(n, bool))
+    numbers = np.zeros(n, int)
     size, done = limit_state.batch * AT_ONCE, 0
     try:
         for start in range(0, len(accepted), size):
             rows = accepted[start : start + size]
+            numbers[rows] = limit_state.evaluated + np.arange(len(rows))
             for column, values in zip(scores, limit_state(z[rows]), strict=True):
                 column[rows] = values
             done += len(rows)
     except Ended:
         n = int(accepted[done]) if done < len(accepted) else n
     scores = Scores(*(column[:n] for column in scores))
-    return z[:n], origin[:n], scores, proposal.ratio(z[:n])
+    return z[:n], origin[:n], scores, proposal.ratio(z[:n]), numbers[:n]
 
 
 def _coarse(z: Float[np.ndarray, "n d"], x: Float[np.ndarray, " n"]) -> float:

@@ -19,8 +19,9 @@ from jaxtyping import Bool, Float
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation import importance, monte_carlo
 from verifai_jax.estimation.anchors import anchors_of, join_explorations
+from verifai_jax.estimation.components import Prior
 from verifai_jax.estimation.exploration import Exploration, explore
-from verifai_jax.estimation.importance import DEFENSIVE, STEADY
+from verifai_jax.estimation.importance import DEFENSIVE, STEADY, FittedProposal
 from verifai_jax.estimation.initial_proposal import (
     Agreement,
     compare_explorations,
@@ -30,6 +31,7 @@ from verifai_jax.estimation.initial_proposal import (
 from verifai_jax.estimation.intervals import log_interval
 from verifai_jax.estimation.mixture import Mixture, fit_mixture
 from verifai_jax.estimation.monte_carlo import Counts
+from verifai_jax.estimation.moved_priors import SURE, moved_priors, share_failing_again, share_out
 from verifai_jax.estimation.normal_space import Ended, LimitState
 from verifai_jax.estimation.splitting import (
     FirstLevel,
@@ -42,6 +44,10 @@ COUNTED = 0.06
 """Relative error at which counting the failures of the prior is good enough."""
 LEAST_EFFECTIVE = 60
 """Effective failures that importance sampling has to promise."""
+LEAST_OF_MOVED = 15
+"""The same of the moved prior, whose weights have no such tail as those of fitted proposals."""
+FEWEST_COUNTED = 10
+"""Failures of the first samples from which on their rate says what counting promises."""
 WORST_TAIL = 0.7
 """Tail index beyond which weighted samples are not relied on (Vehtari et al., 2024)."""
 SHARE_OF_LEVEL = 0.06
@@ -172,29 +178,37 @@ def estimate_by_importance_sampling(
     counts = _counts(first)
     if limit_state.left <= 0:
         return _monte_carlo_answer(counts, plan)
-    run = SplittingRun(stopped="ended")
+    run, again = SplittingRun(stopped="ended"), 1.0
     try:
         explorations = _explore(limit_state, rng)
         reserve = round(RESERVED * limit_state.budget) if explorations else 0
-        run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first, reserve)
-        if run.stopped is not None and not explorations:
-            return _bound_only(limit_state, rng, plan, run, counts)
-        points, chain_ids, proposals = _proposals(limit_state, rng, plan, run, explorations)
-        anchors = anchors_of(explorations, DEFENSIVE) if explorations else None
-        fitted = importance.fit_proposal(
-            limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
-        )
-        promised = fitted.effective * limit_state.left
-        if promised < LEAST_EFFECTIVE:
-            if run.stopped is not None:
+        if explorations:
+            points = np.concatenate([exploration.points for exploration in explorations])
+            again = share_failing_again(limit_state, rng, points)
+        if again >= SURE:
+            run = run_splitting(limit_state, rng, len(first[0]), plan.chains, first, reserve)
+            if run.stopped is not None and not explorations:
                 return _bound_only(limit_state, rng, plan, run, counts)
-            answer = _splitting_answer(limit_state, rng, plan, [run], counts)
-            answer.notes.append(
-                "no proposal fits the failures well enough for importance sampling (it promises "
-                f"{promised:.0f} effective failures, tail index {fitted.tail:.2f}), so the "
-                "estimate is that of multilevel splitting"
+            if run.stopped is None:
+                again = min(again, share_failing_again(limit_state, rng, run.points))
+        by_chance = again < SURE
+        if by_chance:
+            points = run.points
+            ends = [one.nearest for one in explorations] or [points]
+            proposals = [moved_priors(each) for each in ends]
+            fitted = share_out(limit_state, rng, mix(proposals), limit_state.left)
+        else:
+            points, chain_ids, proposals = _proposals(limit_state, rng, plan, run, explorations)
+            anchors = anchors_of(explorations, DEFENSIVE) if explorations else None
+            fitted = importance.fit_proposal(
+                limit_state, rng, points, chain_ids, limit_state.left, mix(proposals), anchors
             )
-            return answer
+        counted = _promised_by_counting(limit_state, fitted, counts)
+        least = max(counted, LEAST_OF_MOVED if by_chance else 0)
+        few = not by_chance and fitted.effective * limit_state.left < LEAST_EFFECTIVE
+        if few or fitted.promise(limit_state.left) < least:
+            answer = _without_proposal(limit_state, rng, plan, run, counts, fitted, counted)
+            return _with_chance(answer, again)
         # A little is left over to see whether the searches agree.
         size = limit_state.left - round(SHARE_OF_PATHS * limit_state.budget)
         samples = importance.sample_proposal(
@@ -213,10 +227,73 @@ def estimate_by_importance_sampling(
         )
     except Ended:
         return _without_samples(limit_state, rng, plan, run, counts)
-    answer = _importance_answer(samples, run, agreement, counts, plan)
+    answer = _with_chance(_importance_answer(samples, run, agreement, counts, plan), again)
     answer.samples = samples
     if explorations:
         answer.nearest = join_explorations(explorations).nearest
+    return answer
+
+
+def _promised_by_counting(limit_state: LimitState, fitted: FittedProposal, counts: Counts) -> float:
+    """Return the failures that are likely counted, if all that is left samples the prior."""
+    many = counts.failures >= FEWEST_COUNTED
+    rate = counts.failures / counts.simulations if many else fitted.probability
+    return rate * (limit_state.left + counts.simulations)
+
+
+def _without_proposal(
+    limit_state: LimitState,
+    rng: np.random.Generator,
+    plan: Plan,
+    run: SplittingRun,
+    counts: Counts,
+    fitted: FittedProposal,
+    counted: float,
+) -> Answer:
+    """Answer by splitting or by counting, whichever promises more.
+
+    Chains of a system that draws keep the failures that were lucky, and splitting is far too low
+    then: it is no alternative.
+    """
+    why = (
+        "no proposal fits the failures well enough for importance sampling (it promises "
+        f"{fitted.effective * limit_state.left:.0f} effective failures, tail index "
+        f"{fitted.tail:.2f}; counting {counted:.0f})"
+    )
+    if run.stopped is None and not limit_state.draws and _promised_by(run, limit_state) > counted:
+        answer = _splitting_answer(limit_state, rng, plan, [run], counts)
+        answer.notes.append(f"{why}, so the estimate is that of multilevel splitting")
+        return answer
+    prior = Mixture((Prior(limit_state.dim),), np.ones(1))
+    samples = importance.sample_proposal(limit_state, rng, prior, limit_state.left, plan.clamped)
+    answer = _bound_only(limit_state, rng, plan, run, counts + samples.counts)
+    answer.samples = samples
+    if answer.probability is not None:
+        answer.notes.append(f"{why}, so failures are counted in samples of the prior")
+    return answer
+
+
+def _promised_by(run: SplittingRun, limit_state: LimitState) -> float:
+    """Return the failures that splitting is worth, with as many more runs as what is left."""
+    more = limit_state.left / _cost(run, run.first[0])
+    return (1 + more) / max(UNDERSTATED * run.cv, 1e-6) ** 2
+
+
+def _cost(run: SplittingRun, size: int) -> float:
+    """Return the simulations of a splitting run with levels of this size."""
+    return size + (len(run.fractions) - 1) * (size - size // CHAIN)
+
+
+def _with_chance(answer: Answer, again: float) -> Answer:
+    """Say of an answer how far the system's own draws decide, where they do."""
+    if again < 1:
+        answer.diagnostics["failing_again"] = again
+    if again < SURE:
+        answer.notes.append(
+            "the system draws random numbers, and they decide with the features whether a "
+            f"simulation fails: of the failures found {format_percent(again)} fail again with "
+            "other random keys. The probability is over both"
+        )
     return answer
 
 
@@ -291,7 +368,7 @@ def _importance_answer(
     answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
     if run.stopped is None:
         check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)
-    else:
+    elif run.levels:
         answer.notes.append(
             "splitting reached no failure; the estimate rests on the failures that independent "
             "searches found"
@@ -367,7 +444,7 @@ def _splitting_answer(
 ) -> Answer:
     """Answer by the mean of these runs and of as many more as the budget allows."""
     size = runs[0].first[0]
-    cost = size + (len(runs[0].fractions) - 1) * (size - size // CHAIN)
+    cost = _cost(runs[0], size)
     # Half as large, where that gives two instead of one.
     while limit_state.left < 2.2 * cost and size >= 20 * CHAIN and len(runs) == 1:
         size, cost = size // 2 // CHAIN * CHAIN, cost / 2

@@ -85,6 +85,11 @@ class LimitState:
     - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
       out. A simulation with its gradient counts 2.
     - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
+    - `draws`: whether the system draws from the random key of its simulation, so that a point fails
+      with a probability.
+
+    `evaluated` counts simulations, one with its gradient once: it is the number of the next random
+    key.
     """
 
     def __init__(
@@ -99,13 +104,14 @@ class LimitState:
         together: int = 1,
         gradient: Differentiate | None = None,
         uniform: Bool[np.ndarray, " dim"] | None = None,
+        draws: bool = False,
     ) -> None:
         self.step = batch * together
         self.evaluate, self.dim, self.budget, self.batch = evaluate, dim, budget, batch
         self.constraint, self.deadline, self.report = constraint, deadline, report
-        self.gradient = gradient
+        self.gradient, self.draws = gradient, draws
         self.uniform = np.zeros(dim, bool) if uniform is None else uniform
-        self.simulations = self.failures = self.no_verdict = 0
+        self.simulations = self.evaluated = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.least = np.inf
@@ -215,6 +221,7 @@ class LimitState:
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
         score[failing] = -np.inf
         self.simulations += len(z)
+        self.evaluated += len(z)
         self.failures += int(failing.sum())
         self.no_verdict += int((~proper).sum())
         if known.any():

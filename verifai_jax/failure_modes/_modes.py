@@ -11,7 +11,7 @@ estimate, and sum to it.
 """
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -21,11 +21,12 @@ from jaxtyping import Bool, Float, Int
 
 from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.errors import suggests_options
-from verifai_jax.core.keys import run_keys
+from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.text import format_time
 from verifai_jax.counterexamples.description import describe_predicate
+from verifai_jax.counterexamples.fixed_key import hold_key
 from verifai_jax.counterexamples.selection import problem_of
 from verifai_jax.estimation._estimate import one_thread
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
@@ -41,21 +42,24 @@ from verifai_jax.estimation.methods import (
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.failure_modes.held_keys import Divided, Held, divide_under_keys
 from verifai_jax.failure_modes.naming import name_mode
 from verifai_jax.failure_modes.region_search import find_regions, share_explained
-from verifai_jax.failure_modes.regions import Regions
 from verifai_jax.failure_modes.result import Mode, Modes
 from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options
 from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl.formula import Predicate
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
 DIVIDING, MOST_DIVIDING = 0.25, 6500
 """Share of the budget that divides the failures, and most of these simulations; the rest is for the
 probability."""
+MORE_DIVIDING = 2
+"""Factor on that share for a system that draws random numbers."""
 SHOWN = 200
 """Failures of a mode that its result keeps, and samples of the prior that its name is told from."""
 OUTWARD = (1.0, 1.005, 1.02, 1.05)
@@ -93,7 +97,8 @@ def modes(
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
 
     **Returns:** the modes, the most probable first; none where no failure was found or failures
-    could not be weighed, and a note says so.
+    could not be weighed, and a note says so. Where the system draws random numbers, probabilities
+    are over these too, and each mode holds the random key under which its likeliest failure fails.
 
     **Raises:** `TypeError` for something that is no problem or run; `ValueError` for options out of
     range, or a run that was loaded without its problem.
@@ -109,11 +114,14 @@ def modes(
     check_fraction("least_share", least_share)
     in_precision(precision)
     problem.space.check_where()
-    estimated = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
-    chains = chains_for(estimated, SHARE_OF_LEVEL)
+    least = int(budget) - min(round(DIVIDING * budget), MOST_DIVIDING)
+    chains = chains_for(least, SHARE_OF_LEVEL)
     batch = min(chains if batch is None else batch, budget)
     chosen = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     chosen.problem.check()
+    draws = depends_on_key(chosen.problem)
+    # Under each of several keys the failures are divided.
+    estimated = int(budget) - (MORE_DIVIDING if draws else 1) * (int(budget) - least)
     simulated = DoublePrecisionEvaluator(chosen.problem, batch, precision, seed)
     simulated.compile()
     rng = np.random.default_rng(seed)
@@ -128,6 +136,7 @@ def modes(
             report=bar.update,
             gradient=simulated.gradient if _has_slopes(chosen.problem) else None,
             uniform=simulated.uniform,
+            draws=draws,
         )
         plan = Plan(confidence, chains, simulated.clamped)
         try:
@@ -136,13 +145,18 @@ def modes(
             limit_state.ended = "interrupted"
             answer = bound_from_pilot(limit_state, plan)
         limit_state.budget = int(budget)
-        regions, unexplained = _divide(limit_state, rng, answer, _failures_of(source), plan)
+        held = _under_keys(simulated, limit_state)
+        divided = _divide(limit_state, held, rng, answer, _failures_of(source))
     bound = answer.prior.upper_bound(confidence)
-    listed, rest, run = (), 0.0, None
-    if regions is not None and answer.samples is not None:
-        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
-        listed, rest, run = _list_modes(numbers, rng, answer.samples, regions)
+    listed, rest, run, unexplained = (), 0.0, None, (0.0, 1.0)
     notes = list(answer.notes)
+    if divided is not None and answer.samples is not None:
+        numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
+        listed, rest, run = _list_modes(numbers, rng, answer, divided)
+        missed = clopper_pearson(divided.tried - divided.joined, divided.tried, confidence)
+        unexplained = (missed.low, missed.high)
+        if divided.held:
+            notes.append(divided.note)
     if answer.probability is not None and not listed:
         notes.append(
             "the failures could not be weighed one by one, so the probability is not divided into "
@@ -169,20 +183,16 @@ def modes(
     )
 
 
+@dataclass(frozen=True)
 class _Numbers:
     """Settings of one call that the listing of modes needs."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        seed: int,
-        precision: str,
-        backend: str | None,
-        confidence: float,
-        least_share: float,
-    ) -> None:
-        self.problem, self.seed, self.precision, self.backend = problem, seed, precision, backend
-        self.confidence, self.least_share = confidence, least_share
+    problem: Problem
+    seed: int
+    precision: str
+    backend: str | None
+    confidence: float
+    least_share: float
 
 
 def _has_slopes(problem: Problem) -> bool:
@@ -210,17 +220,40 @@ def _failures_of(source: Problem | Run) -> Float[np.ndarray, "n d"] | None:
     return ndtri(np.clip(points, 1e-8, 1 - 1e-8))
 
 
+def _under_keys(simulated: DoublePrecisionEvaluator, limit_state: LimitState) -> Held:
+    """Return what makes the limit state under one random key."""
+
+    def held(key: int, budget: int) -> LimitState:
+        def numbers(u: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
+            return np.full(len(u), key)
+
+        slopes = None
+        if limit_state.gradient is not None:
+            slopes = lambda u: simulated.gradient_held(u, numbers(u))  # noqa: E731
+        return LimitState(
+            lambda u: simulated.held(u, numbers(u)),
+            limit_state.dim,
+            budget,
+            limit_state.batch,
+            constraint=limit_state.constraint,
+            deadline=limit_state.deadline,
+            gradient=slopes,
+            uniform=limit_state.uniform,
+        )
+
+    return held
+
+
 def _divide(
     limit_state: LimitState,
+    held: Held,
     rng: np.random.Generator,
     answer: Answer,
     more: Float[np.ndarray, "n d"] | None,
-    plan: Plan,
-) -> tuple[Regions | None, tuple[float, float]]:
-    """Divide the weighted failures into regions; also the share that no region explains."""
-    nothing = (0.0, 1.0)
+) -> Divided | None:
+    """Divide the weighted failures into regions; None where there are none, or time ends."""
     if answer.samples is None or not answer.samples.x.any():
-        return None, nothing
+        return None
     samples = answer.samples
     x = samples.x[samples.failing]
     share = x / x.sum()
@@ -228,12 +261,13 @@ def _divide(
     nearest = [part for part in (answer.nearest, more) if part is not None]
     starts = np.concatenate(nearest) if nearest else z[:0]
     try:
+        if limit_state.draws:
+            return divide_under_keys(limit_state, held, rng, samples, starts)
         regions = find_regions(limit_state, rng, z, share, _failing(limit_state, starts))
         joined, tried = share_explained(limit_state, rng, regions, z, share)
     except (Ended, KeyboardInterrupt):
-        return None, nothing
-    interval = clopper_pearson(tried - joined, tried, plan.confidence)
-    return regions, (interval.low, interval.high)
+        return None
+    return Divided(regions, np.zeros(len(regions.points), int), joined, tried, 1.0, 0)
 
 
 def _failing(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "_ d"]:
@@ -241,10 +275,12 @@ def _failing(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.n
 
 
 def _list_modes(
-    numbers: _Numbers, rng: np.random.Generator, samples: ImportanceSamples, regions: Regions
+    numbers: _Numbers, rng: np.random.Generator, answer: Answer, divided: Divided
 ) -> tuple[tuple[Mode, ...], float, Run | None]:
     """Return the modes in the order of their probability, what is left, and their simulations."""
-    problem, whole = numbers.problem, min(samples.mean.mean, 1.0)
+    samples, regions = answer.samples, divided.regions
+    assert samples is not None
+    problem, whole = numbers.problem, answer.probability or min(samples.mean.mean, 1.0)
     of_sample = np.full(len(samples.x), -1)
     of_sample[samples.failing] = regions.assign(samples.failures)
     parts = [_part_of(samples, of_sample == k) for k in range(regions.count)]
@@ -253,10 +289,12 @@ def _list_modes(
     rest = whole * max(0.0, float(1 - masses[order].sum()))
     if not order:
         return (), rest, None
-    design = regions.design_points[order]
+    rows_of_design = np.array(regions.design_rows)[order]
+    design = regions.points[rows_of_design]
     likeliest = _columns(problem.space, design)
     prior = _columns(problem.space, rng.standard_normal((5 * SHOWN, problem.space.dim)))
-    run, rows = _simulate(numbers, design)
+    keys = divided.keys[rows_of_design]
+    found = _simulate_under(numbers, design, keys) if divided.held else _simulate(numbers, design)
     key = run_keys(numbers.seed)[1]
     listed = []
     of_failure = of_sample[samples.failing]
@@ -265,8 +303,13 @@ def _list_modes(
         drawn = rng.choice(len(chance), SHOWN, p=chance / chance.sum())
         failures = _columns(problem.space, samples.failures[drawn])
         low, high = parts[k].interval(numbers.confidence)
+        run, row = found[number]
         features = {str(name): value for name, value in likeliest.iloc[number].items()}
-        rho, cause = _cause(numbers, features, key)
+        if divided.held and row is not None:
+            # What is handed out is what fails.
+            simulated = run.table.all.loc[row]
+            features = {name: simulated[name] for name in features}
+        rho, cause = _cause(numbers, features, key, int(keys[number]))
         listed.append(
             Mode(
                 number=number,
@@ -280,14 +323,15 @@ def _list_modes(
                 rho=rho,
                 cause=cause,
                 failures=failures,
-                row=rows[number],
+                row=row,
                 problem=problem,
                 run=run,
                 key=key,
                 precision=numbers.precision,
+                key_number=int(keys[number]),
             )
         )
-    return tuple(listed), rest, run
+    return tuple(listed), rest, found[0][0]
 
 
 def _part_of(samples: ImportanceSamples, own: Bool[np.ndarray, " n"]) -> ImportanceSamples:
@@ -307,8 +351,8 @@ def _columns(space: FeatureSpace, z: Float[np.ndarray, "n d"]) -> pd.DataFrame:
     return pd.DataFrame(space.rows(features))
 
 
-def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> tuple[Run, list[int | None]]:
-    """Simulate the likeliest failures and points just beyond; return the failing row of each."""
+def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> list[tuple[Run, int | None]]:
+    """Simulate likeliest failures and points just beyond; return run and failing row of each."""
     count = len(design)
     points = np.concatenate([factor * design for factor in OUTWARD])
     frame = _columns(numbers.problem.space, points)
@@ -321,16 +365,29 @@ def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> tuple[Run,
         progress=False,
     )
     failing = set(run.table.counterexamples.index)
-    rows: list[int | None] = []
+    rows: list[tuple[Run, int | None]] = []
     for k in range(count):
         tried: Int[np.ndarray, " n"] = np.arange(k, len(points), count)
-        rows.append(next((int(row) for row in tried if row in failing), None))
-    return run, rows
+        rows.append((run, next((int(row) for row in tried if row in failing), None)))
+    return rows
 
 
-def _cause(numbers: _Numbers, features: dict[str, Any], key: Any) -> tuple[float, str]:
+def _simulate_under(
+    numbers: _Numbers, design: Float[np.ndarray, "k d"], keys: Int[np.ndarray, " k"]
+) -> list[tuple[Run, int | None]]:
+    """Simulate the same, each under the random key with that number, which its run holds."""
+    found: dict[int, tuple[Run, int | None]] = {}
+    for key in np.unique(keys).tolist():
+        own = np.flatnonzero(keys == key)
+        problem = hold_key(numbers.problem, simulation_key(run_keys(numbers.seed)[1], key))
+        under = replace(numbers, problem=problem)
+        found |= dict(zip(own.tolist(), _simulate(under, design[own]), strict=True))
+    return [found[k] for k in range(len(design))]
+
+
+def _cause(numbers: _Numbers, features: dict[str, Any], key: Any, number: int) -> tuple[float, str]:
     """Return the robustness at features, and the formula and predicate that decide, in words."""
-    replayed = replay(numbers.problem, features, key, None, numbers.precision)
+    replayed = replay(numbers.problem, features, key, number, numbers.precision)
     rho = min(replayed.rho.values())
     try:
         why = replayed.explain()

@@ -42,14 +42,18 @@ class Regions:
         return int(self.region.max()) + 1 if len(self.region) else 0
 
     @property
-    def design_points(self) -> Float[np.ndarray, "k d"]:
-        """The least distant failure of each region."""
+    def design_rows(self) -> list[int]:
+        """Rows of the least distant failure of each region."""
         norms = np.linalg.norm(self.points, axis=1)
-        rows = [
-            np.flatnonzero(self.region == k)[norms[self.region == k].argmin()]
+        return [
+            int(np.flatnonzero(self.region == k)[norms[self.region == k].argmin()])
             for k in range(self.count)
         ]
-        return self.points[rows]
+
+    @property
+    def design_points(self) -> Float[np.ndarray, "k d"]:
+        """The least distant failure of each region."""
+        return self.points[self.design_rows]
 
     def assign(self, z: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
         """Return the region of each failure: that of the nearest point."""

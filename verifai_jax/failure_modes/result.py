@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -11,6 +11,7 @@ import pandas as pd
 from jaxtyping import Array, Key
 
 from verifai_jax.core.figure import Figure
+from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
 from verifai_jax.core.text import format_percent
 from verifai_jax.counterexamples import explain, shrink
@@ -36,7 +37,10 @@ class Mode:
     - `rho`: robustness there.
     - `cause`: the formula and the predicate that decide there, in words; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as the prior's, one a row.
-    - `row`: row of `Modes.run` that fails at, or just beyond, the likeliest failure; None where
+    - `problem`: the problem.
+    - `run`: the simulations of the likeliest failure, all with its random key where the system
+      draws.
+    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None where
       none does.
     """
 
@@ -56,6 +60,12 @@ class Mode:
     run: Run = field(repr=False)
     key: Key[Array, ""] = field(repr=False)
     precision: str = "float32"
+    key_number: int = 0
+
+    @property
+    def random_key(self) -> Key[Array, ""]:
+        """The random key under which the likeliest failure fails, for `problem.system`."""
+        return simulation_key(self.key, self.key_number)
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -63,9 +73,12 @@ class Mode:
         return self.low, self.high
 
     def replay(self, precision: str | None = None) -> Replay:
-        """Simulate the likeliest failure again, and keep the trace."""
+        """Simulate the likeliest failure again, with its random key, and keep the trace."""
         columns: Mapping[str, Any] = self.features
-        return replay(self.problem, columns, self.key, None, precision or self.precision)
+        again = replay(
+            self.problem, columns, self.key, self.key_number, precision or self.precision
+        )
+        return replace(again, row=None)
 
     def animate(self, path: str | Path | None = None) -> Any:
         """Draw the likeliest failure as an animated GIF.

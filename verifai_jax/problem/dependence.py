@@ -1,4 +1,7 @@
-"""The dependence of a problem's robustness on its features, found without simulating.
+"""The dependence of a problem's robustness on its features and its key, without simulating.
+
+    has_gradient(problem)                           # can slopes by features say anything?
+    depends_on_key(problem)                         # does a point fail with a probability?
 
 A signal that is a whole number (a gear, a count) or a truth value is constant between its jumps:
 its derivative is zero wherever there is one. Where formulas speak of nothing else, slopes would
@@ -17,15 +20,18 @@ import jax
 import jax.extend.core
 import jax.numpy as jnp
 from jax.interpreters import ad
-from jaxtyping import Array
+from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import PROGRAM, as_function, of_some
+from verifai_jax.core.steps import PROGRAM, as_function, of_some, used_inputs
 from verifai_jax.problem.problem import Problem
 
 DEPENDENCE: Slot[None, bool] = Slot("dependence")
 """Whether the robustness of a problem depends differentiably on a feature."""
+
+KEY: Slot[None, bool] = Slot("dependence on the key")
+"""Whether the verdict of a simulation depends on its random key."""
 
 _FLAT = frozenset({"ceil", "floor", "nextafter", "round", "sign", "stop_gradient"})
 """Steps with real results whose derivative is zero."""
@@ -37,6 +43,31 @@ _CALLS |= {"remat2": "jaxpr", "checkpoint": "jaxpr", "remat": "jaxpr", "custom_v
 def has_gradient(problem: Problem) -> bool:
     """Return whether a monitored signal depends differentiably on a feature; traced once."""
     return problem.programs.get(DEPENDENCE, None, lambda: _depends(problem))
+
+
+def depends_on_key(problem: Problem) -> bool:
+    """Return whether the verdict of a simulation depends on its random key; traced once.
+
+    A key that is split, or from which numbers are drawn that nothing monitored uses, decides
+    nothing. A black box says whether it is given a seed, and one that is counts as one that draws:
+    no number of simulations could show that it does not.
+    """
+    return problem.programs.get(KEY, None, lambda: _uses_key(problem))
+
+
+@truncate_silently()
+def _uses_key(problem: Problem) -> bool:
+    features = problem.space.feature_form
+    if problem.black_box:
+        return problem.system.may_draw(features)
+
+    def judged(key: Key[Array, ""], features: PyTree) -> PyTree:
+        trace = problem.system(features, key)
+        signals = [trace.signals[name] for name in problem.monitored]
+        return signals, trace.valid, trace.status
+
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    return used_inputs(jax.make_jaxpr(judged)(key, features))[0]
 
 
 @truncate_silently()

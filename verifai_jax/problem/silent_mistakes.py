@@ -15,12 +15,11 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
-from jax.interpreters import partial_eval
 from jaxtyping import PyTree
 
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import Slot
-from verifai_jax.core.steps import PROGRAM
+from verifai_jax.core.steps import PROGRAM, used_inputs
 from verifai_jax.core.user_errors import source_line
 from verifai_jax.features import Categorical, Domain
 from verifai_jax.features.compound import Struct
@@ -155,11 +154,11 @@ def _program(problem: Problem, features: PyTree, key: Any) -> Program:
 
 def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[str]:
     """Yield the features that neither a monitored signal nor the constraint depends on."""
-    used = _used_inputs(program)
+    used = used_inputs(program)
     where = problem.space.where
     if where is not None:
         asked = jax.make_jaxpr(where)(features)
-        used = [one or other for one, other in zip(used, _used_inputs(asked), strict=False)]
+        used = [one or other for one, other in zip(used, used_inputs(asked), strict=False)]
     read: dict[tuple[str, ...], bool] = {}
     for (path, _), is_used in zip(jax.tree.leaves_with_path(features), used, strict=False):
         names = _names(path)
@@ -176,11 +175,6 @@ def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[st
             f"that the property speaks of ({', '.join(problem.monitored)}): "
             f"the search varies {'it' if one else 'them'} for nothing{COMPARED if texts else ''}"
         )
-
-
-def _used_inputs(program: Program) -> list[bool]:
-    outputs = [True] * len(program.jaxpr.outvars)
-    return partial_eval.dce_jaxpr(program.jaxpr, outputs)[1]
 
 
 def _names(path: jax.tree_util.KeyPath) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options, check_search, usual_batch
+from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
@@ -121,7 +122,11 @@ def synthesize(
     best, robustness = work.best, work.robustness
     searched = loop.simulations
     checked = None
-    if stopped != "interrupted" and held_out and (loop.environment is not None or problem.draws()):
+    if (
+        stopped != "interrupted"
+        and held_out
+        and (loop.environment is not None or depends_on_key(problem))
+    ):
         checked = _check(loop, best.theta, held_out, margin, seed, checking)
     if checked is not None and checked.least is not None:
         robustness = min(robustness, checked.least)

@@ -153,6 +153,17 @@ class System:
         """
         return None
 
+    def may_draw(self, features: Features) -> bool:
+        """Return whether a simulation of a host system may depend on its random key.
+
+        JAX tells of any other system. What nobody knows may.
+
+        **Arguments:**
+
+        - `features`: `jax.ShapeDtypeStruct`s.
+        """
+        return True
+
     @property
     def can_simulate_batch(self) -> bool:
         """True for a host system that simulates many rows in lock-step."""
@@ -256,6 +267,9 @@ class FunctionSystem(System):
         if self._offers("why_not"):
             return self._method("why_not")(backend)
         return super().why_not(backend)
+
+    def may_draw(self, features: Features) -> bool:
+        return self._method("may_draw")(features)
 
     @property
     def can_simulate_batch(self) -> bool:

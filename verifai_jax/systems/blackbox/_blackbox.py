@@ -174,6 +174,10 @@ class BlackBox(System):
         """Names of the signals of a trace; None where nothing but a simulation can tell."""
         return self.simulation.known_signals
 
+    def may_draw(self, features: Features) -> bool:
+        """Return whether the simulator is given a seed."""
+        return self.simulation.seeded
+
     def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
         as_system(self.simulation.function).check(features)
@@ -222,6 +226,10 @@ class PooledBlackBox(System):
     def known_signals(self) -> tuple[str, ...] | None:
         """Names of the signals of a trace; None where nothing but a simulation can tell."""
         return self.simulation.known_signals
+
+    def may_draw(self, features: Features) -> bool:
+        """Return whether the simulator is given a seed."""
+        return self.simulation.seeded
 
     def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
@@ -272,6 +280,10 @@ class VectorisedBlackBox(System):
         if self.seeded:
             seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
         return self._simulate(features, seeds, len(keys))
+
+    def may_draw(self, features: Features) -> bool:
+        """Return whether the simulator is given seeds."""
+        return self.seeded
 
     def abstract(self, features: Features) -> Trace | None:
         """Return the form of one trace, if it is given."""

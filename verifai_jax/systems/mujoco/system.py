@@ -19,6 +19,7 @@ from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options, unknown_name
+from verifai_jax.core.steps import used_inputs
 from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
@@ -149,6 +150,15 @@ class MuJoCo(System):
             )
 
         return jax.eval_shape(trace, features)
+
+    def may_draw(self, features: Features) -> bool:
+        """Return whether the state at time 0, which alone gets the key, depends on it."""
+        features, key = (
+            set_durations(features, self.duration),
+            jax.eval_shape(lambda: jax.random.key(0)),
+        )
+        program = jax.make_jaxpr(lambda key, features: self.loop.start(features, key))
+        return used_inputs(program(key, features))[0]
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once: traced by JAX unless the backend is native."""

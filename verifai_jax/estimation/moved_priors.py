@@ -1,0 +1,102 @@
+"""Proposals for systems that draw random numbers: the prior, moved towards where failures are.
+
+    if share_failing_again(limit_state, rng, failures) < SURE:
+        proposals = [moved_priors(ends) for ends in found]
+        fitted = share_out(limit_state, rng, mix(proposals), limit_state.left)
+
+Where a point fails with a probability, failures are distributed as the prior times it. A proposal
+that is fitted to failures, as for other systems, is the worst one then: places that fail seldom get
+the fewest samples, and a failure there weighs as much as thousands of others, or is not seen at all
+and nothing tells. The prior moved by a vector, as wide as it was, has weights without such a tail.
+
+Source: Asmussen and Glynn, Stochastic Simulation (2007), chapter VI, for exponential tilting.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from verifai_jax.estimation.components import Gaussian, Prior, log_ratios
+from verifai_jax.estimation.fitting import effective_size
+from verifai_jax.estimation.importance import (
+    DEFENSIVE,
+    MOST_STAGES,
+    SHARE_OF_STAGE,
+    FittedProposal,
+    draw,
+)
+from verifai_jax.estimation.intervals import tail_index
+from verifai_jax.estimation.mixture import Mixture, optimal_shares
+from verifai_jax.estimation.normal_space import LimitState, fails_at, farthest_first
+
+TRIED_AGAIN = 64
+"""Failures that are simulated again, to learn whether the system's own draws decide."""
+SURE = 0.8
+"""Share of them that has to fail again for proposals to be fitted to failures: then the place at
+which the draws decide is thinner than the failing region, and no narrower than what is fitted."""
+RUNGS = (0.3, 0.5, 0.7, 0.85, 1.0)
+"""Parts of the way from the middle of the prior to a failure by which the prior is moved: the less
+the more the draws decide."""
+ENDS = 12
+"""Failures towards which the prior is moved, at most."""
+EVEN = 0.5
+"""Share of the proposal in which all moves are alike; the rest is what the failures say is best."""
+
+
+def share_failing_again(
+    limit_state: LimitState, rng: np.random.Generator, failures: Float[np.ndarray, "n d"]
+) -> float:
+    """Simulate failures again with other random keys; return the share that fails again."""
+    count = min(TRIED_AGAIN, limit_state.left)
+    if not limit_state.draws or not count:
+        return 1.0
+    rows = rng.choice(len(failures), count)
+    return float(np.mean(fails_at(limit_state, failures[rows])))
+
+
+def moved_priors(ends: Float[np.ndarray, "m d"]) -> Mixture:
+    """Return the prior, and the prior moved by parts of the ways to failures, in equal parts."""
+    d = ends.shape[1]
+    if len(ends) > ENDS:
+        nearest = int(np.sum(ends**2, axis=1).argmin())
+        gaps = lambda row: np.linalg.norm(ends - ends[row], axis=1)  # noqa: E731
+        ends = ends[farthest_first(nearest, gaps, ENDS)]
+    moved = [Gaussian(part * end, np.eye(d), np.ones(d)) for end in ends for part in RUNGS]
+    shares = np.full(len(moved), (1 - DEFENSIVE) / len(moved))
+    return Mixture((Prior(d), *moved), np.append(DEFENSIVE, shares))
+
+
+def share_out(
+    limit_state: LimitState, rng: np.random.Generator, moves: Mixture, simulations: int
+) -> FittedProposal:
+    """Sample a mixture of moved priors in stages, and give more to the moves that are best.
+
+    **Arguments:**
+
+    - `moves`: the mixture, in which all have equal parts.
+    - `simulations`: number of simulations left; each stage takes a share of them.
+
+    **Returns:** the proposal, with the promise of all stages together.
+    """
+    size = max(1, int(SHARE_OF_STAGE * simulations))
+    proposal, counts = moves, []
+    zs: list[np.ndarray] = []
+    proposals: list[Mixture] = []
+    weight = np.zeros(0)
+    for _ in range(MOST_STAGES - 2):
+        z, _, scores, *_ = draw(limit_state, rng, proposal, size)
+        zs.append(z[scores.failing])
+        counts.append(len(z))
+        proposals.append(proposal)
+        new = np.concatenate(zs)
+        if len(new) < 10:
+            continue
+        part = np.array(counts, float) / sum(counts)
+        weight = 1 / (np.stack([p.ratio(new) for p in proposals], axis=1) @ part)
+        table = np.exp(log_ratios(moves.components[1:], new))
+        best = optimal_shares(table, weight / weight.sum(), DEFENSIVE)
+        proposal = moves.with_shares(EVEN * moves.shares[1:] / (1 - DEFENSIVE) + (1 - EVEN) * best)
+    total = max(sum(counts), 1)
+    tail = tail_index(weight) if len(weight) else np.inf
+    return FittedProposal(
+        proposal, effective_size(weight) / total, tail, float(weight.sum()) / total
+    )
