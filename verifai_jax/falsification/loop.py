@@ -273,6 +273,8 @@ class Rounds:
         if self._claims is not None:
             found = self._claims(columns, first)
             columns["verdict"] = found.verdict
+            if found.again is not None:
+                columns["rho_again"] = found.again
             self.compile_seconds += found.compile_seconds
             self.confirm_seconds += found.seconds
             self.checked = self._claims.checked or self.checked
