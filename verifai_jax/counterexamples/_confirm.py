@@ -93,12 +93,15 @@ class Confirmations:
       `band`, `why`.
     - `notes`: checks that could not be made, and why.
     - `checked`: the checks that a confirmed row has passed, in words.
+    - `wavering`: whether and how a host system did not give the numbers of the run again, in words;
+      the first of `notes`, where it is one.
     """
 
     name: str
     table: pd.DataFrame = field(repr=False)
     notes: tuple[str, ...]
     checked: str = ""
+    wavering: tuple[str, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -278,10 +281,12 @@ def _all(run: Run, confirmer: Confirmer) -> Confirmations:
         frame.iloc[block, frame.columns.get_loc("verdict")] = checked.verdict
         frame.iloc[block, frame.columns.get_loc("why")] = np.array(checked.why, object)
     notes = tuple(dict.fromkeys(note for _, checked in parts for note in checked.notes))
+    wavering: tuple[str, ...] = ()
     if "rho.again" in frame:
         again = {"again": frame["rho.again"].to_numpy(np.float64)}
-        notes = (*_own(confirmer, rho, again, frame["verdict"].to_numpy()), *notes)
-    return Confirmations(run.name, frame, (*notes, *stopped), confirmer.checked)
+        wavering = _own(confirmer, rho, again, frame["verdict"].to_numpy())
+    notes = (*wavering, *notes, *stopped)
+    return Confirmations(run.name, frame, notes, confirmer.checked, wavering)
 
 
 def _placed(

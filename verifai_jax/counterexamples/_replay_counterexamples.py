@@ -188,6 +188,10 @@ def _replay_batch(
         replays = Replays(problem, precision, key, features)
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
     [verdicts] = replays(1, [features], numbers)
+    again = None
+    if problem.black_box and np.any(verdicts.violated):
+        # A failure that is claimed has come twice.
+        [again] = replays(1, [features], numbers)
     formulas = {name: str(formula) for name, formula in problem.formulas.items()}
     results = {}
     for i, (path, entry, _) in enumerate(batch):
@@ -199,6 +203,12 @@ def _replay_batch(
         if status == Status.OK:
             robustness = float(np.min(verdicts.rho[i]))
             state = FAILING if bool(verdicts.violated[i]) else FIXED
+            if state == FAILING and again is not None and not bool(again.violated[i]):
+                state = WITHOUT_VERDICT
+                notes.append(
+                    f"simulated again it has robustness {float(np.min(again.rho[i])):.4g}: the "
+                    "system has memory or chance of its own"
+                )
         else:
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())

@@ -24,6 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.counterexamples import confirm
 from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.selection import problem_of
 from verifai_jax.estimation._estimate import one_thread
@@ -39,6 +40,7 @@ from verifai_jax.estimation.methods import (
 )
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.failure_modes.naming import name_mode
 from verifai_jax.failure_modes.region_search import find_regions, share_explained
@@ -135,11 +137,11 @@ def modes(
         limit_state.budget = int(budget)
         regions, unexplained = _divide(limit_state, rng, answer, _failures_of(source), plan)
     bound = answer.prior.upper_bound(confidence)
-    listed, rest, run = (), 0.0, None
+    listed, rest, run, numbers = (), 0.0, None, None
     if regions is not None and answer.samples is not None:
         numbers = _Numbers(chosen.problem, seed, precision, backend, confidence, least_share)
         listed, rest, run = _list_modes(numbers, rng, answer.samples, regions)
-    notes = list(answer.notes)
+    notes = [*([] if numbers is None else numbers.notes), *answer.notes]
     if answer.probability is not None and not listed:
         notes.append(
             "the failures could not be weighed one by one, so the probability is not divided into "
@@ -178,6 +180,7 @@ class _Numbers:
     ) -> None:
         self.problem, self.seed, self.precision, self.backend = problem, seed, precision, backend
         self.confidence, self.least_share = confidence, least_share
+        self.notes: list[str] = []
 
 
 def _has_slopes(problem: Problem) -> bool:
@@ -316,6 +319,12 @@ def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> tuple[Run,
         progress=False,
     )
     failing = set(run.table.counterexamples.index)
+    if numbers.problem.black_box and failing:
+        # What it claims has been simulated at least once more.
+        checked = confirm(run)
+        lost = np.isin(checked.table["verdict"].to_numpy(), NOT_CLAIMED)
+        failing -= set(checked.table.index.to_numpy()[lost])
+        numbers.notes += checked.wavering
     rows: list[int | None] = []
     for k in range(count):
         tried: Int[np.ndarray, " n"] = np.arange(k, len(points), count)
