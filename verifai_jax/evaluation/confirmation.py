@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
@@ -39,6 +40,7 @@ from verifai_jax.evaluation.confirmation_verdicts import (
     describe_checks,
     describe_disagreement,
 )
+from verifai_jax.evaluation.executor_replays import ExecutorReplays
 from verifai_jax.evaluation.replays import ONE_BY_ONE, HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -89,6 +91,8 @@ class Confirmer:
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
       examined before is examined whatever else was.
+    - `executor`, `target`: whose workers simulate a host system again, and how they find the
+      problem; this process when left out.
 
     Once rows were examined, `checked` says which checks a confirmed row has passed, `raised`
     what a replay raised first, if any did. `wavers` is whether a row gave another robustness when
@@ -105,6 +109,8 @@ class Confirmer:
         *,
         simulator: System | Callable[..., Trace] | Problem | str | None = None,
         most: int | None = None,
+        executor: Executor | None = None,
+        target: str | None = None,
     ) -> None:
         if most is not None and (
             isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1
@@ -112,6 +118,7 @@ class Confirmer:
             raise ValueError(f"most must be a positive integer; got {most!r}")
         in_precision(precision)
         self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
+        self.executor, self.target = executor, target
         self.other = None if simulator is None else _other(problem, simulator)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
         self.wavers = self.flips = False
@@ -397,7 +404,10 @@ def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarr
     run, key = confirmer.precision, run_keys(confirmer.seed)[1]
     if problem.black_box:
         notes = ("not checked in float64: a black box",)
-        return _Base(HostReplays(problem, run, key), run, notes)
+        if confirmer.executor is None or problem is not confirmer.problem:
+            return _Base(HostReplays(problem, run, key), run, notes)
+        replays = ExecutorReplays(problem, run, key, confirmer.executor, confirmer.target)
+        return _Base(replays, run, notes)
     # All of one form: one row is enough to trace.
     first = {name: column[:1] for name, column in rows.items()}
     note = "not checked in float64: in it the system would draw other random numbers"

@@ -100,7 +100,9 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self.suggestions: Suggestions | None = None
-        self._claims = RunClaims(problem, precision, seed) if confirm else None
+        self._claims = None
+        if confirm:
+            self._claims = RunClaims(problem, precision, seed, executor, target)
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
         self._pending: Any = None  # Points of the first round that are proposed already.

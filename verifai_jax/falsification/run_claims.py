@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from verifai_jax.core.executors import Executor
 from verifai_jax.evaluation.confirmation import Confirmer
 from verifai_jax.problem.problem import Problem
 
@@ -51,10 +52,19 @@ class RunClaims:
     - `problem`: on the backend that it runs on.
     - `precision`: of the run.
     - `seed`: of the run.
+    - `executor`, `target`: of the run, whose workers simulate a host system again, too.
     """
 
-    def __init__(self, problem: Problem, precision: str, seed: int) -> None:
-        self._confirmer, self._host = Confirmer(problem, precision, seed), problem.black_box
+    def __init__(
+        self,
+        problem: Problem,
+        precision: str,
+        seed: int,
+        executor: Executor | None = None,
+        target: str | None = None,
+    ) -> None:
+        self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
+        self._host = problem.black_box
 
     def prepare(self) -> None:
         """Trace the replays before there is a row, while something else compiles."""
