@@ -149,6 +149,21 @@ def test_another_number_that_fails_too_is_confirmed_and_told():
     assert vj.confirm(run).counts == {"confirmed": 20}
 
 
+def test_what_raises_when_it_is_simulated_again_is_not_claimed():
+    def raises(a, count):
+        if count > 20 and count % 2:
+            raise RuntimeError("the port is taken")
+        return -1.0
+
+    run = falsified(Counter(raises), 20, batch=20)
+    assert set(run.table.unconfirmed["verdict"]) == {"fragile"}
+    assert "10 did not fail" in str(run).splitlines()[1]
+    # Where nothing can be simulated any more, that says nothing of the row.
+    down = falsified(Counter(lambda a, count: -1.0 if count <= 20 else 1 / 0), 20, batch=20)
+    assert set(down.table.all["verdict"]) == {"raised"}
+    assert "every replay to confirm them raised" in str(down)
+
+
 def test_a_search_learns_what_came_again():
     # Fails by chance everywhere, but surely nowhere.
     system = failing_at(5)

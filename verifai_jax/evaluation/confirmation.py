@@ -121,7 +121,7 @@ class Confirmer:
         self.executor, self.target = executor, target
         self.other = None if simulator is None else _other(problem, simulator)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
-        self.wavers = self.flips = False
+        self.wavers = self.flips = self._works = False
         self.checked = ""
         self.raised: tuple[str, ...] = ()
         self._plan: _Plan | None = None
@@ -252,7 +252,15 @@ class Confirmer:
         if self.problem.black_box and "again" in found:
             values = features[plan.checks["again"].precision]
             found["again"] = self._insist(plan, values, numbers, found["again"], run)
-        decision = _decide(len(numbers), found, run, plan, by_far=not plan.plain or self.flips)
+            self._works = self._works or bool(np.any(found["again"].proper))
+        decision = _decide(
+            len(numbers),
+            found,
+            run,
+            plan,
+            by_far=not plan.plain or self.flips,
+            came_again=plan.plain and self._works,
+        )
         if self.problem.black_box and "verdict" in rows:
             _remember(decision, rows, plan.plain)
         return decision
@@ -271,7 +279,7 @@ class Confirmer:
         """
 
         def notice(rows: np.ndarray, seen: Verdicts) -> None:
-            held = bool(np.any(seen.proper & ~seen.violated))
+            held = bool(np.any(~seen.violated & ~np.isin(seen.status, RAISED)))
             self.flips = self.flips or held
             moved = run is not None and np.any(came_otherwise(run[rows], seen.least))
             self.wavers = self.wavers or held or bool(moved)
@@ -446,9 +454,21 @@ class _Decision(NamedTuple):
 
 
 def _decide(
-    count: int, found: dict[str, Verdicts], run: np.ndarray | None, plan: _Plan, by_far: bool
+    count: int,
+    found: dict[str, Verdicts],
+    run: np.ndarray | None,
+    plan: _Plan,
+    *,
+    by_far: bool,
+    came_again: bool,
 ) -> _Decision:
-    """Decide about rows from their replays; `by_far`: they have to fail by more than they moved."""
+    """Decide about rows from their replays.
+
+    **Arguments:**
+
+    - `by_far`: they have to fail by more than they moved.
+    - `came_again`: others could be simulated again, so that one that raised has not come again.
+    """
     base = next((name for name in ("float64", "again") if name in found), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
     rho = {name: replayed.least for name, replayed in found.items()}
@@ -474,7 +494,7 @@ def _decide(
     refuted = np.all([holding[name] for name in deciding], axis=0) & plan.finer
     refuted &= deciding[0] != "again"
     lost = np.any(list(raised.values()), axis=0) | bool(plan.raised)
-    lost &= np.all([failing[name] | raised[name] for name in found], axis=0)
+    lost &= np.all([failing[name] | raised[name] for name in found], axis=0) & (not came_again)
     verdict = np.select(
         [lost, fails & clear, refuted],
         ["raised", "confirmed", "refuted"],
@@ -499,7 +519,8 @@ def _remember(decision: _Decision, rows: Mapping[str, np.ndarray], plain: bool) 
     fails = np.all([replayed.violated for replayed in decision.replayed.values()], axis=0)
     for i in np.flatnonzero((rows["verdict"] == "confirmed") & fails & plain).tolist():
         decision.verdict[i], decision.why[i] = "confirmed", ""
-    known = np.isin(rows["verdict"], NOT_CLAIMED) & (decision.verdict == "confirmed")
+    known = np.isin(rows["verdict"], NOT_CLAIMED)
+    known &= np.isin(decision.verdict, ("confirmed", "raised"))
     for i in np.flatnonzero(known).tolist():
         decision.verdict[i] = "fragile"
         again = float(rows["rho_again"][i]) if "rho_again" in rows else float("nan")

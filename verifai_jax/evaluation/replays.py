@@ -199,6 +199,7 @@ class HostReplays:
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
+        self._renewed: System | None = None
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
 
@@ -212,11 +213,13 @@ class HostReplays:
         return self._replay(self.refiner(factor), each, numbers)
 
     def anew(self, features: PyTree, numbers: Int[np.ndarray, " n"]) -> list[Verdicts]:
-        """Simulate the rows of these numbers again, by a system without memory of earlier ones.
+        """Simulate rows again, by a system that has not simulated what the run did.
 
         That is the system itself, where it cannot be made anew.
         """
-        return self._replay(self.problem.system.renewed(), [features], numbers)
+        if self._renewed is None:
+            self._renewed = self.problem.system.renewed()
+        return self._replay(self._renewed, [features], numbers)
 
     def _replay(
         self, system: System, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
