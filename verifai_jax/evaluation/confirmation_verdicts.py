@@ -174,7 +174,7 @@ def _and(names: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Repetitions:
-    """How rows of a host system came again, simulated once more with the same features and key.
+    """Counts of how a host system gave its rows again, with the same features and key.
 
     - `rows`: violating rows that were simulated again.
     - `moved`: those with another robustness, beyond rounding, or none.
