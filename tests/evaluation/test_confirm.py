@@ -17,7 +17,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.trace import Trace
 from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmation import Confirmer
-from verifai_jax.evaluation.confirmation_verdicts import Checked
+from verifai_jax.evaluation.confirmation_verdicts import VERDICTS, Checked
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.evaluation.replays import ONE_BY_ONE
 from verifai_jax.systems.base import System
@@ -289,8 +289,9 @@ def test_random_systems_keep_their_numbers_and_their_precision():
     found = confirm(run)
     np.testing.assert_allclose(found.table["rho.again"], found.table["rho"], rtol=1e-5, atol=1e-7)
     assert "not checked in float64: in it the system would draw other random numbers" in found.notes
-    # The same numbers again say nothing new.
-    assert found.counts == {"unchecked": len(found)}
+    # With its own key each row comes again.
+    assert found.counts == {"confirmed": len(found)}
+    assert found.checked.startswith("when simulated again and one rounding of the features away")
     finer = confirm(run, int(run.best.name), simulator=noisy)
     assert finer.verdict == "confirmed"
 
@@ -316,7 +317,7 @@ def test_a_system_that_draws_is_traced_in_the_precision_of_the_run_alone():
     assert set(traced) == {np.dtype(np.float32)}
 
 
-def test_a_run_in_double_precision_without_a_finer_step_is_unchecked():
+def test_a_run_in_double_precision_is_replayed_in_it():
     run = vj.falsify(
         plain(lambda f, key: f["x"]),
         "uniform",
@@ -327,8 +328,8 @@ def test_a_run_in_double_precision_without_a_finer_step_is_unchecked():
         confirm=False,
     )
     found = confirm(run)
-    assert found.counts == {"unchecked": len(found)}
-    assert "nothing finer to check it with" in str(confirm(run, int(run.best.name)))
+    assert found.counts == {"confirmed": len(found)}
+    assert "no finer step could be tried" in str(found)
 
 
 def test_formulas_count_together():
@@ -345,7 +346,7 @@ def boxed(function, spec="always x <= 0.5"):
 def test_a_black_box_is_simulated_again():
     steady = boxed(lambda f: Trace({"x": np.full(4, f["x"])}, dt=0.1))
     found = checked(steady, [0.7, 0.9])
-    assert found.verdict.tolist() == ["unchecked"] * 2
+    assert found.verdict.tolist() == ["confirmed"] * 2
     assert found.notes == (
         "not checked in float64: a black box",
         "not checked at a finer step: the system has no refined(factor)",
@@ -621,7 +622,7 @@ def test_mujoco_on_both_engines(backend):
 
 def test_the_page_says_what_comes_out():
     text = (Path(__file__).parents[2] / "docs" / "confirm.md").read_text()
-    for verdict in ("confirmed", "fragile", "refuted", "unchecked", "unexamined"):
+    for verdict in VERDICTS:
         assert f"`{verdict}`" in text
 
 

@@ -116,8 +116,9 @@ def test_only_checks_that_were_made_are_named(run):
     confirmed = "confirmed" in text
     traced = confirmed and not run.problem.black_box
     assert ("in double precision" in text) == traced
+    assert ("when simulated again" in text) == (confirmed and run.problem.black_box)
     assert ("a quarter of the step" in text) == (confirmed and run.problem.system.can_refine)
-    assert ("no finer step" in text) == (traced and not run.problem.system.can_refine)
+    assert ("no finer step" in text) == (confirmed and not run.problem.system.can_refine)
 
 
 def test_the_rates_are_those_of_the_table(run):

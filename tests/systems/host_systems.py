@@ -53,6 +53,17 @@ def troublesome(features):
     return decay(features)
 
 
+calls = 0
+
+
+def counting(features):
+    """Fails at every third simulation of its process, and says in which process."""
+    global calls
+    calls += 1
+    x = -1.0 if calls % 3 == 0 else 1.0
+    return Trace({"x": np.array([x, x]), "pid": np.full(2, os.getpid())}, dt=1.0)
+
+
 def die_once(file):
     if not Path(file).exists():
         Path(file).touch()

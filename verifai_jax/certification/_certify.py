@@ -15,6 +15,7 @@ import numpy as np
 from verifai_jax.certification.allocation import Allocation, find_leader
 from verifai_jax.certification.attack import PolicyRecord, attack_policies, check_attack
 from verifai_jax.certification.blocks import Blocks, Remember
+from verifai_jax.certification.repetition import repeat_failures
 from verifai_jax.certification.result import Certificate, Certificates
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
@@ -118,6 +119,13 @@ def certify(
         stopped = _sample(blocks, sampled, allocation, margins, report)
     except KeyboardInterrupt:
         stopped = "interrupted"
+    notes: list[str] = []
+    if blocks.problem.black_box and stopped != "interrupted":
+        said = (
+            repeat_failures(blocks, number, sampled[number], attacked[number])
+            for number in range(len(policies))
+        )
+        notes = [f"policy {number}: {note}" for number, note in enumerate(said) if note]
     rows = tuple(
         _certificate(number, sampled[number], attacked[number], allocation, len(policies), blocks)
         for number in range(len(policies))
@@ -137,7 +145,7 @@ def certify(
         budget=budget,
         stopped=stopped,
         seconds=time.perf_counter() - started,
-        notes=(*blocks.notes, *_chance(blocks.problem, rows)),
+        notes=(*notes, *blocks.notes, *_chance(blocks.problem, rows)),
     )
 
 
@@ -171,7 +179,7 @@ def _sample(
             for block in range(int(wanted[number]))
         ]
         for (number, block), verdicts in blocks.certificate(chosen):
-            sampled[number].add(blocks.points(block), verdicts)
+            sampled[number].add(blocks.points(block), verdicts, block * blocks.lanes)
             report.sampled(blocks.lanes, undecided)
     open_ = allocation.undecided(failures, simulations).any()
     named = find_leader(failures, simulations, allocation.tie, margins).chance >= allocation.sure

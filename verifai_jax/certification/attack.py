@@ -27,7 +27,7 @@ from verifai_jax.search.proposals import Proposals
 class PolicyRecord:
     """The simulations of one policy: points, verdicts and counts.
 
-    - `points`, `verdicts`: of each block.
+    - `points`, `verdicts`, `first`: of each block, with the number of its first simulation.
     - `simulations`: of all blocks.
     - `failures`: simulations that violate the property.
     - `not_finite`: simulations without a verdict.
@@ -35,17 +35,26 @@ class PolicyRecord:
 
     points: list[Float[np.ndarray, "n d"]] = field(default_factory=list)
     verdicts: list[Verdicts] = field(default_factory=list)
+    first: list[int] = field(default_factory=list)
     simulations: int = 0
     failures: int = 0
     not_finite: int = 0
 
-    def add(self, points: Float[np.ndarray, "n d"], verdicts: Verdicts) -> None:
-        """Add one block."""
+    def add(self, points: Float[np.ndarray, "n d"], verdicts: Verdicts, first: int) -> None:
+        """Add one block, whose first simulation has this number."""
         self.points.append(points)
+        self.first.append(first)
         self.verdicts.append(verdicts)
         self.simulations += len(points)
         self.failures += int(np.sum(verdicts.violated))
         self.not_finite += int(np.sum(~verdicts.proper))
+
+    def take_out(self, block: int, place: int) -> None:
+        """Leave a row out of the counterexamples and the least robustness, but in the counts."""
+        verdicts = self.verdicts[block]
+        rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
+        rho[place], violated[place] = np.nan, False
+        self.verdicts[block] = verdicts._replace(rho=rho, violated=violated)
 
     @property
     def least(self) -> float:
@@ -110,6 +119,6 @@ def attack_policies(
                 attacker.tell_refused()
         for place, verdicts in blocks.attack(chosen, round_, repr(search)):
             number, points = chosen[place]
-            records[number].add(points, verdicts)
+            records[number].add(points, verdicts, round_ * blocks.lanes)
             attackers[number].tell(verdicts.least, verdicts.proper, None)
             report(len(points))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.certification.executor_simulator import ExecutorSimulator
 from verifai_jax.certification.policy_groups import digest, group_policies
@@ -178,6 +178,45 @@ class Blocks:
             for policy, points in chosen
         ]  # fmt: skip
         yield from self._verdicts(blocks, self._attacked_key)
+
+    def again(
+        self,
+        policy: int,
+        points: Float[np.ndarray, "n d"],
+        numbers: Int[np.ndarray, " n"],
+        of_attack: bool,
+        attempt: int,
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Simulate rows of a policy on the host once more.
+
+        **Arguments:**
+
+        - `policy`: its number.
+        - `points`: of the rows.
+        - `numbers`: of the simulations, which their random keys come from.
+        - `of_attack`: whether they are simulations of the attack, or samples.
+        - `attempt`: number of the repetition.
+
+        **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
+        """
+
+        def compute() -> dict[str, np.ndarray]:
+            simulator, places = self._simulators[self._owner[policy]]
+            key = self._attacked_key if of_attack else self._simulation_key
+            members = [places[policy]] * len(points)
+            with truncate_silently():
+                found = simulator(members, points[:, None], numbers.astype(np.int32), key)
+            self.simulated += 1
+            least = [each.least[0] if each.proper[0] else np.nan for each in found]
+            failing = np.array([bool(each.violated[0]) for each in found])
+            return {"again": np.array(least, np.float32), "failing": failing}
+
+        kind, rows = "attack" if of_attack else "sample", "-".join(map(str, numbers.tolist()))
+        kind = f"{kind}/{attempt}"
+        what = hashlib.sha256(points.tobytes() + rows.encode()).hexdigest()[:16]
+        name = f"{self._about}/again/{kind}/{self._digests[policy]}/{what}"
+        known = self._remember(name, compute)
+        return np.asarray(known["again"], np.float64), np.asarray(known["failing"], bool)
 
     def points(self, block: int) -> Float[np.ndarray, "lanes d"]:
         """Return the samples of one block of the held-out stream, which all policies share."""

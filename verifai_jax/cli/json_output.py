@@ -15,7 +15,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +138,7 @@ def describe_run(run: Any) -> dict[str, Any]:
         "violating": counts.violating,
         "counterexamples": counts.claimed,
         "verdicts": run.verdict_counts,
+        "repetitions": asdict(counts.repetitions),
         "without_verdict": counts.without_verdict,
         "failure_rate": rate,
         "worst": best,

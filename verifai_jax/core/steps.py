@@ -26,7 +26,7 @@ def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
     return lambda *arguments: jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
 
 
-def used_inputs(program: jax.extend.core.ClosedJaxpr) -> list[bool]:
+def used_inputs(program: Any) -> list[bool]:
     """Return which inputs of a program any of its results depends on."""
     results = [True] * len(program.jaxpr.outvars)
     return partial_eval.dce_jaxpr(program.jaxpr, results)[1]

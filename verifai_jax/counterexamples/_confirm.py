@@ -18,8 +18,15 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.counterexamples.selection import Row
+from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmation import Confirmer
-from verifai_jax.evaluation.confirmation_verdicts import IN_WORDS, MEANING, VERDICTS, Checked
+from verifai_jax.evaluation.confirmation_verdicts import (
+    IN_WORDS,
+    MEANING,
+    VERDICTS,
+    Checked,
+    Repetitions,
+)
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
@@ -40,7 +47,7 @@ class Confirmation:
 
     - `name`: of the problem.
     - `row`: its number in the table; None for features without one.
-    - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"`, `"raised"` or `"unchecked"`.
+    - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
     - `rho`: robustness `as_run`, NaN where that is not known, and of each check by name.
     - `band`: how far the robustness moved between the replays.
     - `why`: the reason of the verdict, in words.
@@ -93,6 +100,8 @@ class Confirmations:
     - `checked`: the checks that a confirmed row has passed, in words.
     - `changed`, `finding`: as in `Confirmation`, of the worst row that is not confirmed, or the
       worst of all.
+    - `wavering`: whether and how a host system did not give the numbers of the run again, in words;
+      the first of `notes`, where it is one.
     """
 
     name: str
@@ -101,6 +110,7 @@ class Confirmations:
     checked: str = ""
     changed: str = ""
     finding: str = ""
+    wavering: tuple[str, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -193,7 +203,11 @@ def confirm(
             f"the run of {run.name!r} was loaded without its problem, which has to be simulated "
             "again; give it: vj.load(path, problem)"
         )
-    confirmer = Confirmer(run.problem, run.precision, run.seed, simulator=simulator, most=most)
+    # On the backend of the run, whose verdicts these are.
+    problem = resolved(run.problem, wanted=run.backend).problem
+    confirmer = Confirmer(problem, run.precision, run.seed, simulator=simulator, most=most)
+    known = run.table.counts.repetitions
+    confirmer.wavers, confirmer.flips = known.moved > 0, known.lost > 0
     if row is None:
         return _with_changes_of_all(run, _all(run, confirmer))
     return _with_changes(run, _one(run, confirmer, row))
@@ -241,10 +255,25 @@ def _one(
     checked = confirmer(columns, [0 if number is None else number])
     rho = {"as_run": float(columns["rho"][0]) if "rho" in columns else float("nan")}
     rho |= {name: float(values[0]) for name, values in checked.rho.items()}
+    as_run = np.array([rho["as_run"]])
+    notes = (*checked.notes, *_own(confirmer, as_run, checked.rho, checked.verdict))
     return Confirmation(
         run.name, number, str(checked.verdict[0]), rho, float(checked.band[0]), checked.why[0],
-        checked.notes, run.precision,
+        notes, run.precision,
     )  # fmt: skip
+
+
+def _own(
+    confirmer: Confirmer,
+    rho: Float[np.ndarray, " n"],
+    replayed: Mapping[str, Float[np.ndarray, " n"]],
+    verdict: np.ndarray,
+) -> tuple[str, ...]:
+    """Return a note where a host system did not give the numbers of the run again."""
+    if not confirmer.problem.black_box or "again" not in replayed or np.any(np.isnan(rho)):
+        return ()
+    note = str(Repetitions.count(rho, replayed["again"], verdict))
+    return (note,) if note else ()
 
 
 def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
@@ -289,7 +318,12 @@ def _all(run: Run, confirmer: Confirmer) -> Confirmations:
         frame.iloc[block, frame.columns.get_loc("verdict")] = checked.verdict
         frame.iloc[block, frame.columns.get_loc("why")] = np.array(checked.why, object)
     notes = tuple(dict.fromkeys(note for _, checked in parts for note in checked.notes))
-    return Confirmations(run.name, frame, (*notes, *stopped), confirmer.checked)
+    wavering: tuple[str, ...] = ()
+    if "rho.again" in frame:
+        again = {"again": frame["rho.again"].to_numpy(np.float64)}
+        wavering = _own(confirmer, rho, again, frame["verdict"].to_numpy())
+    notes = (*wavering, *notes, *stopped)
+    return Confirmations(run.name, frame, notes, confirmer.checked, wavering=wavering)
 
 
 def _placed(

@@ -194,6 +194,10 @@ def _replay_batch(
         replays = Replays(problem, precision, key, features)
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
     [verdicts] = replays(1, [features], numbers)
+    again = None
+    if problem.black_box and np.any(verdicts.violated):
+        # A failure that is claimed has come twice.
+        [again] = replays(1, [features], numbers)
     formulas = {name: str(formula) for name, formula in problem.formulas.items()}
     now = problem.sources()
     results = {}
@@ -208,6 +212,12 @@ def _replay_batch(
             robustness = float(np.min(verdicts.rho[i]))
             state = FAILING if bool(verdicts.violated[i]) else FIXED
             notes += _not_again(entry, changes, robustness)
+            if state == FAILING and again is not None and not bool(again.violated[i]):
+                state = WITHOUT_VERDICT
+                notes.append(
+                    f"simulated again it has robustness {float(np.min(again.rho[i])):.4g}: the "
+                    "system has memory or chance of its own"
+                )
         else:
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())

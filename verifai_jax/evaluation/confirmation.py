@@ -9,6 +9,9 @@ A search simulates in single precision at the model's step; both may break a pro
 model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
 quarter of the step, there in single precision too, and with features that are one rounding away;
 and if it fails by more than the finer step has moved it, and by far more than rounding has.
+What runs on the host and has no finer step is simulated once more, with the same features and the
+same key: what fails then too is confirmed, and what does not is fragile, since the system remembers
+earlier simulations or draws numbers that do not come from its key.
 `confirmation_verdicts.py` has the verdicts and their words.
 """
 
@@ -22,18 +25,22 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Trace
 from verifai_jax.evaluation.confirmation_verdicts import (
     FINER,
+    NOT_CLAIMED,
     RAISED,
     SINGLE,
     Checked,
+    came_otherwise,
     describe_checks,
     describe_disagreement,
 )
+from verifai_jax.evaluation.executor_replays import ExecutorReplays
 from verifai_jax.evaluation.replays import ONE_BY_ONE, HostReplays, Replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
@@ -50,6 +57,15 @@ LIMIT = 1024
 """Rows that a falsification examines at most, ..."""
 SHARE = 128
 """... or one for so many simulations, where that is more."""
+REPEATED = 32
+"""Rows that a falsification of a host system without finer steps simulates again at most, ..."""
+SHARE_REPEATED = 25
+"""... or one for so many simulations, where that is more: 4 % of the budget, which leaves another
+hundredth for rows that are worse than all before. `LIMIT` and `SHARE` hold once a row came again
+otherwise."""
+MORE = 3
+"""Further repetitions of rows that fail again, once another row of the run did not: a system that
+fails at every seventh call fails in the first repetition of every seventh row, too."""
 SAFE = 10.0
 """Further rows stay unexamined if they are so many times farther from zero than replays have moved
 any row."""
@@ -75,9 +91,12 @@ class Confirmer:
       further ones until the rest is ten times farther from zero than any replay has moved a row;
       these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
       examined before is examined whatever else was.
+    - `executor`, `target`: whose workers simulate a host system again, and how they find the
+      problem; this process when left out.
 
-    Once rows were examined, `checked` says which checks a confirmed row has passed, and `raised`
-    what a replay raised first, if any did.
+    Once rows were examined, `checked` says which checks a confirmed row has passed, `raised`
+    what a replay raised first, if any did. `wavers` is whether a row gave another robustness when
+    a host system simulated it again, and `flips` whether one did not fail again.
 
     **Raises:** what `Problem.check` does, for a simulator that does not fit.
     """
@@ -90,6 +109,8 @@ class Confirmer:
         *,
         simulator: System | Callable[..., Trace] | Problem | str | None = None,
         most: int | None = None,
+        executor: Executor | None = None,
+        target: str | None = None,
     ) -> None:
         if most is not None and (
             isinstance(most, bool) or not isinstance(most, int | np.integer) or most < 1
@@ -97,8 +118,10 @@ class Confirmer:
             raise ValueError(f"most must be a positive integer; got {most!r}")
         in_precision(precision)
         self.problem, self.precision, self.seed, self.most = problem, precision, seed, most
+        self.executor, self.target = executor, target
         self.other = None if simulator is None else _other(problem, simulator)
         self.examined, self.band, self.worst = 0, 0.0, np.inf
+        self.wavers = self.flips = self._works = False
         self.checked = ""
         self.raised: tuple[str, ...] = ()
         self._plan: _Plan | None = None
@@ -131,7 +154,7 @@ class Confirmer:
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
         - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
           the worst row and those nearest to zero are. A worse row than all before, with some
-          beside it, is examined beyond the limit.
+          beside it, is examined beyond the limit, which is 1024 at least where the system wavers.
 
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
@@ -171,6 +194,8 @@ class Confirmer:
             if len(lost) and not self.raised:
                 self.raised = (f"not confirmed: {found.why[lost[0]]}",)
             self.band = max(self.band, float(np.max(found.band)))
+            if self.wavers and limit is not None:
+                limit = max(limit, LIMIT)
         return self._join(parts, order, run)
 
     @property
@@ -181,16 +206,18 @@ class Confirmer:
         replays = {id(check.replays): check.replays for check in self._plan.checks.values()}
         return sum(each.compile_seconds for each in replays.values())
 
-    @property
-    def finer(self) -> bool:
-        """True where more can be done for a black box than to simulate it once more.
+    def limit(self, simulations: int) -> int:
+        """Return how many rows a falsification of so many simulations examines at most.
 
-        What JAX traces can always be looked at in double precision.
+        To simulate a black box again takes as long as to simulate it: 4 % of the simulations, or 32
+        of them, unless a row did not come again, or the simulator has finer steps of its own.
         """
-        if not self.problem.black_box or self.other is not None:
-            return True
-        replays = HostReplays(self.problem, self.precision, run_keys(self.seed)[1])
-        return replays.refiner.why_not(FINER.values()) is None
+        if self.problem.black_box and not self.wavers:
+            if self._plan is None:
+                self._plan = _make_plan(self, {})
+            if self._plan.plain:
+                return max(REPEATED, simulations // SHARE_REPEATED)
+        return max(LIMIT, simulations // SHARE)
 
     def far(self, rho: float) -> bool:
         """Return whether a robustness is so far from zero that no replay will have another sign.
@@ -222,7 +249,52 @@ class Confirmer:
             found |= dict(zip(names, check.replays(check.factor, each, numbers), strict=True))
         # In the order of the plan, in which they are told.
         found = {name: found[name] for name in plan.checks}
-        return _decide(len(numbers), found, run, plan)
+        if self.problem.black_box and "again" in found:
+            values = features[plan.checks["again"].precision]
+            found["again"] = self._insist(plan, values, numbers, found["again"], run)
+            self._works = self._works or bool(np.any(found["again"].proper))
+        decision = _decide(
+            len(numbers),
+            found,
+            run,
+            plan,
+            by_far=not plan.plain or self.flips,
+            came_again=plan.plain and self._works,
+        )
+        if self.problem.black_box and "verdict" in rows:
+            _remember(decision, rows, plan.plain)
+        return decision
+
+    def _insist(
+        self,
+        plan: "_Plan",
+        features: Any,
+        numbers: np.ndarray,
+        again: Verdicts,
+        run: np.ndarray | None,
+    ) -> Verdicts:
+        """Simulate rows that fail again more often, where the system is known to waver.
+
+        **Returns:** of each row the repetition of greatest robustness.
+        """
+
+        def notice(rows: np.ndarray, seen: Verdicts) -> None:
+            held = bool(np.any(~seen.violated & ~np.isin(seen.status, RAISED)))
+            self.flips = self.flips or held
+            moved = run is not None and np.any(came_otherwise(run[rows], seen.least))
+            self.wavers = self.wavers or held or bool(moved)
+
+        notice(np.arange(len(numbers)), again)
+        replays = plan.checks["again"].replays
+        for _ in range(MORE if self.wavers else 0):
+            left = np.flatnonzero(again.violated)
+            if not len(left):
+                break
+            own = jax.tree.map(lambda leaf, left=left: leaf[left], features)
+            [more] = replays.anew(own, numbers[left])
+            notice(left, more)
+            again = _least_failing(again, more, left)
+        return again
 
     def _join(
         self, parts: list[tuple[np.ndarray, "_Decision"]], rest: np.ndarray, run: np.ndarray | None
@@ -270,13 +342,15 @@ class _Plan(NamedTuple):
 
     - `checks`: by name.
     - `notes`: on those left out.
-    - `independent`: whether any says more than the run did.
+    - `finer`: whether any simulates more finely than the run, so that it may refute a row.
+    - `plain`: whether all that is done is to simulate a host system once more.
     - `raised`: what raised already when it was traced; empty where nothing did.
     """
 
     checks: dict[str, _Check]
     notes: tuple[str, ...]
-    independent: bool
+    finer: bool
+    plain: bool
     raised: str = ""
 
     @property
@@ -314,7 +388,8 @@ def _make_plan(confirmer: Confirmer, rows: Mapping[str, np.ndarray]) -> _Plan:
         if other.replays is not None:
             checks["simulator"] = _Check(other.replays, 1, other.precision)
     finer = refined or "simulator" in checks or ("float64" in checks and run != "float64")
-    return _Plan(checks, tuple(notes), finer, raised)
+    plain = problem.black_box and set(checks) == {"again"}
+    return _Plan(checks, tuple(notes), finer, plain, raised)
 
 
 class _Base(NamedTuple):
@@ -337,7 +412,10 @@ def _replays(problem: Problem, confirmer: Confirmer, rows: Mapping[str, np.ndarr
     run, key = confirmer.precision, run_keys(confirmer.seed)[1]
     if problem.black_box:
         notes = ("not checked in float64: a black box",)
-        return _Base(HostReplays(problem, run, key), run, notes)
+        if confirmer.executor is None or problem is not confirmer.problem:
+            return _Base(HostReplays(problem, run, key), run, notes)
+        replays = ExecutorReplays(problem, run, key, confirmer.executor, confirmer.target)
+        return _Base(replays, run, notes)
     # All of one form: one row is enough to trace.
     first = {name: column[:1] for name, column in rows.items()}
     note = "not checked in float64: in it the system would draw other random numbers"
@@ -376,8 +454,21 @@ class _Decision(NamedTuple):
 
 
 def _decide(
-    count: int, found: dict[str, Verdicts], run: np.ndarray | None, plan: _Plan
+    count: int,
+    found: dict[str, Verdicts],
+    run: np.ndarray | None,
+    plan: _Plan,
+    *,
+    by_far: bool,
+    came_again: bool,
 ) -> _Decision:
+    """Decide about rows from their replays.
+
+    **Arguments:**
+
+    - `by_far`: they have to fail by more than they moved.
+    - `came_again`: others could be simulated again, so that one that raised has not come again.
+    """
     base = next((name for name in ("float64", "again") if name in found), "")
     finest = next((n for n in ("quarter_step", base, "simulator") if n in found), "")
     rho = {name: replayed.least for name, replayed in found.items()}
@@ -390,35 +481,73 @@ def _decide(
     if run is not None and base:
         rounding = np.maximum(rounding, _moved(run, rho[base]))
     band = np.maximum(step, rounding)
-    nothing_finer = "; ".join(plan.notes) or "the run was in float64 already"
     if not found:
-        verdict = np.full(count, "raised" if plan.raised else "unchecked", object)
-        return _Decision(verdict, band, [plan.raised or nothing_finer] * count, found)
+        return _Decision(np.full(count, "raised", object), band, [plan.raised] * count, found)
     deciding = [name for name in (*FINER, SINGLE) if name in found] or [base]
     deciding = [name for name in (*deciding, "simulator") if name in found]
     failing = {name: replayed.violated for name, replayed in found.items()}
     holding = {name: r.proper & ~r.violated for name, r in found.items()}
     raised = {name: np.isin(r.status, RAISED) for name, r in found.items()}
-    clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
+    # Of a host system that is simulated once more, and fails each time, that it fails says all.
+    clear = (not by_far) | (np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding))
     fails = np.all(list(failing.values()), axis=0)
-    refuted = np.all([holding[name] for name in deciding], axis=0) & plan.independent
+    refuted = np.all([holding[name] for name in deciding], axis=0) & plan.finer
     refuted &= deciding[0] != "again"
     lost = np.any(list(raised.values()), axis=0) | bool(plan.raised)
-    lost &= np.all([failing[name] | raised[name] for name in found], axis=0)
+    lost &= np.all([failing[name] | raised[name] for name in found], axis=0) & (not came_again)
     verdict = np.select(
-        [lost, fails & clear & plan.independent, refuted, fails & (not plan.independent)],
-        ["raised", "confirmed", "refuted", "unchecked"],
+        [lost, fails & clear, refuted],
+        ["raised", "confirmed", "refuted"],
         "fragile",
     )
     why = [""] * count
     for i in np.flatnonzero(verdict != "confirmed").tolist():
-        if verdict[i] == "unchecked":
-            why[i] = nothing_finer
-        elif verdict[i] == "raised" and plan.raised:
+        if verdict[i] == "raised" and plan.raised:
             why[i] = plan.raised
         else:
-            why[i] = describe_disagreement(i, found, float(rho[finest][i]), float(band[i]))
+            as_run = None if run is None else float(run[i])
+            why[i] = describe_disagreement(i, found, float(rho[finest][i]), float(band[i]), as_run)
     return _Decision(verdict.astype(object), band, why, found)
+
+
+def _remember(decision: _Decision, rows: Mapping[str, np.ndarray], plain: bool) -> None:
+    """Hold to the run's verdict on rows of a host system, where this time is no evidence against.
+
+    What did not come again in the run stays unconfirmed, whatever it does this time; and what fails
+    every time stays confirmed, by whatever it has moved.
+    """
+    fails = np.all([replayed.violated for replayed in decision.replayed.values()], axis=0)
+    for i in np.flatnonzero((rows["verdict"] == "confirmed") & fails & plain).tolist():
+        decision.verdict[i], decision.why[i] = "confirmed", ""
+    known = np.isin(rows["verdict"], NOT_CLAIMED)
+    known &= np.isin(decision.verdict, ("confirmed", "raised"))
+    for i in np.flatnonzero(known).tolist():
+        decision.verdict[i] = "fragile"
+        again = float(rows["rho_again"][i]) if "rho_again" in rows else float("nan")
+        then = "" if np.isnan(again) else f", with robustness {again:.4g}"
+        decision.why[i] = f"it did not come again when the run simulated it again{then}"
+
+
+def _least_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
+    """Return the repetitions, those rows replaced that a further one shows to fail less.
+
+    **Arguments:**
+
+    - `again`: of all rows.
+    - `more`: a further repetition of the rows `at`.
+    """
+    with np.errstate(invalid="ignore"):
+        less = ~more.violated | ~(more.least <= again.least[at])
+    rho, status, violated = again.rho.copy(), again.status.copy(), again.violated.copy()
+    taken = at[less]
+    rho[taken], status[taken] = more.rho[less], more.status[less]
+    violated[taken] = more.violated[less]
+    messages = again.messages
+    if messages is not None and more.messages is not None:
+        messages = list(messages)
+        for i in np.flatnonzero(less).tolist():
+            messages[int(at[i])] = more.messages[i]
+    return again._replace(rho=rho, status=status, violated=violated, messages=messages)
 
 
 def _order(run: Float[np.ndarray, " n"]) -> np.ndarray:

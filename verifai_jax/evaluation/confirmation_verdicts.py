@@ -7,6 +7,7 @@ describe_checks(checked.rho)                        # "in double precision and a
 """
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,19 +16,18 @@ from jaxtyping import Bool, Float
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.verdicts import Verdicts
 
-VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unchecked", "unexamined")
+VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
 """Verdicts of closer replays; see `Checked`."""
-UNDECIDED = ("fragile", "raised", "unchecked", "unexamined")
+UNDECIDED = ("fragile", "raised", "unexamined")
 """Verdicts that leave open whether the failure is the system's or the simulation's."""
 NOT_CLAIMED = ("fragile", "refuted")
 """Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 MEANING = {
     "confirmed": "it fails in every replay",
     "refuted": "an artefact of the simulation",
-    "fragile": "closer replays disagree",
+    "fragile": "replays disagree",
     "raised": "it could not be replayed",
-    "unchecked": "there is nothing finer to check it with",
-    "unexamined": "it was not replayed",
+    "unexamined": "it is unchecked, as it was not replayed",
 }
 """Each verdict as people read it."""
 FINER = {"half_step": 2, "quarter_step": 4}
@@ -46,6 +46,9 @@ IN_WORDS = {
     "simulator": "in the other simulator",
 }
 """Each check as people read it."""
+ROUNDED = 1e-4
+"""Share of a robustness by which rounding may change it between two simulations, such as of
+threads that add up in any order, or of a batch of another size."""
 LEAST_TOLD = 1e-6
 """Robustness that a search is told at least of a row that is not claimed: it holds."""
 
@@ -83,12 +86,13 @@ def describe_checks(checks: Collection[str], exact_step: bool = False) -> str:
 class Checked(NamedTuple):
     """Verdicts of closer replays of `n` rows.
 
-    - `verdict`: `confirmed`: it fails in every check, at least one of which is finer than the run,
-      and by more than replays move it; `refuted`: none of the finer checks fails (half and quarter
-      of the step and the other simulator, or where the step stays, double precision); `fragile`:
-      the checks disagree, one of them gave no robustness, or it fails by less than that; `raised`:
-      a check raised, and the others fail; `unchecked`: there was nothing finer to check with;
-      `unexamined`: left out, see `Confirmer`.
+    - `verdict`: `confirmed`: it fails in every check, and by more than replays move it (where all
+      that can be done is to simulate it once more, and no row of the run held then, it is enough
+      that it fails again); `refuted`: none of the finer
+      checks fails (half and quarter of the step and the other simulator, or where the step stays,
+      double precision); `fragile`: the checks disagree, one of them gave no robustness, it fails by
+      less than that, or it did not fail when it was simulated again; `raised`: a check raised, and
+      the others fail; `unexamined`: left out, see `Confirmer`.
     - `rho`: for each check made, by name, the least formula's robustness; NaN without one. Names
       are `float64` (or `again`, in the precision of the run), `half_step`, `quarter_step`,
       `quarter_step_float32`, `nudged` (at the finest step, with features one rounding of float32
@@ -130,6 +134,7 @@ def describe_disagreement(
     found: Mapping[str, Verdicts],
     rho: float,
     band: float,
+    as_run: float | None = None,
 ) -> str:
     """Say why a row is not confirmed.
 
@@ -139,6 +144,7 @@ def describe_disagreement(
     - `found`: the replays of all rows, by check.
     - `rho`: robustness of the row in the finest replay.
     - `band`: how much it moved between replays.
+    - `as_run`: its robustness in the run, where that is known.
     """
     lost = [name for name in found if not found[name].proper[i]]
     if lost:
@@ -149,6 +155,9 @@ def describe_disagreement(
             return f"the replay {_and(raised)} raised: {message}"
         return f"the replay {_and(lost)} is not finite"
     holds = [name for name, replayed in found.items() if not replayed.violated[i]]
+    if holds == ["again"]:
+        run = "" if as_run is None else f", and {as_run:.4g} in the run"
+        return f"it holds when simulated again: robustness {found['again'].least[i]:.4g}{run}"
     if len(holds) == len(found):
         return "it holds in every replay"
     if holds:
@@ -161,3 +170,73 @@ def describe_disagreement(
 def _and(names: Sequence[str]) -> str:
     words = [IN_WORDS[name] for name in names]
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+@dataclass(frozen=True)
+class Repetitions:
+    """Counts of how a host system gave its rows again, with the same features and key.
+
+    - `rows`: violating rows that were simulated again.
+    - `moved`: those with another robustness, beyond rounding, or none.
+    - `rounded`: those whose last digits alone differ.
+    - `lost`: those that did not fail again.
+    - `most`: how far a robustness moved.
+    """
+
+    rows: int = 0
+    moved: int = 0
+    rounded: int = 0
+    lost: int = 0
+    most: float = 0.0
+
+    @classmethod
+    def count(
+        cls, rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"], verdict: np.ndarray
+    ) -> "Repetitions":
+        """Count over violating rows: robustness in the run and in the repetition, and verdicts."""
+        rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
+        known = ~np.isnan(again)
+        lost = (verdict == "fragile") & ~(again < 0)
+        moved = lost | (known & came_otherwise(rho, again))
+        differs = known & (again != rho)
+        return cls(
+            int(np.sum(known | lost)),
+            int(np.sum(moved)),
+            int(np.sum(differs & ~moved)),
+            int(np.sum(lost)),
+            float(np.max(np.abs(rho - again)[differs], initial=0.0)),
+        )
+
+    def joined(self, other: "Repetitions") -> "Repetitions":
+        """Return the counts over the rows of both."""
+        return Repetitions(
+            self.rows + other.rows,
+            self.moved + other.moved,
+            self.rounded + other.rounded,
+            self.lost + other.lost,
+            max(self.most, other.most),
+        )
+
+    def __str__(self) -> str:
+        """Say what that means of the system; empty where all rows came again bit for bit."""
+        plural = "s" * (self.rows != 1)
+        of = f"of {self.rows} violating row{plural} simulated again with the same features and seed"
+        if self.moved:
+            by = f" (by up to {self.most:.2g})" if self.most else ""
+            return (
+                f"the system has memory or chance of its own: {of}, {self.moved} gave another "
+                f"robustness{by}, and {self.lost} did not fail"
+            )
+        if self.rounded:
+            return f"{of}, {self.rounded} have other last digits, by up to {self.most:.2g}"
+        return ""
+
+
+def came_otherwise(
+    rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Return which robustnesses differ by more than rounding explains; not those without one."""
+    rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
+    with np.errstate(invalid="ignore"):
+        scale = np.maximum(np.abs(rho), np.abs(again))
+        return (rho != again) & (np.abs(rho - again) > ROUNDED * scale + LEAST_TOLD)

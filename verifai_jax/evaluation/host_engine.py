@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status, Trace, without_wrapping
 from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.evaluation.journal import Journal
@@ -85,6 +86,10 @@ class HostMonitor:
         return rho, status, holds, marks, told
 
 
+MONITORS: Slot[str, HostMonitor] = Slot("monitors of host systems")
+"""The monitor of a problem whose simulations steer no search."""
+
+
 class HostEngine:
     """Evaluates batches of a black-box problem; the counterpart of `engine.Engine`.
 
@@ -122,6 +127,9 @@ class HostEngine:
         self.problem, self.precision, self.journal = problem, precision, journal
         self.least, self.keep_traces = least, keep_traces
         self.system = problem.system if system is None else system
+        if monitor is None and not steering.size:
+            # The one of all engines of the problem, so that it compiles once.
+            monitor = problem.programs.get(MONITORS, "", lambda: HostMonitor(problem))
         self.monitor = HostMonitor(problem, steering) if monitor is None else monitor
         self.compile_seconds = 0.0
         self.simulation_seconds = 0.0
@@ -159,22 +167,24 @@ class HostEngine:
             features = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(u)], features)
             return self._verdicts(features, keys[: len(u)], np.asarray(seeds)[: len(u)], u, first)
 
-    def evaluate_features(self, features: PyTree, keys: Key[Array, " n"]) -> Verdicts:
-        """Simulate `n` rows of features, each with the random key of its own, and decide.
+    def evaluate_features(
+        self, features: PyTree, seeds: Integer[np.ndarray, " n"], keys: Key[Array, " n"] | None
+    ) -> Verdicts:
+        """Simulate `n` rows of features, each with the seed of its own, and decide.
 
         **Arguments:**
 
         - `features`: `[n, ...]` each.
-        - `keys`: of the simulations.
+        - `seeds`: of the simulations.
+        - `keys`: that the seeds are made of, which a system needs that simulates batches.
         """
         with in_precision(self.precision):
-            seeds = np.asarray(jax.vmap(jax.random.bits)(keys))
             return self._verdicts(features, keys, seeds, None, 0)
 
     def _verdicts(
         self,
         features: PyTree,
-        keys: Key[Array, " n"],
+        keys: Key[Array, " n"] | None,
         seeds: Integer[np.ndarray, " n"],
         u: Float[np.ndarray, "n d"] | None,
         first: int,
@@ -186,6 +196,7 @@ class HostEngine:
         if self.keep_traces:
             rows.traces = [None for _ in seeds]
         if self.system.can_simulate_batch:
+            assert keys is not None
             self._together(features, keys, rows)
         else:
             self._one_by_one(features, seeds, u, first, rows)

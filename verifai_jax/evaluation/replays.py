@@ -34,6 +34,8 @@ from verifai_jax.systems.base import System
 
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
+SEEDS = 32
+"""Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
 """Rows that a device replays together, where there are more: the second number for very many."""
 
@@ -197,6 +199,7 @@ class HostReplays:
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
+        self._renewed: System | None = None
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
 
@@ -207,18 +210,42 @@ class HostReplays:
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
     ) -> list[Verdicts]:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""
+        return self._replay(self.refiner(factor), each, numbers)
+
+    def anew(self, features: PyTree, numbers: Int[np.ndarray, " n"]) -> list[Verdicts]:
+        """Simulate rows again, by a system that has not simulated what the run did.
+
+        That is the system itself, where it cannot be made anew.
+        """
+        if self._renewed is None:
+            self._renewed = self.problem.system.renewed()
+        return self._replay(self._renewed, [features], numbers)
+
+    def _replay(
+        self, system: System, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
+    ) -> list[Verdicts]:
         # One monitor for all steps.
         engine = HostEngine(
-            self.problem,
-            self.precision,
-            system=self.refiner(factor),
-            monitor=self._engine.monitor,
+            self.problem, self.precision, system=system, monitor=self._engine.monitor
         )
+        count = len(numbers)
+        many = np.pad(np.asarray(numbers, np.int32), (0, -count % SEEDS), mode="edge")
+        keys = None
         with in_precision(self.precision):
-            keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
+            each_block = [np.asarray(_seeds(self.key, b)) for b in many.reshape(-1, SEEDS)]
+            if system.can_simulate_batch:
+                keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
+        seeds = np.concatenate(each_block)[:count]
         return [
-            engine.evaluate_features(features, keys)._replace(features=None) for features in each
+            engine.evaluate_features(features, seeds, keys)._replace(features=None)
+            for features in each
         ]
+
+
+@jax.jit
+def _seeds(key: Key[Array, ""], numbers: Int[Array, " n"]) -> Array:
+    """Return the seeds of a host system's simulations, as its engine makes them of their keys."""
+    return jax.vmap(lambda number: jax.random.bits(simulation_key(key, number)))(numbers)
 
 
 def _raised(count: int, formulas: int, error: Exception) -> Verdicts:

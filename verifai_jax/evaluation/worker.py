@@ -68,7 +68,7 @@ HOST_ENGINES: Slot[BlockMode, HostEngine] = Slot("host engines of blocks")
 
 # An executor may work in threads of one process. A compiled block keeps all cores busy by itself,
 # and a simulator is not made for two simulations at a time.
-_computing = threading.Lock()
+computing = threading.Lock()
 
 
 @reproducible_settings()
@@ -98,7 +98,7 @@ def evaluate_block(
     problem = shipment.thing
     if mode.backend is not None:
         problem = problem.on_backend(mode.backend)
-    with _computing:
+    with computing:
         if problem.black_box:
             notes: tuple[str, ...] = ()
             verdicts, seconds, remarks = _on_host(problem, mode, key, first, u)

@@ -11,7 +11,7 @@ estimate, and sum to it.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -25,6 +25,7 @@ from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.progress import SimulationProgress
 from verifai_jax.core.text import format_time
+from verifai_jax.counterexamples import confirm
 from verifai_jax.counterexamples.description import describe_predicate
 from verifai_jax.counterexamples.fixed_key import hold_key
 from verifai_jax.counterexamples.selection import problem_of
@@ -41,6 +42,7 @@ from verifai_jax.estimation.methods import (
 )
 from verifai_jax.estimation.normal_space import Ended, LimitState, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.failure_modes.held_keys import Divided, Held, divide_under_keys
 from verifai_jax.failure_modes.naming import name_mode
@@ -157,6 +159,7 @@ def modes(
         unexplained = (missed.low, missed.high)
         if divided.held:
             notes.append(divided.note)
+        notes = [*numbers.notes, *notes]
     if answer.probability is not None and not listed:
         notes.append(
             "the failures could not be weighed one by one, so the probability is not divided into "
@@ -193,6 +196,8 @@ class _Numbers:
     backend: str | None
     confidence: float
     least_share: float
+    notes: list[str] = field(default_factory=list)
+    """On failures that did not come again."""
 
 
 def _has_slopes(problem: Problem) -> bool:
@@ -365,6 +370,12 @@ def _simulate(numbers: _Numbers, design: Float[np.ndarray, "k d"]) -> list[tuple
         progress=False,
     )
     failing = set(run.table.counterexamples.index)
+    if numbers.problem.black_box and failing:
+        # What it claims has been simulated at least once more.
+        checked = confirm(run)
+        lost = np.isin(checked.table["verdict"].to_numpy(), NOT_CLAIMED)
+        failing -= set(checked.table.index.to_numpy()[lost])
+        numbers.notes.extend(checked.wavering)
     rows: list[tuple[Run, int | None]] = []
     for k in range(count):
         tried: Int[np.ndarray, " n"] = np.arange(k, len(points), count)

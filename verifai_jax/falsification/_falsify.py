@@ -143,6 +143,8 @@ def falsify(
       finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
       stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
       simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
+      What runs on the host and has no finer steps is simulated once more: 32 rows, or one for 25
+      simulations, and up to 1024 once one came again otherwise.
     - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
       failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
       inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED
+from verifai_jax.evaluation.confirmation_verdicts import NOT_CLAIMED, Repetitions
 from verifai_jax.falsification.columns import Columns
 
 
@@ -20,6 +20,7 @@ class Counts:
     - `failing_alone`: violating rows that violate this formula, where there are several.
     - `failed`: rows without a verdict, by status, the most frequent first.
     - `verdicts`: violating rows by what closer replays say, the most frequent first.
+    - `repetitions`: how violating rows of a host system came again.
     - `worst`: number of the row of least robustness among those claimed; None without one.
     - `nearest`: that among all rows with a verdict.
     - `least`: the least robustness of all rows; NaN where none has one.
@@ -32,6 +33,7 @@ class Counts:
     failing_alone: Counter[str] = field(default_factory=Counter)
     failed: dict[str, int] = field(default_factory=dict)
     verdicts: dict[str, int] = field(default_factory=dict)
+    repetitions: Repetitions = field(default_factory=Repetitions)
     worst: int | None = None
     nearest: int | None = None
     least: float = float("nan")
@@ -77,6 +79,9 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
         statuses.update(map(str, columns["status"][~proper]))
         if "verdict" in columns:
             verdicts.update(map(str, columns["verdict"][violating]))
+            if "rho_again" in columns:
+                own = (columns[name][violating] for name in ("rho", "rho_again", "verdict"))
+                counts.repetitions = counts.repetitions.joined(Repetitions.count(*own))
         least = np.fmin.reduce(np.asarray(columns["rho"], np.float64))
         counts.least = float(np.fmin(counts.least, least))
         rho = np.nan_to_num(np.asarray(columns["rho"], np.float64), nan=np.inf)

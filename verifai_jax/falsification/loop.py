@@ -106,7 +106,9 @@ class Rounds:
         self.checkpoint: dict[str, Any] = {}
         self.record_checksum = 0
         self.suggestions: Suggestions | None = None
-        self._claims = RunClaims(problem, precision, seed) if confirm else None
+        self._claims = None
+        if confirm:
+            self._claims = RunClaims(problem, precision, seed, executor, target)
         self._objective = None if problem.rulebook is None else Objective(problem.rulebook)
         self._proposals: Any = None
         self._pending: Any = None  # Points of the first round that are proposed already.
@@ -289,6 +291,8 @@ class Rounds:
                 found = self._claims(columns, first)
                 self.watch.move(found.compile_seconds, COMPILE)
             columns["verdict"] = found.verdict
+            if found.again is not None:
+                columns["rho_again"] = found.again
             self.checked = self._claims.checked or self.checked
             claimed = verdicts.violated & ~found.refused
             # A search that took them for failures would stay with them.

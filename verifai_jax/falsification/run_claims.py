@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from verifai_jax.evaluation.confirmation import LIMIT, SHARE, Confirmer
+from verifai_jax.core.executors import Executor
+from verifai_jax.evaluation.confirmation import Confirmer
 from verifai_jax.problem.problem import Problem
 
 CONFIRMER = "confirmer"
-"""Entry of a checkpoint: rows examined, how far replays moved one, and the worst row."""
+"""Entry of a checkpoint: rows examined, how far replays moved one, the worst row, whether one came
+again otherwise, and whether one did not fail again."""
 
 
 class Claimed(NamedTuple):
@@ -27,12 +29,15 @@ class Claimed(NamedTuple):
     - `verdict`: in a word; empty where nothing is violated.
     - `refused`: rows that violate the property and are not claimed.
     - `greatest`: robustness that the search learns of these, the greatest of their replays.
+    - `again`: robustness when it was simulated once more, NaN where it was not; None for a system
+      that JAX traces.
     - `compile_seconds`: that their programs took to compile.
     """
 
     verdict: Shaped[np.ndarray, " n"]
     refused: Bool[np.ndarray, " n"]
     greatest: Float[np.ndarray, " n"]
+    again: Float[np.ndarray, " n"] | None = None
     compile_seconds: float = 0.0
 
 
@@ -44,10 +49,19 @@ class RunClaims:
     - `problem`: on the backend that it runs on.
     - `precision`: of the run.
     - `seed`: of the run.
+    - `executor`, `target`: of the run, whose workers simulate a host system again, too.
     """
 
-    def __init__(self, problem: Problem, precision: str, seed: int) -> None:
-        self._confirmer = Confirmer(problem, precision, seed)
+    def __init__(
+        self,
+        problem: Problem,
+        precision: str,
+        seed: int,
+        executor: Executor | None = None,
+        target: str | None = None,
+    ) -> None:
+        self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
+        self._host = problem.black_box
 
     def prepare(self) -> None:
         """Trace the replays before there is a row, while something else compiles."""
@@ -75,31 +89,31 @@ class RunClaims:
         count = len(columns["rho"])
         verdict = np.full(count, "", object)
         refused, greatest = np.zeros(count, bool), np.full(count, np.nan)
-        claimed = Claimed(verdict, refused, greatest)
+        again = np.full(count, np.nan) if self._host else None
+        claimed = Claimed(verdict, refused, greatest, again)
         if not len(rows):
             return claimed
         confirmer = self._confirmer
-        if not confirmer.finer:
-            # To simulate it again may take as long as the run, and would say little.
-            verdict[rows] = "unchecked"
-            return claimed
         own = {name: column[rows] for name, column in columns.items()}
         compiled = confirmer.compile_seconds
-        checked = confirmer(own, first + rows, max(LIMIT, (first + count) // SHARE))
+        checked = confirmer(own, first + rows, confirmer.limit(first + count))
         compiled = confirmer.compile_seconds - compiled
         verdict[rows] = checked.verdict
         refused[rows], greatest[rows] = checked.refuse(own["rho"])
+        if again is not None and "again" in checked.rho:
+            again[rows] = checked.rho["again"]
         return claimed._replace(compile_seconds=compiled)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Return what decides which rows are examined next, as an entry of a checkpoint."""
         seen = self._confirmer
-        return {CONFIRMER: np.array([seen.examined, seen.band, seen.worst], np.float64)}
+        numbers = [seen.examined, seen.band, seen.worst, seen.wavers, seen.flips]
+        return {CONFIRMER: np.array(numbers, np.float64)}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
         """Go on from a checkpoint."""
         if CONFIRMER in checkpoint:
-            # Checkpoints of before the worst row was noted hold two numbers.
-            examined, band, *worst = checkpoint[CONFIRMER]
+            examined, band, worst, wavers, flips = checkpoint[CONFIRMER]
             self._confirmer.examined, self._confirmer.band = int(examined), float(band)
-            self._confirmer.worst = float(worst[0]) if worst else np.inf
+            self._confirmer.worst = float(worst)
+            self._confirmer.wavers, self._confirmer.flips = bool(wavers), bool(flips)

@@ -23,6 +23,9 @@ def summarize(run: Run) -> str:
     counts = run.table.counts
     violating, failed = counts.violating, counts.without_verdict
     lines = [f"{run.name}: {_headline(run, violating)}"]
+    repetitions = counts.repetitions
+    if repetitions.moved:
+        lines.append(f"  its own      {repetitions}")
     for name, text in run.formulas.items():
         lines.append(f"  {'property' if len(run.formulas) == 1 else name:<13}{text}")
         if len(run.formulas) > 1 and violating:
@@ -47,6 +50,8 @@ def summarize(run: Run) -> str:
             lines.append(f"               first in row {number}: {one_line(message)}")
     if lost := counts.not_differentiated:
         lines.append(f"  gradient     not finite in {lost} of {_differentiated(run)}")
+    if repetitions.rounded and not repetitions.moved:
+        lines.append(f"  note         {repetitions}")
     lines.extend(f"  note         {note}" for note in run.notes)
     if run.damage:
         lines.append(f"  damaged      {run.damage}")
@@ -131,10 +136,9 @@ def _closer_look(run: Run) -> str:
 
 
 _UNDECIDED_IN_WORDS = {
-    "fragile": "not claimed, as closer replays disagree",
+    "fragile": "not claimed, as replays disagree",
     "raised": "a replay raised",
-    "unchecked": "there is nothing finer to check with",
-    "unexamined": "not replayed",
+    "unexamined": "unchecked, as not replayed",
 }
 
 

@@ -65,6 +65,7 @@ RESERVED = (
     "gradient_finite",
     "differentiated",
     "verdict",
+    "rho_again",
     "new_marks",
     "suggested",
 )

@@ -94,6 +94,12 @@ class CheckedSystem(System):
     def refined(self, factor: Any) -> System:
         return CheckedSystem(self.system.refined(factor), self.ranges, self.verdicts)
 
+    def renewed(self) -> System:
+        renewed = self.system.renewed()
+        if renewed is self.system:
+            return self
+        return CheckedSystem(renewed, self.ranges, self.verdicts)
+
     def with_backend(self, name: str) -> System:
         return CheckedSystem(self.system.with_backend(name), self.ranges, self.verdicts)
 

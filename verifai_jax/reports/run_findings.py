@@ -1,5 +1,6 @@
 """Findings of a run: numbers, failures with pictures, the reason, the least form, the analysis."""
 
+import math
 from collections.abc import Iterable
 
 from verifai_jax.core.errors import UnknownNameError
@@ -60,6 +61,8 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
         for verdict in VERDICTS
         if run.verdict_counts.get(verdict)
     ]
+    if counts.repetitions.moved or counts.repetitions.rounded:
+        rows.append(("simulated again", str(counts.repetitions)))
     rows.append(("claimed as failures", f"{counts.claimed:,}"))
     if run.checked and run.verdict_counts.get("confirmed"):
         rows.append(("a confirmed failure fails", run.checked))
@@ -224,7 +227,9 @@ def not_claimed_rows(run: Run, most: int = 20) -> Iterable[Child]:
     """Write rows that violate as simulated, and that closer replays did not let be claimed."""
     rows = run.table.unconfirmed.sort_values("rho")
     for row_number, row in list(rows.iterrows())[:most]:
-        yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:.4g}"
+        again = float(row.get("rho_again", math.nan))
+        then = "" if math.isnan(again) else f", {again:.4g} when simulated again"
+        yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:.4g}{then}"
     if len(rows) > most:
         yield f"and {len(rows) - most:,} more"
 

@@ -133,6 +133,13 @@ class System:
         """
         raise NotImplementedError(f"{self!r} has no refined(factor)")
 
+    def renewed(self) -> "System":
+        """Return the same system without what its simulations so far have left behind in it.
+
+        That is the system itself where it has nothing that could be made anew.
+        """
+        return self
+
     def with_backend(self, name: str) -> "System":
         """Return the same system on one of its `backends`, or on `"auto"`.
 
@@ -259,6 +266,9 @@ class FunctionSystem(System):
 
     def refined(self, factor: int | Int[Array, ""]) -> System:
         return as_system(self._method("refined")(factor))
+
+    def renewed(self) -> System:
+        return as_system(self._method("renewed")()) if self._offers("renewed") else self
 
     def with_backend(self, name: str) -> System:
         return as_system(self._method("with_backend")(name))

@@ -196,6 +196,13 @@ class BlackBox(System):
         """Return the same simulator with a `factor` times smaller step, if it has one."""
         return BlackBox(replace(self.simulation, function=_finer(self.simulation.function, factor)))
 
+    def renewed(self) -> "BlackBox":
+        """Return the same simulator made anew, if it has a `renewed()` of its own."""
+        made = _renewed(self.simulation.function)
+        if made is self.simulation.function:
+            return self
+        return BlackBox(replace(self.simulation, function=made))
+
 
 @dataclass(frozen=True, eq=False)
 class PooledBlackBox(System):
@@ -240,6 +247,10 @@ class PooledBlackBox(System):
         """True for a simulator that says that its step is part of the system."""
         return as_system(self.simulation.function).exact_step
 
+    def renewed(self) -> "PooledBlackBox":
+        """Return the same simulator in worker processes of its own."""
+        return PooledBlackBox(self.simulation, self.pool.renewed())
+
     def close(self) -> None:
         """End the workers; the next simulation starts new ones."""
         self.pool.close()
@@ -273,6 +284,11 @@ class VectorisedBlackBox(System):
     def refined(self, factor: int) -> "VectorisedBlackBox":
         """Return the same simulator with a `factor` times smaller step, if it has one."""
         return replace(self, function=_finer(self.function, factor))
+
+    def renewed(self) -> "VectorisedBlackBox":
+        """Return the same simulator made anew, if it has a `renewed()` of its own."""
+        made = _renewed(self.function)
+        return self if made is self.function else replace(self, function=made)
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         """Simulate many rows at a time; see `System.simulate_batch`."""
@@ -449,6 +465,11 @@ def _plain(leaf: object) -> Any:
 def _finer(function: Callable[..., Trace], factor: int) -> Callable[..., Trace]:
     finer = as_system(function).refined(factor)
     return finer.function if isinstance(finer, FunctionSystem) else finer
+
+
+def _renewed(function: Callable[..., Trace]) -> Callable[..., Trace]:
+    made = as_system(function).renewed()
+    return made.function if isinstance(made, FunctionSystem) else made
 
 
 def _is_number(value: object) -> bool:

@@ -8,6 +8,7 @@ takes along what it has started.
 import contextlib
 import importlib
 import importlib.util
+import itertools
 import logging
 import math
 import os
@@ -20,7 +21,7 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing import Pipe, spawn
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -46,8 +47,12 @@ POLL_SECONDS = 0.5
 SLOW_IMPORT_SECONDS = 30.0
 """Time until the log says that a worker is still importing."""
 
+REMEMBERED = 1 << 16
+"""Simulations of which a pool remembers in which worker they were."""
+
 # True in a worker that still imports the simulator.
 _preparing = False
+_numbers = itertools.count()
 
 
 class StartError(RuntimeError):
@@ -94,6 +99,7 @@ class Pool:
         self._setup = setup
         self._slots = threading.Semaphore(workers)
         self._idle: list[_Worker] = []  # Its own operations are all the locking that it needs.
+        self._seen: dict[int, int] = {}  # Which worker has simulated what last.
         # When the pool is garbage, and at the interpreter's exit.
         weakref.finalize(self, _end, self._idle)
 
@@ -102,6 +108,7 @@ class Pool:
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate all rows, and yield each index with its outcome as soon as it has one.
 
+        What was simulated before is simulated in another worker than then, where there are several.
         Workers go on while the caller looks at an outcome. When the caller stops, or is
         interrupted, the simulations that run are ended.
 
@@ -139,6 +146,10 @@ class Pool:
             for thread in threads:
                 thread.join()
 
+    def renewed(self) -> "Pool":
+        """Return a pool with workers of its own that simulates the same."""
+        return _pool(self.workers, self.timeout, self.retries, self._setup)
+
     def close(self) -> None:
         """Let the idle workers end; those that work are ended by their batch."""
         _end(self._idle)
@@ -150,16 +161,20 @@ class Pool:
                 return
         worker = None
         try:
-            while not batch.stopped:
-                try:
-                    index, task = batch.tasks.popleft()
-                except IndexError:
+            while not batch.stopped and batch.tasks:
+                worker = worker or self._worker(batch)
+                taken = batch.take(worker, self._seen)
+                if taken is None:
                     break
+                index, task, what = taken
+                if self._seen.get(what) == worker.number:
+                    worker = self._another(batch, worker)
                 deaths = 0
                 while True:
                     worker = worker or self._worker(batch)
                     outcome = worker.simulate(task, self.timeout)
                     if outcome is not None and outcome.status != Status.TIMEOUT:
+                        self._remember(what, worker)
                         break
                     batch.leave(worker)
                     end, worker = worker.end(), None
@@ -183,6 +198,22 @@ class Pool:
                 else:
                     self._idle.append(worker)
             self._slots.release()
+
+    def _remember(self, what: int, worker: "_Worker") -> None:
+        self._seen.pop(what, None)
+        self._seen[what] = worker.number
+        if len(self._seen) > REMEMBERED:
+            with contextlib.suppress(KeyError, StopIteration, RuntimeError):
+                del self._seen[next(iter(self._seen))]
+
+    def _another(self, batch: "_Batch", worker: "_Worker") -> "_Worker":
+        """Return another worker than this one, where there may be several."""
+        if not self._idle and batch.busy >= self.workers:
+            return worker
+        other = self._worker(batch)
+        batch.leave(worker)
+        self._idle.append(worker)
+        return other
 
     def _worker(self, batch: "_Batch") -> "_Worker":
         """Return an idle worker that is alive, or a new one that is ready."""
@@ -233,11 +264,34 @@ class _Batch:
     """The rows that are left to simulate, the results of the others, and the busy workers."""
 
     def __init__(self, features: Sequence[Features], seeds: Sequence[int]) -> None:
-        self.tasks = deque(enumerate(zip(features, seeds, strict=True)))
+        self.tasks: deque[tuple[int, tuple[Features, int], int]] = deque(
+            (index, task, hash(pickle.dumps(task)))
+            for index, task in enumerate(zip(features, seeds, strict=True))
+        )
         self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.stopped = False
         self._busy: set[_Worker] = set()
         self._lock = threading.Lock()
+
+    @property
+    def busy(self) -> int:
+        """Number of workers that simulate, or are about to."""
+        return len(self._busy)
+
+    def take(
+        self, worker: "_Worker", seen: Mapping[int, int]
+    ) -> tuple[int, tuple[Features, int], int] | None:
+        """Return what a worker simulates next: its index, itself, and a number that stands for it.
+
+        None where nothing is left, or only what it has simulated before and others will now.
+        """
+        with self._lock:
+            for place, task in enumerate(self.tasks):
+                if seen.get(task[2]) != worker.number:
+                    del self.tasks[place]
+                    return task
+            # Whatever else is at work comes back for it.
+            return self.tasks.popleft() if self.tasks and self._busy <= {worker} else None
 
     def enter(self, worker: "_Worker") -> None:
         with self._lock:
@@ -261,6 +315,7 @@ class _Worker:
     """One process and the pipe to it."""
 
     def __init__(self, setup: bytes) -> None:
+        self.number = next(_numbers)
         self.pipe, theirs = Pipe()
         try:
             self.process = subprocess.Popen(

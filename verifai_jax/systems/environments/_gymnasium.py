@@ -9,10 +9,10 @@ One trace is one episode: it is never reset within.
 """
 
 import copy
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias, cast
 
 import jax
@@ -59,7 +59,7 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 }
 
 
-@dataclass(eq=False)
+@dataclasses.dataclass(eq=False)
 class EpisodeFunction:
     """A function `(features, seed) -> Trace` of one episode of an environment.
 
@@ -89,6 +89,10 @@ class EpisodeFunction:
 
     def __repr__(self) -> str:
         return self.name
+
+    def renewed(self) -> "EpisodeFunction":
+        """Return the same function with an environment that has seen nothing yet."""
+        return dataclasses.replace(self)
 
     @property
     def name(self) -> str:

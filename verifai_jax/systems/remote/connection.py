@@ -60,12 +60,16 @@ class Batch:
 
 @dataclass(eq=False)
 class Point:
-    """One simulation: the place for its outcome, and its history so far."""
+    """One simulation: the place for its outcome, and its history so far.
+
+    `what` stands for its features and seed: the same number, the same simulation.
+    """
 
     id: int
     batch: Batch
     index: int
     text: bytes
+    what: int
     losses: int = 0  # Clients that vanished while they simulated it,
     lost: float = 0.0  # and when the last one did.
     handed: float = 0.0

@@ -35,6 +35,8 @@ UNCOUNTED = 1 << 16
 """Bytes that a client may hold without that those of all are counted."""
 MOST_CLIENTS = 256
 """Clients that may be connected at a time."""
+REMEMBERED = 1 << 16
+"""Simulations of which is remembered which client made them."""
 REMINDER = 10.0
 """Seconds without a client until the log says so; then twice as long, up to 60."""
 
@@ -47,6 +49,7 @@ class Server(threading.Thread):
         self.rules, self.listening = rules, listening
         self.clients: set[Client] = set()
         self.waiting: deque[Point] = deque()
+        self._seen: dict[int, str] = {}  # Which client has simulated what last.
         self.lost: deque[Point] = deque()  # Those whose client vanished, for a client that works.
         self.batches: list[Batch] = []
         self._inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -135,7 +138,8 @@ class Server(threading.Thread):
         self.batches.append(batch)
         for index, text in enumerate(texts):
             number = next(self._ids)
-            self.waiting.append(Point(number, batch, index, b'{"id":%d,%b' % (number, text)))
+            message = b'{"id":%d,%b' % (number, text)
+            self.waiting.append(Point(number, batch, index, message, hash(text)))
 
     # Connections
 
@@ -349,10 +353,11 @@ class Server(threading.Thread):
         if not (self.waiting or self.lost) or not self._free():
             return
         self._hand_out_lost()
-        while self.waiting and (free := self._free()):
-            share = -(-len(self.waiting) // len(free))
+        handed = True
+        while handed and self.waiting and (free := self._free()):
+            share, handed = -(-len(self.waiting) // len(free)), False
             for client in free:
-                self._hand(client, self.waiting, min(share, client.room))
+                handed |= self._hand(client, self.waiting, min(share, client.room))
 
     def _hand_out_lost(self) -> None:
         """Hand points whose client vanished to one that has answered, or was here already.
@@ -376,15 +381,33 @@ class Server(threading.Thread):
     def _free(self) -> list[Client]:
         return [client for client in self.clients if client.here and client.room > 0]
 
-    def _hand(self, client: Client, points: deque[Point], most: int) -> None:
-        handed = []
+    def _hand(self, client: Client, points: deque[Point], most: int) -> bool:
+        """Hand points to a client; return whether any left the queue.
+
+        What it has simulated before is left to another one, where there is one: a simulation that
+        is repeated shall not find what the first one left behind.
+        """
+        others = points is self.waiting and any(
+            other.here and other is not client for other in self.clients
+        )
+        handed, left, before = [], [], len(points)
         while points and len(handed) < most:
             point = points.popleft()
-            if not point.batch.cancelled:
-                handed.append(point)
+            if point.batch.cancelled:
+                continue
+            if others and self._seen.get(point.what) == client.name:
+                left.append(point)
+                continue
+            self._seen.pop(point.what, None)
+            self._seen[point.what] = client.name
+            handed.append(point)
+        points.extendleft(reversed(left))
+        while len(self._seen) > REMEMBERED:
+            del self._seen[next(iter(self._seen))]
         if handed:
             client.hand(handed, time.monotonic())
             self._flush(client)
+        return len(points) < before
 
     # The clock
 
