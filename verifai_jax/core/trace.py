@@ -276,7 +276,7 @@ class Trace:
             known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
             text = count
             if known:
-                first, last = (format_time(self.clock()[i]) for i in (0, -1))
+                first, last = (format_time(float(self.clock()[i])) for i in (0, -1))
                 text += f" from {first} s to {last} s"
         for name in ("valid", "status"):
             code = getattr(self, name)

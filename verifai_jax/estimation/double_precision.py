@@ -264,7 +264,8 @@ class HeldKeys:
             features = jax.tree.map(
                 lambda leaf: np.asarray(leaf)[:count], self._features(padded.astype(self.precision))
             )
-        return self._engine.evaluate_features(features, keys[:count])
+            seeds = np.asarray(jax.vmap(jax.random.bits)(keys))[:count]
+        return self._engine.evaluate_features(features, seeds, keys[:count])
 
 
 def _flat(features: Any) -> Array:

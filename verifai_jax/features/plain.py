@@ -139,7 +139,7 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
     if kind not in KINDS:
         others = ("Struct", "Categorical", "Fixed", "Distribution", "Automaton")
         raise unknown_name("kind of domain", kind, (*KINDS, *others))
-    arguments = {
+    arguments: dict[str, Any] = {
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
         for name in FIELDS[KINDS[kind]]
     }

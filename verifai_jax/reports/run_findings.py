@@ -226,7 +226,7 @@ def explore(run: Run, view: dict, studies: Studies) -> Section:
 def not_claimed_rows(run: Run, most: int = 20) -> Iterable[Child]:
     """Write rows that violate as simulated, and that closer replays did not let be claimed."""
     rows = run.table.unconfirmed.sort_values("rho")
-    for row_number, row in list(rows.iterrows())[:most]:
+    for row_number, row in list(rows.to_dict("index").items())[:most]:
         again = float(row.get("rho_again", math.nan))
         then = "" if math.isnan(again) else f", {again:.4g} when simulated again"
         yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:.4g}{then}"

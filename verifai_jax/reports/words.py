@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.core.text import format_percent, one_line
@@ -178,7 +179,7 @@ def domain_words(domain: Domain) -> str:
 
 def _quantile_words(domain: Continuous) -> str:
     """Write a distribution by its quantiles, the outermost that are simulated among them."""
-    u = np.array([0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0], np.float32)
+    u = jnp.array([0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0], jnp.float32)
     least, low, first, median, third, high, most = np.asarray(
         jax.vmap(domain.from_unit)(u[:, None])
     )
