@@ -10,7 +10,7 @@ from playing import gain, play
 from verifai_jax.core.cube import Cube
 from verifai_jax.search import Observations
 from verifai_jax.search.cmaes import CMAES
-from verifai_jax.search.evolution import Evolution, recombination
+from verifai_jax.search.evolution import Evolution, recombination, reverse_recombination
 from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search
 
@@ -21,6 +21,43 @@ KEY = jax.random.key(0)
 def test_single_points():
     _, (value,) = play(CMAES(), ("ball",), 1, 256, 15)
     assert gain("ball", value) > 4
+
+
+def rosenbrock(x):
+    return jnp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)
+
+
+def rastrigin(x):
+    return 10 * len(x) + jnp.sum(x**2 - 10 * jnp.cos(2 * jnp.pi * x))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "below", "median", "most"),
+    [
+        (lambda x: jnp.sum(x**2), 0.01, 1.25 * 565, 1000),
+        (rosenbrock, 1.0, 1.25 * 3085, 8000),
+        (rastrigin, 30.0, 1.25 * 940, 5000),
+    ],
+    ids=["sphere", "rosenbrock", "rastrigin"],
+)
+def test_in_ten_dimensions_as_the_cmaes_package(function, below, median, most):
+    # The medians of the package cmaes 0.13.1: a random mean, steps of 0.3 times the range, and
+    # generations of ten. Restart rules that ignore the dimension find none of the last two.
+    search, cube = CMAES(), Cube((0,) * 10)
+
+    def one(key):
+        def step(state, _):
+            u, state = search.ask(state, cube, 10)
+            rho = jax.vmap(lambda point: function(10 * point - 5) - below)(u)
+            return search.tell(state, cube, Observations(u, rho, jnp.ones(10, bool))), rho
+
+        return jax.lax.scan(step, search.init(key, cube, 10), None, length=800)[1].ravel()
+
+    failing = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(KEY, 10))) < 0
+    first = np.where(failing.any(axis=1), failing.argmax(axis=1) + 1.0, np.inf)
+    assert np.median(first) < median
+    assert np.max(first) < most
 
 
 @pytest.mark.thorough
@@ -37,7 +74,7 @@ def test_the_same_robustness_everywhere_gives_the_prior():
     np.testing.assert_allclose(seen.reshape(64, 2), expected, atol=1e-6)
 
 
-def one_step(evolution, points, weights):
+def one_step(evolution, points, weights, worse):
     """The tutorial's equations, one after the other, for a full covariance."""
     mean, size, covariance, way, whitened, age = (np.asarray(x, float) for x in evolution)
     n = len(mean)
@@ -46,7 +83,7 @@ def one_step(evolution, points, weights):
     ds = 1 + 2 * max(0, np.sqrt((mu - 1) / (n + 1)) - 1) + cs
     cc = (4 + mu / n) / (n + 4 + 2 * mu / n)
     c1 = 2 / ((n + 1.3) ** 2 + mu)
-    cmu = min(1 - c1, 2 * (mu - 2 + 1 / mu) / ((n + 2) ** 2 + mu))
+    cmu = min(1 - c1, 2 * (0.25 + mu - 2 + 1 / mu) / ((n + 2) ** 2 + mu))
     y = (points - mean) / size
     total = sum(w * step for w, step in zip(weights, y, strict=True))
     factor = np.linalg.inv(np.linalg.cholesky(covariance))
@@ -55,9 +92,16 @@ def one_step(evolution, points, weights):
     norm = np.linalg.norm(whitened)
     h = norm / np.sqrt(1 - (1 - cs) ** (2 * (age + 1))) < (1.4 + 2 / (n + 1)) * chi
     way = (1 - cc) * way + h * np.sqrt(cc * (2 - cc) * mu) * total
-    outer = sum(w * np.outer(step, step) for w, step in zip(weights, y, strict=True))
+    against = 1 / np.sum(worse**2)
+    alpha = min(1 + c1 / cmu, 1 + 2 * against / (mu + 2), (1 - c1 - cmu) / (n * cmu))
+    signed = weights - alpha * worse
+    white = (factor @ y.T).T
+    outer = sum(
+        (w if w >= 0 else w * n / (z @ z)) * np.outer(step, step)
+        for w, step, z in zip(signed, y, white, strict=True)
+    )
     covariance = (
-        (1 + c1 * (1 - h) * cc * (2 - cc) - c1 - cmu) * covariance
+        (1 + c1 * (1 - h) * cc * (2 - cc) - c1 - cmu * signed.sum()) * covariance
         + c1 * np.outer(way, way)
         + cmu * outer
     )
@@ -72,9 +116,11 @@ def test_a_step_is_that_of_the_tutorial():
     learn = jax.jit(Evolution.learn)
     for _ in range(5):
         points = evolution.draw(jnp.asarray(rng.standard_normal((12, 3)), jnp.float32))
-        weights = recombination(jnp.sum((points - 0.2) ** 2, axis=1))
-        expected = one_step(evolution, np.asarray(points, float), np.asarray(weights, float))
-        evolution = learn(evolution, points, weights)
+        score = jnp.sum((points - 0.2) ** 2, axis=1)
+        weights, worse = recombination(score), reverse_recombination(score)
+        each = (np.asarray(part, float) for part in (points, weights, worse))
+        expected = one_step(evolution, *each)
+        evolution = learn(evolution, points, weights, worse)
         for got, wanted in zip(evolution, expected, strict=True):
             np.testing.assert_allclose(got, wanted, rtol=2e-4, atol=1e-5)
 
@@ -108,6 +154,20 @@ def test_recombination():
         ([inf] * 5, np.zeros(5)),
     ):
         got = jax.jit(recombination)(jnp.array(score, jnp.float32))
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_reverse_recombination():
+    # The worse half, the worst most; nothing that is as good as one of the better half.
+    inf = np.inf
+    weights = np.maximum(np.log([3, 1, 1, 2, 4]) - np.log(2.5), 0) * [1, 0, 1, 1, 1]
+    for score, expected in (
+        ([3, inf, 1, 2, 4], weights / weights.sum()),
+        ([0, 0, 0, 0, 0], np.zeros(5)),
+        ([1, 1, 1, 1, 2], [0, 0, 0, 0, 1]),
+        ([inf, 2, inf, inf, inf], np.zeros(5)),
+    ):
+        got = jax.jit(reverse_recombination)(jnp.array(score, jnp.float32))
         np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 

@@ -13,9 +13,11 @@ Additions for falsification:
   no progress. The next one begins alternately with small steps, at the best of the points that
   exploration has found meanwhile, and with large ones, from the prior (as Hansen, Benchmarking a
   BI-population CMA-ES on the BBOB-2009 function testbed, alternates between two regimes);
-- after runs without a failure the prior is sampled for twice as long as the last one took, times
+- after runs without a failure the prior is sampled for half as long as the last one took, times
   their number, and the next run begins at the best of these points: where the robustness misleads,
-  most simulations are those of the prior in the end.
+  most simulations are those of the prior in the end;
+- how long a run waits for progress follows from its dimension, by the learning rates of the
+  covariance: in ten dimensions a narrow valley is learned in hundreds of points.
 """
 
 import math
@@ -30,7 +32,12 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.cube import Cube
 from verifai_jax.search.base import Observations, Search, draw_uniform, standard_normal
-from verifai_jax.search.evolution import Evolution, recombination
+from verifai_jax.search.evolution import (
+    Evolution,
+    rates,
+    recombination,
+    reverse_recombination,
+)
 from verifai_jax.search.halton import halton_points
 
 MOST_CELLS = 32
@@ -45,6 +52,15 @@ LEARNING = 0.3
 LARGEST = 1e30
 """Robustness above which all is equally bad."""
 
+
+ADAPTATIONS = 4
+"""Times that the covariance could be learned anew without progress before a run ends. With 1,
+every third run in ten dimensions ended too early on Rastrigin's function; with 4, one in thirty."""
+
+FEW_COORDINATES = 5
+"""Coordinates up to which the share of exploration is the given one. In more of them, a point of
+the prior is seldom near anything: with 5 % instead of 10 % in ten coordinates, CMA-ES needs 0.93
+times the simulations on Rosenbrock's function, and finds Rastrigin's as often."""
 
 Tree = TypeVar("Tree")
 
@@ -81,10 +97,13 @@ class CMAES(Search[CMAESState]):
 
     - `step`: standard deviation, in unit coordinates, with which a run from the prior begins.
     - `small_step`: that of a run around a point of exploration.
-    - `exploration`: share of the points drawn from the prior, for ever.
+    - `exploration`: share of the points drawn from the prior, for ever, in up to five coordinates;
+      in more of them it is less, in proportion.
     - `full_up_to`: coordinates up to which there is a whole covariance matrix.
     - `least_std`: standard deviation at which a run has converged, if all coordinates are below.
-    - `patience`: generations without progress after which a run ends; more in many dimensions.
+    - `patience`: generations without progress after which a run ends, beside four times those in
+      which the covariance is learned (25 in all in four coordinates with batches of 16, 130 in ten
+      with batches of 10).
     - `failures`: after this many failing points, and no fewer than two generations', a run ends.
 
     **Raises:** `ValueError` for values out of range.
@@ -94,7 +113,7 @@ class CMAES(Search[CMAESState]):
     small_step: float = 0.1
     exploration: float = 0.1
     full_up_to: int = 40
-    least_std: float = 0.005
+    least_std: float = 1e-5
     patience: int = 6
     failures: int = 20
 
@@ -134,7 +153,7 @@ class CMAES(Search[CMAESState]):
     def ask(
         self, state: CMAESState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], CMAESState]:
-        prior = self._explores(state, batch) | (state.generation == 0)
+        prior = self._explores(state, cube, batch) | (state.generation == 0)
         number = state.explored + jnp.cumsum(prior).astype(jnp.uint32)
         fresh = halton_points(number, cube.dim, state.key)
         drawn = self._draw(jax.random.fold_in(state.key, state.round), state, cube, batch)
@@ -145,7 +164,7 @@ class CMAES(Search[CMAESState]):
         batch = len(observations.rho)
         u, score = _scored(observations)
         # Points of exploration are far away from the run: they say nothing about its next step.
-        outside = self._explores(state, batch) & (state.generation > 0)
+        outside = self._explores(state, cube, batch) & (state.generation > 0)
         state = _with_reserve(state, u, jnp.where(outside, score, jnp.inf))
         row = state.filled * batch
         inside = jnp.where(outside, jnp.inf, score)
@@ -168,10 +187,11 @@ class CMAES(Search[CMAESState]):
         begun = self._begin(found, cube, jnp.array(True), jnp.float32(self.small_step))
         return _where(better, begun._replace(best=found.reserve_score), state)
 
-    def _explores(self, state: CMAESState, batch: int) -> Bool[Array, " batch"]:
+    def _explores(self, state: CMAESState, cube: Cube, batch: int) -> Bool[Array, " batch"]:
         """Return the rows from the prior: every tenth, say, whatever the batch; in integers."""
         row = (state.results % 1000 + jnp.arange(batch, dtype=jnp.uint32)) % 1000
-        share = np.uint32(np.ceil(1000 * self.exploration))
+        explored = self.exploration * min(1.0, FEW_COORDINATES / max(cube.dim, 1))
+        share = np.uint32(np.ceil(1000 * explored))
         return row * share % 1000 < share
 
     def _draw(
@@ -209,7 +229,8 @@ class CMAES(Search[CMAESState]):
         points = state.u[:, _plain(cube)]
         # A generation of the prior says where the run begins.
         placed = state.gaussian._replace(mean=weights @ points)
-        gaussian = _where(state.generation == 0, placed, state.gaussian.learn(points, weights))
+        moved = state.gaussian.learn(points, weights, reverse_recombination(state.score))
+        gaussian = _where(state.generation == 0, placed, moved)
         gaussian = gaussian._replace(size=jnp.minimum(gaussian.size, 1.0))
         learned = state._replace(
             gaussian=gaussian.widened(_margins(cube)),
@@ -228,7 +249,10 @@ class CMAES(Search[CMAESState]):
     def _over(self, state: CMAESState, cube: Cube) -> Bool[Array, ""]:
         """Return whether a run has failed often enough, or leads nowhere."""
         n, population = len(_plain(cube)), len(state.score)
-        stuck = state.stale >= self.patience + 5 * n // population
+        patience = jnp.float32(self.patience)
+        if n:
+            patience += ADAPTATIONS * _learning_time(n, population, n <= self.full_up_to)
+        stuck = state.stale >= patience
         if n:
             widest = state.gaussian.size * jnp.sqrt(jnp.max(state.gaussian.variance()))
             stuck |= (widest < self.least_std) | ~jnp.isfinite(widest)
@@ -247,7 +271,7 @@ class CMAES(Search[CMAESState]):
         waiting = waiting._replace(
             reserve_score=state.reserve_score,
             fruitless=fruitless,
-            rest=jnp.minimum(2 * fruitless * state.length, 1000),
+            rest=jnp.minimum(fruitless * state.length // 2, 1000),
         )
         return _where(fruitful, next_run._replace(fruitless=fruitless), waiting)
 
@@ -311,6 +335,13 @@ def _population(cube: Cube, batch: int) -> int:
     """Return the points in a generation: whole batches, no fewer than the tutorial's default."""
     least = 4 + int(3 * math.log(max(cube.dim, 1)))
     return batch * -(-least // batch)
+
+
+def _learning_time(n: int, population: int, full: bool) -> Float[Array, ""]:
+    """Return in how many generations the covariance of `n` coordinates is learned."""
+    weights = recombination(jnp.arange(population, dtype=jnp.float32))
+    one, many = rates(1 / jnp.sum(weights**2), n, full)
+    return 1 / (one + many)
 
 
 def _updated_choices(

@@ -1,7 +1,8 @@
 """One step of CMA-ES: a Gaussian learns from points and their ranks.
 
-Hansen, The CMA Evolution Strategy: A Tutorial, 2016: rates are the defaults of its table 1, for
-weights that are not negative. A Cholesky factor stands for the symmetric root of the covariance
+Hansen, The CMA Evolution Strategy: A Tutorial, 2016, revised 2023: rates and weights are the
+defaults of its table 1, where those of the worse points are negative. A Cholesky factor stands for
+the symmetric root of the covariance
 (Krause, Arbones, Igel, A CMA-ES with optimal covariance update and storage complexity, 2016). A
 covariance of shape `[n]` is a diagonal one, which learns faster by a factor (Ros, Hansen, A simple
 modification in CMA-ES achieving linear time and space complexity, 2008).
@@ -46,8 +47,21 @@ class Evolution(NamedTuple):
             return self.mean + self.size * jnp.sqrt(self.covariance) * normal
         return self.mean + self.size * normal @ jnp.linalg.cholesky(self.covariance).T
 
-    def learn(self, points: Float[Array, "m n"], weights: Float[Array, " m"]) -> "Evolution":
-        """Update by points with these recombination weights; in comments the tutorial's names."""
+    def learn(
+        self,
+        points: Float[Array, "m n"],
+        weights: Float[Array, " m"],
+        worse: Float[Array, " m"] | float = 0.0,
+    ) -> "Evolution":
+        """Update by points; in comments the tutorial's names.
+
+        **Arguments:**
+
+        - `points`: of a generation.
+        - `weights`: recombination weights, which sum to one.
+        - `worse`: weights of the points that the covariance is to shrink along, which sum to one
+          or are all zero.
+        """
         n = len(self.mean)
         if n == 0:
             return self
@@ -60,15 +74,17 @@ class Evolution(NamedTuple):
         cut = jnp.minimum(1.0, most / jnp.maximum(norm, 1e-12))
         steps, white = steps * cut, white * cut
 
-        mass = 1 / jnp.maximum(jnp.sum(weights**2), 1e-12)  # mu_eff
+        mass = _mass(weights)  # mu_eff
         size_rate = (mass + 2) / (n + mass + 5)  # c_sigma
         damping = 1 + 2 * jnp.maximum(0, jnp.sqrt((mass - 1) / (n + 1)) - 1) + size_rate
         way_rate = (4 + mass / n) / (n + 4 + 2 * mass / n)  # c_c
-        one = 2 / ((n + 1.3) ** 2 + mass)  # c_1
-        many = 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)  # c_mu
-        if self.covariance.ndim == 1:
-            one, many = (jnp.minimum(rate * (n + 2) / 3, 0.5) for rate in (one, many))
-        many = jnp.clip(many, 0.0, 1 - one)
+        one, many = rates(mass, n, self.covariance.ndim == 2)
+        # The sum of the negative weights; the last limit keeps the covariance positive definite.
+        learned = jnp.maximum(many, 1e-12)
+        shrinking = jnp.minimum(1 + one / learned, 1 + 2 * _mass(worse) / (mass + 2))
+        shrinking = jnp.minimum(shrinking, (1 - one - many) / (n * learned)) * jnp.sum(worse)
+        length = jnp.sum(white**2, axis=1)
+        signed = weights - shrinking * worse * n / jnp.maximum(length, 1e-12)
 
         step = weights @ steps
         gain = jnp.sqrt(size_rate * (2 - size_rate) * mass)
@@ -81,11 +97,11 @@ class Evolution(NamedTuple):
         steady = length / unbiased < (1.4 + 2 / (n + 1)) * expected  # h_sigma
         gain = jnp.sqrt(way_rate * (2 - way_rate) * mass)
         way = (1 - way_rate) * self.way + steady * gain * step
-        kept = 1 - one - many + one * (1 - steady) * way_rate * (2 - way_rate)
+        kept = 1 - one - many * (1 - shrinking) + one * (1 - steady) * way_rate * (2 - way_rate)
         if self.covariance.ndim == 1:
-            covariance = kept * self.covariance + one * way**2 + many * (weights @ steps**2)
+            covariance = kept * self.covariance + one * way**2 + many * (signed @ steps**2)
         else:
-            spread = (weights * steps.T) @ steps
+            spread = (signed * steps.T) @ steps
             covariance = kept * self.covariance + one * jnp.outer(way, way) + many * spread
         return Evolution(
             mean=self.mean + self.size * step,
@@ -117,17 +133,61 @@ class Evolution(NamedTuple):
         return solve_triangular(factor, steps.T, lower=True).T
 
 
+def _mass(weights: Float[Array, " m"]) -> Float[Array, ""]:
+    """Return as how many equal weights these count."""
+    return jnp.sum(weights) ** 2 / jnp.maximum(jnp.sum(weights**2), 1e-12)
+
+
+def rates(
+    mass: float | Float[Array, ""], n: int, full: bool
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the learning rates of the covariance: of its path, and of a generation's points.
+
+    **Arguments:**
+
+    - `mass`: as how many equal weights those of the better points count.
+    - `n`: number of coordinates.
+    - `full`: whether the covariance is a whole matrix rather than a diagonal.
+    """
+    one = 2 / ((n + 1.3) ** 2 + mass)  # c_1
+    many = 2 * (0.25 + mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)  # c_mu
+    if not full:
+        one, many = (jnp.minimum(rate * (n + 2) / 3, 0.5) for rate in (one, many))
+    one = jnp.asarray(one)
+    return one, jnp.clip(many, 0.0, 1 - one)
+
+
 def recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
     """Weight points: logarithmic in the rank, zero in the worse half, equal where tied.
 
     Points of infinite score have none.
     """
     there = jnp.isfinite(score)
-    count = jnp.sum(there).astype(jnp.float32)
-    rank = jnp.argsort(jnp.argsort(score)).astype(jnp.float32)
-    weight = jnp.maximum(jnp.log((count + 1) / 2) - jnp.log(rank + 1), 0.0)
     # A single point is all that there is.
-    weight = jnp.where(there, jnp.where(count > 1, weight, 1.0), 0.0)
+    weight = jnp.where(jnp.sum(there) > 1, jnp.maximum(_log_ranks(score), 0.0), 1.0)
+    return _shared(jnp.where(there, weight, 0.0), score)
+
+
+def reverse_recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Weight the points of the worse half, as `recombination` does those of the better one.
+
+    A point that is as good as one of the better half has none.
+    """
+    there = jnp.isfinite(score)
+    worse = there & (recombination(score) == 0)
+    return _shared(jnp.where(worse, jnp.maximum(-_log_ranks(score), 0.0), 0.0), score)
+
+
+def _log_ranks(score: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return weights by rank: positive in the better half, negative in the worse one."""
+    count = jnp.sum(jnp.isfinite(score)).astype(jnp.float32)
+    rank = jnp.argsort(jnp.argsort(score)).astype(jnp.float32)
+    return jnp.log((count + 1) / 2) - jnp.log(rank + 1)
+
+
+def _shared(weight: Float[Array, " m"], score: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Share weights evenly among points of the same score, and let all sum to one."""
+    there = jnp.isfinite(score)
     tied = (score[:, None] == score[None]) & there
     weight = jnp.where(there, (tied @ weight) / jnp.maximum(jnp.sum(tied, axis=1), 1), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1e-12)
