@@ -1,4 +1,4 @@
-"""The grid against the product of its axes."""
+"""The grid against the product of its axes, and its order."""
 
 import itertools
 
@@ -9,18 +9,49 @@ import pytest
 from checked_types import unchecked
 
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.grid import Grid
+from verifai_jax.search.grid import STEPS, Grid, permuted
 from verifai_jax.testing import check_batch_independence, check_search
 
 
-def whole(search, cube, batch=7):
-    """All points of the grid, asked in batches that do not divide it."""
+def asked(search, cube, batch=7, seed=0):
+    """All points of the grid in the order of the search, in batches that do not divide it."""
     search.check(cube)
-    state, parts = search.init(jax.random.key(0), cube, batch), []
+    state, parts = search.init(jax.random.key(seed), cube, batch), []
     for _ in range(-(-search.total(cube) // batch)):
         u, state = search.ask(state, cube, batch)
         parts.append(np.asarray(u))
     return np.concatenate(parts)
+
+
+def whole(search, cube, batch=7):
+    """All points of the grid in the order of its rows, which are those that the search asks for."""
+    total = search.total(cube)
+    points = np.asarray(search.points_at(jnp.arange(total, dtype=jnp.uint32), cube))
+    found = asked(search, cube, batch)[:total]
+    assert sorted(map(tuple, found)) == sorted(map(tuple, points))
+    return points
+
+
+def test_orders_are_permutations():
+    run = jax.jit(permuted, static_argnums=1)
+    for total in (1, 2, 3, 5, 7, 12, 441, 10_201):
+        orders = set()
+        for seed in range(3):
+            keys = jax.random.bits(jax.random.key(seed), (STEPS,), jnp.uint32)
+            found = np.asarray(run(jnp.arange(total, dtype=jnp.uint32), total, keys))
+            np.testing.assert_array_equal(np.sort(found), np.arange(total))
+            orders.add(tuple(found))
+        assert len(orders) == 3 or total < 12
+
+
+def test_a_part_of_a_grid_is_spread_over_all_of_it():
+    cube = Cube((101, 0, 101))
+    u = np.asarray(Grid().ask(Grid().init(jax.random.key(3), cube, 400), cube, 400)[0])
+    for column in u.T:
+        counts = np.histogram(column, 4, (0, 1))[0]
+        # Of a random sample of 400, 100 in each quarter, with a deviation of 9.
+        assert np.all(np.abs(counts - 100) < 45)
+    assert np.all(np.abs(np.corrcoef(u.T) - np.eye(3)) < 0.25)
 
 
 def test_continuous_as_verifai():
@@ -51,10 +82,11 @@ def test_every_combination_once_in_order():
         [a, x, b, 0.5, 0.5]
         for x, b, a in itertools.product(np.linspace(0, 1, 4), (0.25, 0.75), (0.25, 0.625, 0.875))
     ]
-    u = whole(search, cube)
-    np.testing.assert_allclose(u[:24], expected, atol=1e-7)
+    np.testing.assert_allclose(whole(search, cube), expected, atol=1e-7)
     # Beyond the end the last point is repeated.
+    u = asked(search, cube)
     np.testing.assert_array_equal(u[24:], np.repeat(u[23:24], len(u) - 24, axis=0))
+    assert not np.array_equal(u, asked(search, cube, seed=1))
 
 
 def test_large_indices_are_exact():
@@ -63,13 +95,19 @@ def test_large_indices_are_exact():
     assert 2**30 < total < 2**31
     state = search.init(jax.random.key(0), cube, 8)
     first = total - 5
-    u, after = search.ask(state._replace(index=jnp.uint32(first)), cube, 8)
-    for row, number in zip(np.asarray(u), [*range(first, total), *[total - 1] * 3], strict=True):
+    numbers = jnp.arange(first, total, dtype=jnp.uint32)
+    for row, number in zip(np.asarray(search.points_at(numbers, cube)), numbers, strict=True):
+        number = int(number)
         rest, cell = divmod(number, 97)
         rest, x = divmod(rest, 21)
         z, y = divmod(rest, 1009)
         np.testing.assert_allclose(row, [x / 20, y / 1008, z / 999, (cell + 0.5) / 97], atol=1e-7)
+    found = np.asarray(permuted(numbers, total, state.keys))
+    assert len(np.unique(found)) == 5
+    assert np.all(found < total)
     # At the end the number stays there.
+    u, after = search.ask(state._replace(index=jnp.uint32(first)), cube, 8)
+    assert len(np.unique(np.asarray(u), axis=0)) == 5
     assert after.index == total
     assert search.ask(after, cube, 8)[1].index == total
 

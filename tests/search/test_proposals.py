@@ -112,6 +112,11 @@ def test_a_grid_ends():
     assert run.acceptance == pytest.approx(20 / 75)
     assert "let through 26.7 % of all proposals" in run.summary()
     assert vj.resume(run, budget=500).simulations == 20
+    assert not any("cut short" in note for note in run.notes)
+    part = vj.falsify(problem, Grid(5), budget=8, batch=16)
+    note = "grid cut short: 8 of its 75 points were simulated (11 %), in a random order over the"
+    assert any(each.startswith(note) for each in part.notes)
+    assert not any("cut short" in each for each in vj.resume(part, budget=75).notes)
 
 
 def test_a_search_that_does_not_get_past_the_constraint_says_so():

@@ -41,6 +41,7 @@ from verifai_jax.falsification.run import (
 )
 from verifai_jax.falsification.silent_mistakes import (
     NOMINAL_FAILS,
+    cut_short_note,
     nominal_note,
     notes_after,
     notes_before,
@@ -547,6 +548,9 @@ def _run_rounds(
         models = (*models[:-1], last.to_json())
     result = run(stopped)
     after = notes_after(rounds.table, result.formulas, search, warm)
+    if not rounds.exhausted:
+        simulated = len(rounds.table) - len(rounds.first)
+        after += cut_short_note(search, search.total(problem.space.cube), max(simulated, 0))
     result = replace(result, notes=(*result.notes, *after))
     try:
         rounds.table.close()

@@ -22,7 +22,7 @@ from verifai_jax.falsification.validation import needs_gradient
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, traced_by_default
-from verifai_jax.search import PointList, Search
+from verifai_jax.search import Grid, PointList, Search
 
 ENOUGH = 32
 """Simulations with a verdict from which on what all of them have in common is worth a note."""
@@ -133,6 +133,26 @@ def notes_after(
     else:
         ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
     return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))
+
+
+def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[str, ...]:
+    """Return a note on how much of a finite search, such as a grid, a run has simulated.
+
+    **Arguments:**
+
+    - `search`: of the run; it has more points to propose.
+    - `total`: points of the whole search; None where it never ends.
+    - `simulated`: points of it that were simulated.
+    """
+    if total is None or isinstance(search, PointList) or simulated >= total:
+        return ()
+    which, order = "search", "in its order"
+    if isinstance(search, Grid):
+        which, order = "grid", "in a random order over the whole of it"
+    return (
+        f"{which} cut short: {simulated} of its {total} points were simulated "
+        f"({100 * simulated / total:.2g} %), {order}; budget={total} simulates all",
+    )
 
 
 def _range(table: ErrorTable, column: str) -> tuple[float, float]:

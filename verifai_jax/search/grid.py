@@ -1,9 +1,17 @@
-"""The regular grid: every combination of evenly spaced values, once, and then an end."""
+"""The regular grid: every combination of evenly spaced values, once, and then an end.
+
+The order is a random permutation of the grid, drawn with the seed: a run that is cut short has seen
+points from everywhere, where rows in order would have stayed in one corner. The permutation is not
+stored, but computed point by point, by a Feistel network over numbers in two digits that leaves out
+what lies beyond the grid (Black, Rogaway, Ciphers with arbitrary finite domains, CT-RSA 2002,
+methods "generalized Feistel" and "cycle walking").
+"""
 
 import math
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
@@ -16,17 +24,22 @@ MOST_POINTS = 2**31 - 1
 """Points of a grid at most."""
 
 
+STEPS = 6
+"""Steps of the permutation; with fewer, small grids have fewer different orders."""
+
+
 class GridState(NamedTuple):
     index: UInt32[Array, ""]
+    keys: UInt32[Array, " steps"]  # of the permutation
 
 
 @dataclass(frozen=True)
 class Grid(Search[GridState]):
     """A grid with both ends of each continuous coordinate and the middle of each cell.
 
-    Discrete coordinates change fastest, and among the discrete and among the continuous ones the
-    first does: for each place in the continuous coordinates all choices are tried. Batches beyond
-    the end repeat the last point.
+    Its points come once each, in a random order that the seed decides. So a budget below the size
+    of the grid simulates a sample of the whole of it, and the run's notes say which share that is.
+    Batches beyond the end repeat the last point.
 
     **Arguments:**
 
@@ -69,14 +82,25 @@ class Grid(Search[GridState]):
         return math.prod(self._sizes(cube))
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GridState:
-        return GridState(jnp.uint32(0))
+        return GridState(jnp.uint32(0), jax.random.bits(key, (STEPS,), jnp.uint32))
 
     def ask(
         self, state: GridState, cube: Cube, batch: int
     ) -> tuple[Float[Array, "batch d"], GridState]:
         total = self.total(cube)
-        rest = jnp.minimum(state.index + jnp.arange(batch, dtype=jnp.uint32), np.uint32(total - 1))
-        figures = []
+        number = state.index + jnp.arange(batch, dtype=jnp.uint32)
+        number = permuted(jnp.minimum(number, np.uint32(total - 1)), total, state.keys)
+        # Stays at the end, so that the number never wraps around.
+        index = jnp.minimum(state.index + batch, np.uint32(total)).astype(jnp.uint32)
+        return self.points_at(number, cube), state._replace(index=index)
+
+    def points_at(self, rest: UInt32[Array, " n"], cube: Cube) -> Float[Array, "n d"]:
+        """Return the points of the grid with these numbers, in the order of its rows.
+
+        Discrete coordinates change fastest, and among the discrete and among the continuous ones
+        the first does.
+        """
+        figures, batch = [], len(rest)
         for size in self._sizes(cube):
             figures.append((rest % np.uint32(size)).astype(jnp.int32))
             rest = rest // np.uint32(size)
@@ -86,9 +110,7 @@ class Grid(Search[GridState]):
         u = u.at[:, cube.discrete].set(cube.centres(places[:, :k]))
         sizes = np.array(self._sizes(cube)[k:], np.int32)
         steps = places[:, k:] / np.maximum(sizes - 1, 1).astype(np.float32)
-        u = u.at[:, cube.continuous].set(jnp.where(sizes > 1, steps, np.float32(0.5)))
-        # Stays at the end, so that the number never wraps around.
-        return u, GridState(jnp.minimum(state.index + batch, np.uint32(total)).astype(jnp.uint32))
+        return u.at[:, cube.continuous].set(jnp.where(sizes > 1, steps, np.float32(0.5)))
 
     def tell(self, state: GridState, cube: Cube, observations: Observations) -> GridState:
         return state
@@ -99,3 +121,38 @@ class Grid(Search[GridState]):
         if isinstance(self.points, tuple):
             return cells + self.points
         return cells + (self.points,) * len(cube.continuous)
+
+
+def permuted(
+    number: UInt32[Array, " n"], total: int, keys: UInt32[Array, " steps"]
+) -> UInt32[Array, " n"]:
+    """Return where a random permutation of the numbers below `total` takes these.
+
+    **Arguments:**
+
+    - `number`: numbers below `total`.
+    - `total`: at most `2^31 - 1`.
+    - `keys`: random bits, one for each step; the same keys give the same permutation.
+    """
+    high = math.isqrt(total - 1) + 1
+    low = -(-total // high)
+
+    def once(number: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
+        # Each step shifts one of the two digits by what a hash makes of the other.
+        one, two, sizes = number // np.uint32(low), number % np.uint32(low), (high, low)
+        for step in range(STEPS):
+            size = np.uint32(sizes[step % 2])
+            one, two = two, (one + _hash(two ^ keys[step]) % size) % size
+        return one * np.uint32(low) + two
+
+    def again(found: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
+        return jnp.where(found < total, found, once(found))
+
+    return jax.lax.while_loop(lambda found: jnp.any(found >= total), again, once(number))
+
+
+def _hash(value: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
+    """Mix the bits of numbers: the finalizer of MurmurHash3."""
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        value = (value ^ (value >> shift)) * np.uint32(factor)
+    return value ^ (value >> 16)
