@@ -52,6 +52,9 @@ def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     # A search that does not learn, and that nothing but the budget ends, has few rounds.
     batches = [usual_batch(vj.search.Uniform(), n, whole=True) for n in (10_000, 131_072, 10**7)]
     assert batches == [1024, 16_384, 32_768]
+    # One that ends with the first failure has small rounds, but not a great many of them.
+    batches = [usual_batch(vj.search.Halton(), n, stop_after=1) for n in (10_000, 100_000, 10**7)]
+    assert batches == [16, 128, 1024]
     assert vj.falsify(problem, "cross_entropy", 1000).batch == 32
     assert vj.falsify(problem, "cross_entropy", 5).batch == 5
     assert vj.search.Bayes().most_at_once == 16

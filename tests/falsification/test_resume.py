@@ -34,15 +34,6 @@ def same(one, other):
     return one.table.all.equals(other.table.all)
 
 
-def end_of_a_round(run, least):
-    """After how many simulations a round of the run ends: there is no other to go on from."""
-    table = run.table.all
-    if "differentiated" not in table:
-        return -(-least // 16) * 16
-    begins = np.flatnonzero(np.diff(table["differentiated"].to_numpy(int)) == 1) + 1
-    return int(begins[begins >= least][0])
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "name",
@@ -54,7 +45,8 @@ def end_of_a_round(run, least):
 )
 def test_in_memory(problem, name):
     whole = vj.falsify(problem, name, 96, batch=16)
-    first = end_of_a_round(whole, 32)
+    # In the middle of a round, which is simulated again as a whole.
+    first = 39
     part = vj.falsify(problem, name, first, batch=16)
     resumed = vj.resume(part, budget=96)
     assert same(resumed, whole)
@@ -75,6 +67,16 @@ def test_with_more_counterexamples_than_are_replayed():
     assert resumed.summary().splitlines()[2] == whole.summary().splitlines()[2]
 
 
+@pytest.mark.thorough
+def test_a_budget_in_the_middle_of_a_round_that_was_reached_is_spent(problem):
+    part = vj.falsify(problem, "cross_entropy", 25, batch=16)
+    with pytest.raises(ValueError, match="has 25 simulations already"):
+        vj.resume(part, budget=20)
+    # The batch stays, where another budget would have had another.
+    resumed = vj.resume(part, budget=2000)
+    assert any(note.startswith("resumed in batches of 16: a run of 2000") for note in resumed.notes)
+
+
 def test_passive_searches_go_on_within_a_batch(problem):
     whole = vj.falsify(problem, "halton", 64, batch=16)
     part = vj.falsify(problem, "halton", 25, batch=16)
@@ -85,11 +87,11 @@ def test_passive_searches_go_on_within_a_batch(problem):
 @pytest.mark.parametrize("name", ["cross_entropy", "portfolio"])
 def test_from_a_folder_after_a_kill(problem, name, tmp_path):
     longest = vj.falsify(problem, name, 240, batch=16)
-    end = end_of_a_round(longest, 96)
+    end = 101
     whole = vj.falsify(problem, name, end, batch=16)
     vj.falsify(problem, name, 64, batch=16, folder=tmp_path / "run")
     # A process that dies has rows that its last saved state does not know of.
-    first = end_of_a_round(longest, 20)
+    first = 23
     earlier = vj.falsify(problem, name, first, batch=16, folder=tmp_path / "earlier")
     shutil.copy(earlier.folder / STATE, tmp_path / "run" / STATE)
     resumed = vj.resume(tmp_path / "run", problem, budget=end)

@@ -48,7 +48,11 @@ if TYPE_CHECKING:
 @click.option("--within", type=float, help="Stop when the failure rate is known as closely.")
 @click.option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @click.option("--warm-start", type=click.Path(path_type=Path), help="Run to learn from first.")
-@click.option("--resume", type=click.Path(path_type=Path), help="Run folder to go on with.")
+@click.option(
+    "--resume",
+    type=click.Path(path_type=Path),
+    help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
+)
 @click.option(
     "--even-if-changed", is_flag=True, help="Resume although the model has changed, and note it."
 )

@@ -296,8 +296,11 @@ def resume(
       notes and its record say so.
     - the others as in `falsify`.
 
-    The table is that of an uninterrupted run, bit for bit. Only where a budget cut the last batch
-    of a search that learns does a larger one go on with a new batch.
+    The table is that of an uninterrupted run with this budget and the same `batch`, bit for bit,
+    whatever the search. Where the earlier budget cut the last round of a search that learns, its
+    simulations are made again, with the others of the round. The default batch of a search that
+    learns depends on the budget: a run from the start has the same points only with the same
+    `batch`, and the notes of the resumed run say where the default would be another.
 
     **Returns:** the run with the earlier rows and the new ones.
 
@@ -352,9 +355,11 @@ def _resume(
         raise ValueError(f"the run of {run.name!r} cannot go on: {run.damage}")
     checkpoint = run.checkpoint or {}
     rows = int(checkpoint.get("rows", 0))
-    if budget <= rows:
+    # Those of a round that the budget cut are simulated again, with the rest of the round.
+    done = len(run.table) if run.stopped == "budget" else rows
+    if budget <= done:
         raise ValueError(
-            f"the run of {run.name!r} has {rows} simulations already; resume it with a larger "
+            f"the run of {run.name!r} has {done} simulations already; resume it with a larger "
             f"budget than {budget}"
         )
     if not checkpoint and len(run.table) and run.stopped != "running":
@@ -387,6 +392,12 @@ def _resume(
     notes = [note for note in run.notes if note.startswith(kept)]
     notes += [changed] if changed else []
     notes += notes_before(problem, search)
+    usual = min(usual_batch(search, budget, ends.stop_after), budget)
+    if search.learns and usual != run.batch:
+        notes.append(
+            f"resumed in batches of {run.batch}: a run of {budget} simulations from the start has "
+            f"batches of {usual} by default, and so other points"
+        )
     return _run_rounds(
         rounds,
         ends,

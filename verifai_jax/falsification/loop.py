@@ -246,10 +246,12 @@ class Rounds:
         verdicts: Verdicts | None = None
         # The number of rows alone says how many of them are still to come, so resuming goes on.
         given = self.first[first : first + most]
+        cut = most < self.batch and len(self.first) > first + most
         suggested = False
         if not len(given) and self.suggestions is not None:
             with self._searching():
                 given = self._suggested(self.suggestions, first)
+            cut = limit is not None and len(given) > limit - first
             given = given[: most if limit is None else max(limit - first, 0)]
             suggested = len(given) > 0
         if len(given):
@@ -265,6 +267,7 @@ class Rounds:
                 self._begin_stage()
                 with self._searching():
                     points = self._proposals.next(most)
+                cut = self._proposals.cut
         if not len(points):
             self._proposals.tell_refused()
             self._keep()
@@ -310,7 +313,9 @@ class Rounds:
         self.violating += int(np.sum(verdicts.violated))
         self.without_verdict += int(np.sum(~verdicts.proper))
         self.best = float(np.fmin(self.best, np.fmin.reduce(verdicts.least)))
-        self._keep()
+        if not (cut and self.search.learns):
+            # A larger budget goes on before a round that this one cut, with all of its points.
+            self._keep()
 
     @contextmanager
     def _searching(self) -> Iterator[None]:

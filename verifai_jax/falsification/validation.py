@@ -52,6 +52,7 @@ def usual_batch(
     A power of two, so that shapes are few.
 
     One that stops at few counterexamples gets small batches: it is likely to end in its first.
+    Where it does not learn it has some five hundred to a thousand rounds at most.
 
     **Arguments:**
 
@@ -61,6 +62,11 @@ def usual_batch(
     - `whole`: whether the budget alone ends the run; a search that does not learn then has eight
       rounds, where these are not too large.
     """
+    if not search.learns and stop_after is not None:
+        few = 1 << (min(search.most_at_once, 16 * stop_after).bit_length() - 1)
+        return max(
+            few, min(search.most_at_once, 1 << (max(int(budget) // 512, 1).bit_length() - 1))
+        )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
         return max(search.most_at_once, min(MOST_AT_ONCE, eighth) if whole else 0)

@@ -47,6 +47,7 @@ class Proposals:
     - `proposed`: number of points that the search proposed.
     - `accepted`: number of these that the constraint accepted.
     - `stage`: the search, or its parts that take part in the next round.
+    - `cut`: whether the last `next` left out points that a search that learns had proposed.
 
     `improve` may replace points of a round by others, of which the search is told instead.
     """
@@ -64,6 +65,7 @@ class Proposals:
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0
+        self.cut = False
         self._marks = marks if search.wants_marks else 0
         self._improve = improve
         self.stage = search.stage(None, self.cube, batch)
@@ -345,6 +347,7 @@ class Proposals:
         missing = self.batch - len(points)
         self._points = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
         self._rows = np.flatnonzero(accepted)[:most]
+        self.cut = int(accepted.sum()) > most
         return points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
 
     def _spread(self, values: np.ndarray, filler: float) -> Any:
