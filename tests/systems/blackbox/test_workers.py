@@ -149,7 +149,7 @@ def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
         return made
 
     monkeypatch.setattr(workers, "_Batch", batch)
-    rest = system.simulate_each([{"a": 0}, {"a": 0}, {"a": 4}, {"a": 4}], [0] * 4)
+    rest = system.simulate_each([{"a": 0}, {"a": 0}, {"a": 4}, {"a": 4}], [1, 2, 3, 4])
     assert sorted(next(rest)[0] for _ in range(2)) == [0, 1]
     with pytest.raises(KeyboardInterrupt):
         next(rest)
