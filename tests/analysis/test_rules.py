@@ -295,6 +295,7 @@ def test_conditions_that_rows_kept_aside_do_not_support_are_dropped(seed):
     assert rule.precision.low < 0.53 < rule.precision.high
 
 
+@pytest.mark.thorough
 def test_a_random_key_is_never_in_a_rule():
     """Whole numbers of so many values need far more support than chance ever gives."""
     for seed in range(20):

@@ -116,6 +116,7 @@ def falling(high=1.5, pull=1.0, bound=0.2):
     return vj.Problem("fall", space, system, f"always (h >= {bound} & v > -0.9)")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("clauses", [False, True])
 def test_gradients_are_recalled_and_right(folder, monkeypatch, clauses):
     swept = []
@@ -209,6 +210,7 @@ for name, function in (("plain", lambda m: 2 * m), ("lapack", jnp.linalg.cholesk
 """
 
 
+@pytest.mark.thorough
 def test_lapack_is_loaded_by_recalled_programs_that_use_it_alone(folder):
     shown = []
     for _ in range(2):
