@@ -226,11 +226,11 @@ def shrink(
             if original.status == 0
             else original.status.name
         )
-        raise ValueError(
+        refusal = (
             f"row {number} of the run of {run.name!r} does not fail when it is simulated again "
-            f"({reason}); see what confirm says of it, and shrink another"
-            f"{''.join(f'. {text}' for text in original.warnings)}"
+            f"({reason}); see what confirm says of it, and shrink another."
         )
+        raise ValueError(" ".join([refusal, *original.warnings]))
     u = np.asarray(problem.space.point_of(problem.space.from_row(first)))
     start = at.settle(u[None])
     if stay:
