@@ -93,7 +93,7 @@ def test_explorations_together_have_all_normals():
     assert np.linalg.norm(last, axis=1) == pytest.approx(1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_failures_that_need_two_oblique_conditions_have_their_probability():
     for seed in range(3):
         known, truth = oblique_slabs(40, 50_000)
@@ -146,7 +146,7 @@ def test_a_region_a_hundred_times_less_probable_has_samples():
     assert np.sum(cells.of(z[fails]) == 1) > 150
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize("gradient", [True, False])
 def test_failures_that_need_a_few_of_many_features_have_their_probability(gradient):
     """Four cells in 20 dimensions, each in three coordinates of its own."""

@@ -34,7 +34,7 @@ def answered(
     return answer, limit_state
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize(
     ("name", "dim"),
     [("half-space", 2), ("sphere", 10), ("uneven modes", 5)],

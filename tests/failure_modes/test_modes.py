@@ -130,7 +130,7 @@ CENTRES = np.array([[0.3, 0.3], [0.36, 0.3], [0.7, 0.6], [0.2, 0.8]])
 RADII = np.array([0.008, 0.004, 0.006, 0.005])
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_islands_inside_a_box_are_modes_with_their_areas():
     """Two lie side by side, and no corner and no tail leads to any."""
 

@@ -30,7 +30,7 @@ def jitted(search):
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize("names", [FLAT, ("mixed",), ("few_of_many",)], ids="-".join)
 def test_beats_uniform(names):
     values = play(SMALL, names, 8, 11, 9, together=False)[1]
@@ -38,7 +38,7 @@ def test_beats_uniform(names):
         assert gain(name, value) > 5, name
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_expected_improvement_beats_uniform():
     (value,) = play(IMPROVEMENT, ("ball",), 8, 11, 9, together=False)[1]
     assert gain("ball", value) > 5

@@ -131,7 +131,7 @@ def kinds(run):
     return len({-1 if row.b > 0.6 else int(8 * row.a) for row in rows.itertuples()})
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_it_finds_more_that_happens_where_inputs_say_little():
     options = {"budget": 500, "seed": 0, "confirm": False}
     assert kinds(vj.falsify(BANDED, "cross_entropy", diverse=True, **options)) <= 4
@@ -163,7 +163,7 @@ def staged(f, key):
     return vj.Trace({"alarm": alarm * jnp.ones(8), "depth": 1.0 * depth * jnp.ones(8)}, dt=1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_what_is_new_leads_on_where_the_robustness_says_nothing():
     space = {name: vj.Box(0, 1) for name in "abcdef"}
     problem = vj.Problem("staged", space, staged, "always alarm < 0.5")

@@ -138,7 +138,7 @@ def test_all_modes_are_found_where_the_plain_search_finds_few():
     assert np.sum(diverse == count) >= 7
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize(("d", "count", "least"), [(2, 5, 4.8), (3, 8, 7.0), (10, 2, 1.5)])
 def test_modes_in_other_dimensions(d, count, least):
     found = modes_found(Diverse(CrossEntropy(), capacity=64), d, count, 32, 200, 20, after=100)

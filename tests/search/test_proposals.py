@@ -52,6 +52,7 @@ def play(proposals, rounds, gradient):
 def test_every_search(name):
     # A small model meets the constraint as a large one does.
     small = {"capacity": 64, "candidates": 64} if name in ("bayes", "turbo") else {}
+    small |= {"capacity": 64} if name == "trace_surrogate" else {}
     search = named(name, **small)
     proposals = Proposals(search, SPACE.cube, 16, KEY, SPACE.constraint)
     points = play(proposals, 8, search.wants_gradient)

@@ -47,7 +47,7 @@ EACH = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize("name", LANDSCAPES)
 def test_the_failure_rates_are_as_stated(name):
     rho, cube, share = LANDSCAPES[name]
@@ -56,7 +56,7 @@ def test_the_failure_rates_are_as_stated(name):
     assert abs(failures - share * 2**18) < 5 * math.sqrt(share * 2**18)
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @pytest.mark.parametrize(
     "name",
     [
@@ -79,7 +79,7 @@ def test_beats_uniform_in_fifty_dimensions(search, name):
     assert gain(name, played(search, name)[1]) > GAIN[search]
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @EACH
 def test_is_not_much_worse_than_uniform_where_nothing_can_be_learned(search):
     if (type(search), "needle") in POINTLESS:
@@ -87,7 +87,7 @@ def test_is_not_much_worse_than_uniform_where_nothing_can_be_learned(search):
     assert gain("needle", played(search, "needle")[1]) > 1 / 1.6
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @EACH
 def test_goes_on_to_other_failures(search):
     u, value = played(search, "saddles")
@@ -103,7 +103,7 @@ def test_goes_on_to_other_failures(search):
     assert np.mean(value[:, value.shape[1] // 2 :] < 0) > least
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 @EACH
 def test_never_stops_exploring(search):
     # A tenth of the last 480 points: over every seed's and coordinate's whole range.

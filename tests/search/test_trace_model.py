@@ -87,7 +87,7 @@ def test_the_fit_follows_the_derivative_of_the_evidence(data):
         np.testing.assert_allclose(got, wanted, rtol=2e-3, atol=2e-3)
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_draws_have_the_moments_of_the_exact_posterior(data):
     x, coefficients, mask = data
     hyper = models.first_hyper(WIDTH)._replace(noise=jnp.float32(-5.0))
@@ -129,7 +129,7 @@ def test_absent_rows_change_nothing(data):
         np.testing.assert_allclose(one, other, atol=1e-2)
 
 
-@pytest.mark.thorough
+@pytest.mark.proves
 def test_what_is_linear_is_learned_from_as_many_rows_as_it_has_inputs():
     # Forty inputs, fifty rows: a rough process alone would know nothing of a new point.
     rng = np.random.default_rng(2)
