@@ -1,4 +1,4 @@
-"""Two minutes of each fuzzer; `benchmarks/soak.py` runs them for as long as one likes."""
+"""Half a minute of each fuzzer; `benchmarks/soak.py` runs them for as long as one likes."""
 
 import logging
 
