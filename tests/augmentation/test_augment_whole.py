@@ -50,7 +50,12 @@ def test_every_arm_adds_what_it_says(whole):
         for seed in (0, 1):
             added = result.added
             rows = added.loc[(added["arm"] == arm) & (added["seed"] == seed)]
-            assert len(rows) == table.loc[(arm, seed), "added"] == (0 if arm == "none" else 24)
+            # So few failures may support no rule, and then the arm says so.
+            no_rule = arm.startswith("rules") and "no rule for" in table.loc[(arm, seed), "why"]
+            wanted = 0 if arm == "none" or no_rule else 24
+            assert len(rows) == table.loc[(arm, seed), "added"] == wanted
+            if not wanted:
+                continue
             for name in ("x", "y"):
                 assert rows[name].between(-1, 1).all()
             errors = result.error_tables[seed]

@@ -96,6 +96,7 @@ def kill_when(busy):
 quiet = pytest.mark.filterwarnings("ignore")
 
 
+# Over a minute: three workers, and one more for that which is killed, each import JAX and compile.
 @quiet
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cartpole", "decaying"])

@@ -74,7 +74,7 @@ def environment():
             "native",
             lambda: mujoco_cartpole.balance,
             {"backend": "native"},
-            marks=pytest.mark.slow,
+            marks=pytest.mark.proves,  # Compiled as a user does: the policy's rounding decides.
         ),
     ],
 )

@@ -211,7 +211,8 @@ def _replay_batch(
         if status == Status.OK:
             robustness = float(np.min(verdicts.rho[i]))
             state = FAILING if bool(verdicts.violated[i]) else FIXED
-            notes += _not_again(entry, changes, robustness)
+            if entry.formulas == formulas:
+                notes += _not_again(entry, changes, robustness)
             if state == FAILING and again is not None and not bool(again.violated[i]):
                 state = WITHOUT_VERDICT
                 notes.append(
