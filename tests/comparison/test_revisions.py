@@ -1,5 +1,6 @@
 """Problems at revisions of git: their own modules and files, in a checkout that stays as it is."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.cli.main import main
-from verifai_jax.core.revisions import load_at_revision, split_revision
+from verifai_jax.core.revisions import _lies_in, load_at_revision, split_revision
 from verifai_jax.core.targets import TargetError
 
 SPEC = """
@@ -123,3 +124,12 @@ def test_command_compares_revisions(project):
     again = vj.compare("specs/ramp.py:ramp@HEAD", "specs/ramp.py:ramp@HEAD~1")
     assert again.candidates[0].name == "specs/ramp.py:ramp@HEAD~1"
     assert again.verdict == "better"
+
+
+def test_what_a_failed_import_left_behind_is_in_no_folder(project, monkeypatch):
+    """A package without an `__init__.py` asks its parent for its folders."""
+    (project / "half" / "part").mkdir(parents=True)
+    monkeypatch.syspath_prepend(str(project))
+    part = importlib.import_module("half.part")
+    monkeypatch.delitem(sys.modules, "half")
+    assert not _lies_in(part, project)

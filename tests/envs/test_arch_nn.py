@@ -42,12 +42,13 @@ def test_steps_of_the_reference_are_followed_as_closely_as_the_loop_allows(simul
     trace = simulate(1.2, 2.8, 1.1)
     assert at(trace, [1])[0] == pytest.approx(1.366161, abs=1e-6)
     # Near its reference the loop is chaotic: what follows depends on the last bit, and so on the
-    # version of XLA. Positions of 64 starts that are 1e-12 apart spread by up to 0.045.
+    # version of XLA. Positions of 64 starts that are 1e-12 apart spread by up to 0.045, and their
+    # margins by 0.016.
     times = [5, 13.3, 15, 26.6, 30, 40]
     wanted = [1.200993, 1.201941, 2.806120, 2.803133, 1.101366, 1.116840]
     np.testing.assert_allclose(at(trace, times), wanted, rtol=0, atol=0.045)
     margin = float(vj.mtl.robustness(specs.nn.formulas["spec"], trace))
-    assert margin == pytest.approx(0.01437, abs=0.01)
+    assert margin == pytest.approx(0.01437, abs=0.016)
 
 
 def test_a_change_of_the_last_digits_moves_the_position_by_a_hundredth():

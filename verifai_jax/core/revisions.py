@@ -138,7 +138,10 @@ def _lies_in(module: object, folder: Path) -> bool:
     file = getattr(module, "__file__", None)
     if file is None:
         # A folder without an `__init__.py` is a package of several places.
-        places = [str(path) for path in getattr(module, "__path__", ())]
+        try:
+            places = [str(path) for path in getattr(module, "__path__", ())]
+        except KeyError:
+            return False  # Its parent is gone: an import that failed has left it behind.
         return bool(places) and all(Path(path).is_relative_to(folder) for path in places)
     return is_user_file(file) and Path(file).resolve().is_relative_to(folder)
 
