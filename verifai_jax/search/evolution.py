@@ -133,7 +133,7 @@ class Evolution(NamedTuple):
         return solve_triangular(factor, steps.T, lower=True).T
 
 
-def _mass(weights: Float[Array, " m"]) -> Float[Array, ""]:
+def _mass(weights: Float[Array, " m"] | float) -> Float[Array, ""]:
     """Return as how many equal weights these count."""
     return jnp.sum(weights) ** 2 / jnp.maximum(jnp.sum(weights**2), 1e-12)
 
