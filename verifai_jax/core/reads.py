@@ -80,7 +80,7 @@ def _writes(mode: object, flags: object) -> bool:
 
 
 def _reader(frame: FrameType | None) -> str | None:
-    """Return the file of the innermost user's module on the stack; None where none reads."""
+    """Return the file of the innermost user's module on the stack, or None if no such one reads."""
     own = str(PACKAGE) + os.sep
     while frame is not None:
         file = frame.f_code.co_filename

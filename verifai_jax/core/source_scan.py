@@ -78,7 +78,7 @@ def _writes(call: ast.Call) -> bool:
 
 
 def _name_of_file(node: ast.AST) -> str | None:
-    """Return the name that an expression ends in; None where it may be no name of a file."""
+    """Return the name that an expression ends in, or None if it cannot name a file."""
     if isinstance(node, ast.Constant):
         parts = _texts([node])
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Div):

@@ -229,7 +229,7 @@ def _replay_batch(
 
 
 def _changes(entry: SavedCounterexample, now: Sources) -> tuple[Change, ...] | None:
-    """Return what has changed since a counterexample was saved; None where that is not known."""
+    """Return what has changed since a counterexample was saved, or None if that is unknown."""
     recorded = entry.found.get("sources")
     try:
         return Sources.from_json(recorded).changes(now) if recorded else None

@@ -66,7 +66,7 @@ class Shrunk:
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
     margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
-    name of coordinate: `(nominal, value)`, None where nominal does not have the item; `count`: how
+    name of coordinate: `(nominal, value)`, None if nominal lacks the item; `count`: how
     many; `distance`: Euclidean, in unit coordinates; `nominal`: that point of the cube;
     `start_count` and `start_distance` of the row;
     `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;

@@ -256,7 +256,7 @@ def _divide(
     answer: Answer,
     more: Float[np.ndarray, "n d"] | None,
 ) -> Divided | None:
-    """Divide the weighted failures into regions; None where there are none, or time ends."""
+    """Divide the weighted failures into regions; return None if there are none, or time ends."""
     if answer.samples is None or not answer.samples.x.any():
         return None
     samples = answer.samples
