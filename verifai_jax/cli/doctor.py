@@ -30,7 +30,7 @@ EXTRAS = {
 
 
 class Tested(NamedTuple):
-    """Versions with which all tests of this version of the package have passed.
+    """Versions with which this version of the package has been tested.
 
     - `python`, `jax`, `numpy`: versions.
     - `platform`: operating system and processor, as `platform` names them.
