@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import ndtri
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.cube import Cube
 
@@ -203,10 +203,3 @@ def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Map uniform numbers in `[0, 1)` to standard normal ones, finite at 0."""
     return ndtri(jnp.maximum(uniform, np.float32(2**-25)))
-
-
-def mixed(value: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
-    """Mix the bits of numbers, as a hash does: the finalizer of MurmurHash3."""
-    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
-        value = (value ^ (value >> shift)) * np.uint32(factor)
-    return value ^ (value >> 16)

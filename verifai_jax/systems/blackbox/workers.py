@@ -271,6 +271,7 @@ class _Batch:
         self.results: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.stopped = False
         self._busy: set[_Worker] = set()
+        self._leaving: set[_Worker] = set()  # Those of the busy ones that take no more.
         self._lock = threading.Lock()
 
     @property
@@ -290,12 +291,17 @@ class _Batch:
                 if seen.get(task[2]) != worker.number:
                     del self.tasks[place]
                     return task
-            # Whatever else is at work comes back for it.
-            return self.tasks.popleft() if self.tasks and self._busy <= {worker} else None
+            if self.tasks and self._busy <= {worker, *self._leaving}:
+                return self.tasks.popleft()
+            # Whatever else is at work comes back for it. It must not count on this worker, in turn:
+            # both would leave what is left to the other.
+            self._leaving.add(worker)
+            return None
 
     def enter(self, worker: "_Worker") -> None:
         with self._lock:
             self._busy.add(worker)
+            self._leaving.discard(worker)
             if self.stopped:
                 worker.kill()
 
