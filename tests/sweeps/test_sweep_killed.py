@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent.parent
 SCRIPT = """
+import os
 import sys
 import numpy as np
 import verifai_jax as vj
@@ -28,7 +29,8 @@ assert found.record.complete
 columns = {n: c for n, c in found.record.columns.items() if n != "training_seconds"}
 policies = [leaf for policy in found.record.policies for leaf in sum(policy.layers, ())]
 arrays = {f"policy{i}": leaf for i, leaf in enumerate(policies)}
-np.savez(sys.argv[3], **{n: c.astype(str) for n, c in columns.items()}, **arrays)
+np.savez("written.npz", **{n: c.astype(str) for n, c in columns.items()}, **arrays)
+os.replace("written.npz", sys.argv[3])  # A kill may come while it is written.
 """
 
 

@@ -23,6 +23,7 @@ from verifai_jax.falsification.claims import SeedClaims
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 from verifai_jax.search.proposals import effort_of
+from verifai_jax.search.repetition import Repetition
 
 VALUES_AT_ONCE = 256
 """Simulations of one call without derivatives."""
@@ -68,6 +69,7 @@ def lockstep(
     run_key = jnp.stack([key for _, key in keys])
     start, ask, tell = _search_programs(problem, search, batch)
     state = start(jnp.stack([key for key, _ in keys]))
+    repetitions = [Repetition(cube, key) for key, _ in keys] if cube.dim else []
     engines = {
         kind: _engine(problem, kind, min(n * batch, most), precision)
         for kind, most in ((False, VALUES_AT_ONCE), (True, DERIVATIVES_AT_ONCE))
@@ -79,23 +81,32 @@ def lockstep(
     differentiated: list[list[bool]] = [[] for _ in range(n)]
     failures = np.full((n, cube.dim), np.nan, np.float32)
     failed = np.zeros(n, bool)
+    proposed = np.zeros(n, int)
     while True:
         u, plan, state = ask(state)
         u, rows, wanted, temperature = map(
             np.asarray, (u, plan.rows, plan.differentiate, plan.temperature)
         )
+        planned = rows
         left = np.array([budget - len(each) for each in rho])
         left[failed] *= not stop_early
         rows = np.minimum(rows, left)
         if not rows.any():
             break
+        asked, u = u, u.copy()
+        proposed += planned
+        for seed, repetition in enumerate(repetitions):
+            chosen = np.arange(batch) < planned[seed]
+            number = int(proposed[seed])
+            u[seed] = repetition.avoid(u[seed], chosen, not wanted[seed], number)
+            repetition.add(u[seed, : rows[seed]])
         values = np.full((n, batch), np.nan, np.float32)
         valid, broken = np.zeros((n, batch), bool), np.zeros((n, batch), bool)
         clauses = np.zeros((n, batch, CLAUSES), np.float32)
         clause_gradients = np.zeros((n, batch, CLAUSES, cube.dim), np.float32)
-        proposed = np.arange(batch) < rows[:, None]
+        simulates = np.arange(batch) < rows[:, None]
         for kind, engine in engines.items():
-            seed, row = np.nonzero(proposed & (wanted == kind)[:, None])
+            seed, row = np.nonzero(simulates & (wanted == kind)[:, None])
             if not len(seed):
                 continue
             numbers = np.array([len(rho[each]) for each in seed]) + row
@@ -133,7 +144,8 @@ def lockstep(
             if len(first) and not failed[seed]:
                 failed[seed], failures[seed] = True, u[seed, first[0]]
         observations = Observations(
-            u=jnp.asarray(u),
+            # As `Proposals` tells them.
+            u=jnp.asarray(np.where(wanted[:, None, None], asked, u)),
             rho=jnp.asarray(values),
             valid=jnp.asarray(valid),
             clauses=jnp.asarray(clauses),

@@ -8,7 +8,7 @@ Methods of Optimization, 1987, section 14.6); for one clause it is a jump along 
 gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
 does a plain gradient, because the gradients of all clauses count.
 
-The first descent starts in the middle, and its box is the whole cube. It shrinks while points turn
+The first descent starts near the middle, and its box is the whole cube. It shrinks while points turn
 out no better, several sizes in one batch where there is room, and grows again on success. A corner
 that nothing points out of is left by its weakest coordinates, one at a time, since a small
 derivative says little about the other end of the range. After that, or when gradients are zero or
@@ -42,6 +42,10 @@ NOTHING = -1e8
 
 LITTLE = 0.9
 """Share of the robustness that is left after a step which is only a little better."""
+
+AROUND = 0.1
+"""Length, in unit coordinates, of the interval around the middle in which the first descent starts:
+where exactly depends on the seed, as all points do."""
 
 SIZES = 6
 """Boxes tried at once at most."""
@@ -345,11 +349,11 @@ class Gradient(Search[GradientState]):
     def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:
-        """Return the points to differentiate: new starts for fresh descents, the middle first."""
+        """Return the points to differentiate: new starts for fresh descents, near the middle first."""
         number = state.starts + jnp.cumsum(state.fresh).astype(jnp.uint32) - 1
         points = halton_points(number, cube.dim, state.key)
         free = np.array(cube.levels) == 0
-        middle = jnp.where(free, 0.5, points)
+        middle = jnp.where(free, 0.5 + AROUND * (points - 0.5), points)
         points = jnp.where((number == 0)[:, None], middle, points)
         given = jnp.isfinite(state.near)
         points = jnp.where(given[:, None], state.offered, points)

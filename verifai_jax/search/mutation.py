@@ -41,6 +41,9 @@ MOST_EXPLORATION = 0.9
 EVENLY = 0.1
 """Share of exploration that samples the prior; it grows where nothing else helps."""
 
+FEW = 4
+"""Dimensions below which corners are few, so that more of exploration samples the prior."""
+
 SELDOM = 0.35
 """Share of exploration in which signals change seldom."""
 
@@ -207,7 +210,7 @@ def _explore(
     """Draw points towards the ends of the range; signals change seldom, always or at random."""
     # Arcsine distributed: dense at both ends, as the best controls often are.
     u = jnp.sin(0.5 * np.pi * values) ** 2
-    evenly = even < EVENLY + (MOST_EXPLORATION - EVENLY) * idle
+    evenly = even < max(EVENLY, 1 - cube.dim / FEW) + (MOST_EXPLORATION - EVENLY) * idle
     u = jnp.where(evenly[:, None] | (np.array(cube.levels) > 0), values, u)
     for signal in cube.signals:
         places = np.array(signal)

@@ -57,6 +57,10 @@ LEAST_SHARE = 0.05
 OPENING = 6
 """Descents before the budget is shared by evidence."""
 
+FEW = 4
+"""Dimensions below which points that are spread find sooner what descents find: the fewer there are,
+the fewer simulations the descents get before there is evidence."""
+
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare."""
 
@@ -120,7 +124,8 @@ class Portfolio(Search[PortfolioState]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
         keys = jax.random.split(key, 3)
         gradient = Gradient().init(keys[0], cube, batch) if self._differentiates(cube) else None
-        gains = np.where(np.arange(3) == GRADIENT, gradient is not None, True) * PRIOR_GAINS
+        share = 0.0 if gradient is None else min(1.0, cube.dim / FEW)
+        gains = np.where(np.arange(3) == GRADIENT, share, 1.0) * PRIOR_GAINS
         return PortfolioState(
             key=key,
             gradient=gradient,
@@ -166,9 +171,11 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is not None:
             points, gradient = Gradient().ask(state.gradient, cube, batch)
             plan = Gradient().plan(gradient, cube, batch)
-            # Some descents go first, that from the middle of the cube before all.
+            # Some descents go first, that from near the middle of the cube before all.
             opening = gradient.starts <= max(OPENING, len(gradient.fresh))
             opening &= gradient.useless == 0
+            if cube.dim < FEW:
+                opening &= state.barren < OPENING * cube.dim
             turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))

@@ -9,7 +9,7 @@ A constraint (`where=`) refuses points; only accepted ones are simulated. A sear
 learn is asked until there are enough, so that the accepted points are a subsequence of its own,
 whatever the batch. One that learns is asked again for the refused rows only, which leaves each
 row with the distribution it would have, given acceptance; rows that stay refused are told as not
-valid.
+valid. A point that was simulated before is not simulated again (`repetition`).
 """
 
 from collections.abc import Callable, Mapping
@@ -29,6 +29,7 @@ from verifai_jax.core.outcomes import OUTCOME
 from verifai_jax.core.remembered import lower_or_recall, remembered_as
 from verifai_jax.search import Diverse, Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_own
+from verifai_jax.search.repetition import Repetition
 
 TRIES = 32
 """Asks in one round at most until every row of a search that learns is accepted."""
@@ -83,6 +84,7 @@ class Proposals:
         self._rows = np.zeros(0, int)  # and which of them are simulated.
         self._plan: Plan | None = None
         self._barren = 0  # Rounds without any, so far.
+        self._repetition = Repetition(cube, key) if search.learns and cube.dim else None
 
     @property
     def exhausted(self) -> bool:
@@ -210,6 +212,8 @@ class Proposals:
     ) -> None:
         if not self.search.learns or not len(u):
             return
+        if self._repetition is not None:
+            self._repetition.add(u)
         if verb not in self._verbs:
             learn = getattr(self.search, verb)
             self._verbs[verb] = jax.jit(lambda state, rows: learn(state, self.cube, rows))
@@ -255,6 +259,7 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
+            **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
     def restore(self, checkpoint: Mapping[str, np.ndarray | Array]) -> None:
@@ -277,6 +282,8 @@ class Proposals:
         self._state = jax.tree.unflatten(form, restored)
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
+        if self._repetition is not None and "simulated" in checkpoint:
+            self._repetition.codes = np.asarray(checkpoint["simulated"])
 
     def _ask(self) -> Float[Array, "m d"]:
         points, self._state = self._program.ask(self._state)
@@ -330,25 +337,48 @@ class Proposals:
             self._plan, planned = plan, int(plan.rows)
         self.proposed += planned
         wanted = np.arange(len(points)) < planned
+        asked, points = points, self._unrepeated(points, wanted)
         accepted = self._accepted_rows(points) & wanted
         for _ in range(TRIES - 1):
             if accepted.sum() == planned or self.total is not None:
                 break
             others = self._ask()
             fresh = wanted & ~accepted
-            if np.array_equal(np.asarray(others)[fresh], np.asarray(points)[fresh]):
+            if np.array_equal(np.asarray(others)[fresh], np.asarray(asked)[fresh]):
                 break  # This search proposes the same until it is told something.
             self.proposed += int(fresh.sum())
-            points = jnp.where(fresh[:, None], others, points)
+            asked = jnp.where(fresh[:, None], others, asked)
+            points = jnp.where(fresh[:, None], self._unrepeated(others, fresh), points)
             accepted = accepted | (self._accepted_rows(points) & wanted)
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MOST_REFUSED:
             self._give_up()
-        missing = self.batch - len(points)
-        self._points = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
+        told = points if self._anywhere else asked
+        missing = self.batch - len(told)
+        self._points = np.pad(told, ((0, missing), (0, 0)), mode="edge") if missing else told
         self._rows = np.flatnonzero(accepted)[:most]
         self.cut = int(accepted.sum()) > most
-        return points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
+        simulated = points if len(self._rows) == len(points) else np.asarray(points)[self._rows]
+        if self._repetition is not None and not self.cut:
+            self._repetition.add(np.asarray(simulated))
+        return simulated
+
+    @property
+    def _anywhere(self) -> bool:
+        """True where any point may take the turn of a repeated one, and the search is told which.
+
+        A search that plans its rounds has looked at the point without derivatives. Others go on
+        from the points that they proposed: they are told of these, which are next to it.
+        """
+        return self._plan is not None and not bool(self._plan.differentiate)
+
+    def _unrepeated(
+        self, points: Float[Array, "n d"] | Float[np.ndarray, "n d"], wanted: Bool[np.ndarray, " n"]
+    ) -> Float[Array, "n d"] | Float[np.ndarray, "n d"]:
+        """Return the points of a round, with others for those that were simulated before."""
+        if self._repetition is None:
+            return points
+        return self._repetition.avoid(np.asarray(points), wanted, self._anywhere, self.proposed)
 
     def _spread(self, values: np.ndarray, filler: float) -> Any:
         """Put values of the simulated rows into an array of all rows of the batch."""
