@@ -1,12 +1,18 @@
 """The type checker of the tests: beartype, which takes NumPy's numbers for Python's.
 
+check_first_calls()
 install_import_hook("verifai_jax.estimation", "checked_types.check")
 with unchecked():
     estimate("no problem")          # the function's own message, not the checker's
 """
 
 import contextlib
-from collections.abc import Iterator
+import functools
+import inspect
+from collections import Counter
+from collections.abc import Callable, Iterator
+from types import CodeType
+from typing import Any
 
 import jaxtyping
 import numpy as np
@@ -26,3 +32,46 @@ def unchecked() -> Iterator[None]:
         yield
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
+
+
+CALLS = 50
+"""Calls of a function that are checked in a process, of all calls the first: a wrong annotation
+shows in one of these, and a million checks take longer than what they look at."""
+
+INSTANCES = 3
+"""Functions made within another one, by the same lines of it, whose calls are checked."""
+
+
+def check_first_calls() -> None:
+    """Let jaxtyping's import hook make the checks of a function when it is called, and not always.
+
+    Before a module is imported under the hook.
+    """
+    whole = jaxtyping.jaxtyped
+    made: Counter[CodeType] = Counter()
+
+    def jaxtyped(fn: Any = None, *, typechecker: Any) -> Any:
+        if fn is None:
+            return functools.partial(jaxtyped, typechecker=typechecker)
+        if not inspect.isfunction(fn):
+            return whole(typechecker=typechecker)(fn)
+        made[fn.__code__] += 1
+        if made[fn.__code__] > INSTANCES:
+            return fn
+        checked: list[Callable[..., Any]] = []
+        calls = 0
+
+        @functools.wraps(fn)
+        def wrapped(*args: Any, **kwargs: Any) -> Any:
+            __tracebackhide__ = True
+            nonlocal calls
+            if calls >= CALLS:
+                return fn(*args, **kwargs)
+            calls += 1
+            if not checked:
+                checked.append(whole(typechecker=typechecker)(fn))
+            return checked[0](*args, **kwargs)
+
+        return wrapped
+
+    jaxtyping.jaxtyped = jaxtyped

@@ -6,6 +6,7 @@ import os
 import resource
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 # Tests measure what the code compiles, not what an earlier session left behind.
@@ -13,6 +14,7 @@ os.environ.setdefault("VERIFAI_JAX_CACHE", "off")
 
 import matplotlib
 import pytest
+from checked_types import check_first_calls
 from jaxtyping import install_import_hook
 
 matplotlib.use("Agg")
@@ -54,6 +56,7 @@ CHECKED_ROOMS: list[str] = [
 ]
 """Rooms whose annotations, shapes included, are checked at run time in tests."""
 
+check_first_calls()
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")
 
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
@@ -106,12 +109,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
+KEPT = 1.3
+"""Memory, in GB, up to which compiled programs are kept: small ones are used by many files."""
+
+
+def memory() -> float:
+    """Return the resident memory of this process now, in GB; infinite where it cannot be read."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("inf")
+    return pages * resource.getpagesize() / 1e9
+
+
 @pytest.fixture(scope="module", autouse=True)
 def memory_given_back(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Free the programs that a file has compiled: the next one compiles others."""
+    """Free the programs that files have compiled, once they take much memory."""
     yield
     jax = sys.modules.get("jax")
-    if jax is None:
+    if jax is None or memory() < KEPT:
         return
     specs = [module for name, module in sys.modules.items() if name.startswith("specs")]
     for module in (request.module, *specs):

@@ -1,4 +1,4 @@
-"""Half a minute of each fuzzer; `benchmarks/soak.py` runs them for as long as one likes."""
+"""Some seconds of each fuzzer; `benchmarks/soak.py` runs them for as long as one likes."""
 
 import logging
 
@@ -7,7 +7,7 @@ import pytest
 from benchmarks.faults import folders, formulas, kills, messages
 from benchmarks.faults.cases import tally
 
-SECONDS = 30.0
+SECONDS = 8.0
 
 
 @pytest.mark.slow
@@ -31,11 +31,11 @@ def test_messages():
     with messages.fire() as fire:
         found = tally(fire.case, 0, cases=10_000, seconds=SECONDS)
     assert not found.broken, found
-    assert found.cases > 100
+    assert found.cases >= 100
 
 
 @pytest.mark.slow
 def test_kills():
-    found = tally(kills.case, 0, cases=6, seconds=SECONDS)
+    found = tally(kills.case, 0, cases=2, seconds=SECONDS)
     assert not found.broken, found
-    assert found.cases > 1
+    assert found.cases >= 1

@@ -14,7 +14,7 @@ from verifai_jax.clusters import RayExecutor, connect
 from verifai_jax.core.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.targets import load_target
 
-ROWS = 200_000
+ROWS = 100_000
 
 
 def black_box():
@@ -44,9 +44,9 @@ def decaying():
     return problem, vj.falsify(problem, "uniform", 2000).table.all
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def dask():
-    """Three worker processes of one thread each, anew for each test, for one may kill a worker."""
+    """Three worker processes of one thread each; one that is killed is started again."""
     distributed = pytest.importorskip("distributed", reason="needs the extra dask")
     with (
         distributed.LocalCluster(
