@@ -106,3 +106,20 @@ def test_resumed_it_remembers_the_points_of_the_process_before(tmp_path):
     vj.falsify(bowl, budget=28, batch=4, seed=1, folder=tmp_path)
     resumed = vj.resume(tmp_path, bowl, budget=60).table.all
     np.testing.assert_array_equal(whole["x0"], resumed["x0"])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("search", ["bayes", "turbo"])
+def test_a_half_without_verdicts_is_left_alone(search):
+    half = vj.Problem(
+        "half",
+        space={"a": vj.Box(-1, 1), "b": vj.Box(-1, 1)},
+        system=vj.blackbox(
+            lambda features: vj.Trace(
+                {"y": np.full(2, np.nan if features["a"] < 0 else 0.2 + features["b"] ** 2)}, dt=1.0
+            )
+        ),
+        spec="always y > 0",
+    )
+    table = vj.falsify(half, search=search, budget=96).table.all
+    assert np.mean(table["a"].to_numpy()[32:] < 0) < 0.25

@@ -102,6 +102,10 @@ class Search(abc.ABC, Generic[State]):
     wants_outcomes: ClassVar[bool] = False
     """Whether `tell` needs `Observations.outcomes`."""
 
+    avoids_no_verdict: ClassVar[bool] = False
+    """Whether a simulation without a verdict is told as one of the greatest robustness so far, so
+    that a model of the robustness leaves alone where there are no verdicts."""
+
     samples_prior: ClassVar[bool] = False
     """Whether points are independent samples of the prior, so that failure rates mean something."""
 

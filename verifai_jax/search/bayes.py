@@ -83,6 +83,7 @@ class Bayes(Search[BayesState]):
     """
 
     most_at_once: ClassVar[int] = 16
+    avoids_no_verdict: ClassVar[bool] = True
     acquisition: str = "thompson"
     capacity: int = 512
     candidates: int = 512

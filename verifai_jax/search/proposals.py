@@ -12,6 +12,7 @@ row with the distribution it would have, given acceptance; rows that stay refuse
 valid. A point that was simulated before is not simulated again (`repetition`).
 """
 
+import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple, NoReturn
@@ -84,6 +85,7 @@ class Proposals:
         self._rows = np.zeros(0, int)  # and which of them are simulated.
         self._plan: Plan | None = None
         self._barren = 0  # Rounds without any, so far.
+        self._greatest = -math.inf  # Robustness so far, for a search that avoids what has none.
         self._repetition = Repetition(cube, key) if search.learns and cube.dim else None
 
     @property
@@ -152,6 +154,10 @@ class Proposals:
         """
         if not self.search.learns:
             return
+        if self.search.avoids_no_verdict and valid.any():
+            self._greatest = float(np.max(rho[valid], initial=self._greatest))
+        if self.search.avoids_no_verdict and math.isfinite(self._greatest):
+            rho, valid = np.where(valid, rho, np.float32(self._greatest)), np.ones(len(rho), bool)
         observations = Observations(
             u=self._points,
             rho=self._spread(rho, np.nan),
@@ -259,6 +265,7 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
+            "greatest": np.array(self._greatest),
             **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
@@ -282,6 +289,7 @@ class Proposals:
         self._state = jax.tree.unflatten(form, restored)
         self._queue = np.asarray(checkpoint["queue"])
         self.proposed, self.accepted = (int(count) for count in checkpoint["counts"])
+        self._greatest = float(checkpoint.get("greatest", -math.inf))
         if self._repetition is not None and "simulated" in checkpoint:
             self._repetition.codes = np.asarray(checkpoint["simulated"])
 

@@ -85,6 +85,7 @@ class TuRBO(Search[TuRBOState]):
     """
 
     most_at_once: ClassVar[int] = 16
+    avoids_no_verdict: ClassVar[bool] = True
     capacity: int = 512
     candidates: int = 1024
     initial: int = 12
