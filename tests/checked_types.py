@@ -72,6 +72,8 @@ def check_first_calls() -> None:
                 checked.append(whole(typechecker=typechecker)(fn))
             return checked[0](*args, **kwargs)
 
+        # What makes a model is told by the files of its functions: this one is no part of any.
+        wrapped.__code__ = wrapped.__code__.replace(co_filename=fn.__code__.co_filename)
         return wrapped
 
     jaxtyping.jaxtyped = jaxtyped

@@ -334,6 +334,7 @@ class Rounds:
     ) -> None:
         """Let the search learn from a round, of its own points or of `given` ones."""
         if len(given):
+            self._proposals.remember(given)
             told = objective[verdicts.proper].astype(np.float32)
             happened = None if outcomes is None else outcomes[verdicts.proper]
             if suggested:

@@ -209,6 +209,11 @@ class Proposals:
         """Let the search start from points that somebody suggested, between two rounds."""
         self._learn_from(u, rho, outcomes, "start_from")
 
+    def remember(self, u: Float[np.ndarray, "n d"]) -> None:
+        """Propose no more points that the run has simulated, but not as proposals: given ones."""
+        if self._repetition is not None:
+            self._repetition.add(u)
+
     def _learn_from(
         self,
         u: Float[np.ndarray, "n d"],
@@ -218,8 +223,6 @@ class Proposals:
     ) -> None:
         if not self.search.learns or not len(u):
             return
-        if self._repetition is not None:
-            self._repetition.add(u)
         if verb not in self._verbs:
             learn = getattr(self.search, verb)
             self._verbs[verb] = jax.jit(lambda state, rows: learn(state, self.cube, rows))
@@ -361,7 +364,7 @@ class Proposals:
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MOST_REFUSED:
             self._give_up()
-        told = points if self._anywhere else asked
+        told = points if self._anywhere or not len(self.cube.continuous) else asked
         missing = self.batch - len(told)
         self._points = np.pad(told, ((0, missing), (0, 0)), mode="edge") if missing else told
         self._rows = np.flatnonzero(accepted)[:most]
