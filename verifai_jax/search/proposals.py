@@ -268,7 +268,7 @@ class Proposals:
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},
             "queue": self._queue,
             "counts": np.array([self.proposed, self.accepted], np.int64),
-            "greatest": np.array(self._greatest),
+            **({"greatest": np.array(self._greatest)} if self.search.avoids_no_verdict else {}),
             **({} if self._repetition is None else {"simulated": self._repetition.codes}),
         }
 
