@@ -243,7 +243,8 @@ def test_a_function_of_the_script_itself(tmp_path):
     done = run(script(tmp_path, SCRIPT + "\n    if __name__ == '__main__':\n        main()\n"))
     assert done.returncode == 0, done.stderr
     assert done.stdout == "[1.0, 1.0]\n"
-    assert done.stderr == ""
+    # A busy machine may take long to start a worker, which is said.
+    assert not [line for line in done.stderr.splitlines() if "is still importing" not in line]
 
 
 @pytest.mark.thorough
