@@ -43,7 +43,7 @@ NOTHING = -1e8
 LITTLE = 0.9
 """Share of the robustness that is left after a step which is only a little better."""
 
-AROUND = 0.1
+AROUND = 0.01
 """Length, in unit coordinates, of the interval around the middle in which the first descent starts:
 where exactly depends on the seed, as all points do."""
 
