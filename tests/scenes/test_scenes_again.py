@@ -22,7 +22,6 @@ third = new Object at 20 @ Range(Range(0, 1), 3), with width Uniform(Range(1, 2)
 """
 
 
-
 def pose(body):
     return (*body.position, body.orientation.yaw, body.width)
 
@@ -201,7 +200,9 @@ class TestThreeDimensions:
         assert program.space.check_where() == 1.0
         assert 16 <= len(asked) < 200
         monkeypatch.setattr("verifai_jax.scenes.requirements.FIRST_SHOWN", 0.05)
-        program.space.accepts_points(np.random.default_rng(1).random((16, program.space.dim), np.float32))
+        program.space.accepts_points(
+            np.random.default_rng(1).random((16, program.space.dim), np.float32)
+        )
         assert "Scenic decides requirements in Python" in capsys.readouterr().err
 
 

@@ -67,6 +67,11 @@ class CheckedSystem(System):
         self.traced_factor = system.traced_factor
         self.backends, self.backend, self.likely = system.backends, system.backend, system.likely
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The system's own."""
+        return self.system.notes
+
     def __repr__(self) -> str:
         return repr(self.system)
 

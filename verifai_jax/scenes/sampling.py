@@ -226,7 +226,9 @@ class Sampling:
                 except (ValueError, refusals) as error:
                     why = f": {error}"
             else:
-                raise ValueError(f"this scene does not tell the features at which it would come{why}")
+                raise ValueError(
+                    f"this scene does not tell the features at which it would come{why}"
+                )
         features.update({name: bool(r.active) for name, r in self.soft.items()})
         if SEED in self.domains:
             features[SEED] = 0.5
@@ -251,7 +253,9 @@ class Sampling:
                 complete = False
                 unit = {name: random.random() if place is None else place for name in leaf.domains}
                 guess = {
-                    name: np.asarray(domain.from_unit(jnp.full(domain.size, unit[name], jnp.float32)))
+                    name: np.asarray(
+                        domain.from_unit(jnp.full(domain.size, unit[name], jnp.float32))
+                    )
                     for name, domain in leaf.domains.items()
                 }
                 values[node] = self._drawn(leaf, guess, values.__getitem__)

@@ -42,6 +42,7 @@ class System:
     - `effort`: how much XLA does to make programs that simulate it fast; one for all numbers of
       rows, since a row's last digits may depend on it.
     - `forward_up_to`: features up to which forward mode is no slower than reverse mode.
+    - `notes`: sentences for the notes of a run, on what the system changed in what it was given.
     - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
     - `dt`: the sampling period in seconds of what `fold` simulates.
     - `exact_step`: True where the step is part of what the system is, as in an environment that its
@@ -57,6 +58,7 @@ class System:
     lanes: int = 512
     effort: Effort = "most"
     forward_up_to: int = 1
+    notes: tuple[str, ...] = ()
     reverse_hint: str = ""
     dt: float | None = None
     exact_step: bool = False

@@ -43,7 +43,7 @@ from verifai_jax.systems.environments.brax_model import (
     with_system,
     with_value,
 )
-from verifai_jax.systems.environments.delays import (
+from verifai_jax.systems.delays import (
     NO_DELAY,
     Delay,
     DelayOption,
