@@ -106,30 +106,31 @@ class TestThereAndBack:
         assert again.egoObject is None
 
 
+CAR = (
+    "model scenic.simulators.newtonian.model\nparam render = False\n"
+    "from scenic.core.dynamics import Action\n"
+    "class Set(Action):\n    def __init__(self, x):\n        self.x = x\n"
+    "    def applyTo(self, agent, simulation):\n        agent.velocity = self.x @ 0\n"
+    "behavior Go(x):\n    while True:\n        take Set(x)\n"
+)
+PROGRAMS = {
+    "behaviour": "behavior B():\n    while True:\n        take Set(Range(-9, 9))\n"
+    "ego = new Object with behavior B\nrecord ego.position.x as x\n",
+    "do choose": "behavior B():\n    do choose Go(-9), Go(-3), Go(3), Go(9)\n"
+    "ego = new Object with behavior B\nrecord ego.position.x as x\n",
+    "compose": "scenario Main():\n    setup:\n        ego = new Object with behavior Go(0)\n"
+    "        record ego.position.x as x\n"
+    "    compose:\n        do choose Sub(-9), Sub(-3), Sub(3), Sub(9)\n"
+    "scenario Sub(x):\n    setup:\n        override ego with behavior Go(x)\n",
+}
+
+
 class TestProgramsThatDrawWhileTheyRun:
     """What is drawn while a program runs depends on the row, and on a feature `seed`."""
 
-    CAR = (
-        "model scenic.simulators.newtonian.model\nparam render = False\n"
-        "from scenic.core.dynamics import Action\n"
-        "class Set(Action):\n    def __init__(self, x):\n        self.x = x\n"
-        "    def applyTo(self, agent, simulation):\n        agent.velocity = self.x @ 0\n"
-        "behavior Go(x):\n    while True:\n        take Set(x)\n"
-    )
-    PROGRAMS = {
-        "behaviour": "behavior B():\n    while True:\n        take Set(Range(-9, 9))\n"
-        "ego = new Object with behavior B\nrecord ego.position.x as x\n",
-        "do choose": "behavior B():\n    do choose Go(-9), Go(-3), Go(3), Go(9)\n"
-        "ego = new Object with behavior B\nrecord ego.position.x as x\n",
-        "compose": "scenario Main():\n    setup:\n        ego = new Object with behavior Go(0)\n"
-        "        record ego.position.x as x\n"
-        "    compose:\n        do choose Sub(-9), Sub(-3), Sub(3), Sub(9)\n"
-        "scenario Sub(x):\n    setup:\n        override ego with behavior Go(x)\n",
-    }
-
     @pytest.mark.parametrize("name", PROGRAMS)
     def test_they_run(self, name):
-        program = vj.scenic(self.CAR + self.PROGRAMS[name])
+        program = vj.scenic(CAR + PROGRAMS[name])
         assert program.space.columns == ("seed",)
         run = program.simulator(steps=4, records=("x",))
         ends = [float(run({"seed": s}, seed).signals["x"][-1]) for s, seed in SEEDS]
@@ -137,7 +138,7 @@ class TestProgramsThatDrawWhileTheyRun:
         assert ends[0] == float(run({"seed": 0.1}, 1).signals["x"][-1])
 
     def test_a_run_is_falsified_and_replayed(self):
-        program = vj.scenic(self.CAR + self.PROGRAMS["behaviour"])
+        program = vj.scenic(CAR + PROGRAMS["behaviour"])
         problem = vj.Problem(
             "wander", program.space, program.simulator(steps=4, records=("x",)), "always x < 0.5"
         )

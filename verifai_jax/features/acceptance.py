@@ -21,7 +21,7 @@ ENOUGH = 1000
 """Accepted samples after which the rate is known well enough."""
 
 ON_HOST = 16
-"""Samples at a time of a constraint that Python decides, which may take tens of milliseconds each."""
+"""Samples at a time of a constraint that Python decides, which may take 40 ms for each."""
 
 PATIENCE, AT_MOST = 1.0, 60.0
 """Seconds after which one accepted sample of such a constraint is enough, and after which none ends

@@ -154,8 +154,8 @@ class Constraint:
         if now - self._shown > SHOWN_EVERY:
             self._shown = now
             write_line(
-                f"vj.scenic: Scenic decides requirements in Python: {decided} of {points} points so "
-                f"far, {1000 * (now - self._began) / decided:.0f} ms each"
+                f"vj.scenic: Scenic decides requirements in Python: {decided} of {points} points "
+                f"so far, {1000 * (now - self._began) / decided:.0f} ms each"
             )
 
     def _accepts(self, features: Mapping[str, Any]) -> bool:

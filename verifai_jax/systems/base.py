@@ -153,6 +153,15 @@ class System:
         """Return the reason why an engine cannot simulate this system, None where it can."""
         return None if backend in self.backends else "the system has no such backend"
 
+    def why_slow_to_compile(self, gradient: bool) -> str:
+        """Say why compiling this system takes minutes, and what is cheaper; empty if it is quick.
+
+        **Arguments:**
+
+        - `gradient`: whether derivatives are compiled too.
+        """
+        return ""
+
     def why_error(self, features: Features) -> str | None:
         """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.
 

@@ -81,14 +81,15 @@ class TestPaths:
         np.testing.assert_allclose(here.signals["x"], there.signals["x"], atol=1e-5)
 
 
-class TestDelays:
-    SEEN = {"signals": {"u": lambda time, state, control, features: control[0]}}
+SEEN = {"signals": {"u": lambda time, state, control, features: control[0]}}
 
+
+class TestDelays:
     @pytest.mark.parametrize("backend", ["native", pytest.param("mjx", marks=pytest.mark.thorough)])
     def test_a_decision_takes_effect_later(self, backend):
         system = cart(
             controller=lambda time, state, features: 1.0 + time, backend=backend,
-            action_delay={"lag": 3}, **self.SEEN,
+            action_delay={"lag": 3}, **SEEN,
         )  # fmt: skip
         simulate = system if backend == "native" else jax.jit(system)
         sent = simulate({"lag": jnp.int32(2)}).signals["u"]
@@ -103,7 +104,7 @@ class TestDelays:
         with pytest.raises(ValueError, match="action_delay must be a number of steps"):
             cart(action_delay=-1, controller=lambda t, s, f: 0.0)
         system = cart(action_delay={"lag": 3}, controller=lambda t, s, f: 0.0)
-        with pytest.raises(vj.ProblemError, match="unknown feature of action_delay"):
+        with pytest.raises(ValueError, match="unknown feature of action_delay: 'lag'"):
             vj.Problem("p", vj.FeatureSpace({"x": vj.Box(0, 1)}), system, "x < 9").check()
 
 
@@ -139,7 +140,7 @@ class TestControllersInPython:
                 return 1.0, memory
             return 0.0, memory + 1
 
-        system = cart(controller=counting, controller_memory=0, backend="native", **TestDelays.SEEN)
+        system = cart(controller=counting, controller_memory=0, backend="native", **SEEN)
         assert system({}).signals["u"].tolist() == [0.0] * 3 + [1.0] * 8
 
     def test_elsewhere_the_error_names_the_way(self):
@@ -187,3 +188,31 @@ class TestRefusals:
         code = why.split("`")[1].partition("; ")[2]
         exec(code.replace("; for", "\nfor"), {"spec": spec, "mujoco": mj})
         assert cart(spec).why_not("mjx") is None
+
+
+class TestWhatTakesLong:
+    def test_a_compilation_of_minutes_is_announced_with_its_reason_and_a_cheaper_way(self):
+        floor = '<geom name="floor" type="plane" size="9 9 1" pos="0 0 -9"/><body name="target"'
+        source = model('integrator="RK4"').replace('<body name="target"', floor)
+        system = cart(source, backend="mjx")
+        why = system.why_slow_to_compile(True)
+        assert "MJX compiles this model for minutes" in why
+        assert "four times in each Runge-Kutta step" in why
+        assert 'integrator="implicitfast"' in why
+        assert 'backend="native"' in why
+        assert system.with_backend("native").why_slow_to_compile(True) == ""
+        assert cart(source, backend="auto").why_slow_to_compile(True) == ""
+
+    @pytest.mark.thorough
+    def test_a_row_of_mjx_is_replayed_natively_where_that_gives_its_number(self):
+        system = cart(backend="mjx", bind={"x0": "joint/s/qpos"}, keyframe=0)
+        space = vj.FeatureSpace({"x0": vj.Box(0, 1)})
+        problem = vj.Problem("cart", space, system, "always x < 0.8")
+        run = vj.falsify(problem, "uniform", budget=4, batch=4, confirm=False, progress=False)
+        seen = run.replay(1)
+        assert seen.finding == ""
+        assert seen.rho["spec"] == pytest.approx(run.table.row(1)["rho"], abs=1e-5)
+        assert "engine       native MuJoCo" in str(seen)
+        other = run.table.all.copy()
+        other["rho"] += 0.1
+        assert run._natively(1, run.table.row(1), other.loc[1].to_dict()) is None

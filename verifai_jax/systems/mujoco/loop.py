@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.errors import check_names
@@ -234,7 +235,7 @@ class Loop:
         return control.reshape(nu), memory
 
     def _decide(self, state: State, memory: PyTree, features: Features) -> Any:
-        """Call the controller: under JAX, or on the host where it may be and JAX cannot trace it."""
+        """Call the controller: under JAX, or on the host where JAX cannot trace it and it may."""
         assert self.controller is not None
         first = (
             (state.time, state) if self.controller_memory is None else (state.time, state, memory)
@@ -243,7 +244,7 @@ class Loop:
             try:
                 return self.controller(*first, features)
             except Exception as error:
-                if not self.on_host or not isinstance(state.time, jax.core.Tracer):
+                if not self.on_host or not isinstance(state.time, Tracer):
                     raise
                 self.said["controller"] = self._why_on_host((*first, dict(features)), error)
         form = jax.ShapeDtypeStruct((self.compiled.nu,), state.time.dtype)

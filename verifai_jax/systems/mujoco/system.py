@@ -73,6 +73,28 @@ class MuJoCo(System):
         """Sentences on what was changed in the model, and on a controller that runs in Python."""
         return (*self.loop.bindings.model.notes, *self.loop.said.values())
 
+    def why_slow_to_compile(self, gradient: bool) -> str:
+        """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
+
+        **Arguments:**
+
+        - `gradient`: whether derivatives are compiled too.
+        """
+        compiled = self.loop.compiled
+        stages = compiled.opt.integrator == 1  # Runge-Kutta
+        if self.backend != "mjx" or not (stages or gradient) or not has_constraints(compiled):
+            return ""
+        reason = "its constraints are solved in a loop"
+        reason += ", four times in each Runge-Kutta step" if stages else ""
+        sweeps = ", whose derivatives take forward sweeps" if stages and gradient else ""
+        reason += sweeps or (", through which derivatives are taken" if gradient else "")
+        euler = 'integrator="implicitfast" in the model, or ' if stages else ""
+        search = ' with a search without gradients, such as "cross_entropy"' if gradient else ""
+        return (
+            f"MJX compiles this model for minutes: {reason}. Cheaper: {euler}"
+            f'backend="native"{search}, which compiles nothing of the physics'
+        )
+
     def why_error(self, features: Features) -> str | None:
         """Return what is wrong with the delay of a simulation that ended with `ERROR`, if it is."""
         return self.loop.delay.refusal(features, "this system") if self.loop.delay.most else None
