@@ -82,7 +82,7 @@ class Sampling:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether something happens over time, in which the program or its simulator may draw."""
+        """True where something happens over time, in which program or simulator may draw."""
         parts = self.scenario.dynamicScenario
         behaves = any(field(body, "behavior") is not None for body in self.scenario.objects)
         composed = getattr(parts, "_compose", None) is not None
