@@ -121,7 +121,9 @@ class MuJoCo(System):
         """
         if name != "auto" and (reason := self.why_not(name)) is not None:
             raise ValueError(f"backend {name!r} is not possible: {reason}")
-        return replace(self, backend=name, loop=replace(self.loop, on_host=name == "native"))
+        return replace(
+            self, backend=name, loop=replace(self.loop, on_host=name == "native", said={})
+        )
 
     @property
     def traced_factor(self) -> bool:
