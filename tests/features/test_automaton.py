@@ -205,6 +205,62 @@ def test_refused_automata(events, options, message):
         Automaton("a", events, **options)
 
 
+W = {"wait": Box(0, 1)}
+
+
+@pytest.mark.parametrize(
+    ("events", "options", "message"),
+    [
+        (
+            {("cruise", "cut"): {"to": "crowdd", **W}, ("crowded", "brake"): {"to": "cruise", **W}},
+            {},
+            "no event leaves the state 'crowdd' that cruise -cut-> crowdd leads to; did you mean "
+            "'crowded'",
+        ),
+        (
+            {("cruise", "cut"): {"to": "slow", **W}, ("slow", "go"): {"to": "criuse", **W}},
+            {},
+            "did you mean 'cruise'",
+        ),
+        (
+            {("cruise", "cut"): W, ("far", "brake"): {"to": "cruise", **W}},
+            {},
+            "no sequence of events leads from 'cruise' to the state 'far' of far -brake-> cruise; "
+            "it leads to cruise: correct its name, or add an event with to='far'",
+        ),
+        (
+            {
+                ("cruise", "cut"): W,
+                ("b", "x"): {"to": "c", **W},
+                ("c", "x"): {"to": "b", **W},
+            },
+            {},
+            "leads from 'cruise' to the state 'b'",
+        ),
+        (
+            {("cruise", "a"): {"to": "near", **W}, ("near", "b"): {"to": "over", **W}},
+            {"least": 3},
+            "least=3 events are impossible: no sequence from 'cruise' has more than 2",
+        ),
+        (
+            {("cruise", "a"): {"at_most": 2, **W}},
+            {"least": 4, "most": 5},
+            "least=4 events are impossible: no sequence from 'cruise' has more than 2",
+        ),
+        ({("cruise", "a"): {"to": 3, **W}}, {}, "to of event .* must be the name of a state"),
+    ],
+)
+def test_states_and_lengths_that_cannot_be_are_refused(events, options, message):
+    with unchecked(), pytest.raises(ValueError, match=message):
+        Automaton("cruise", events, **options)
+
+
+def test_a_state_in_which_a_sequence_ends_is_none_of_these():
+    assert Automaton("lane1", {("lane1", "change"): {"to": "lane2", **W}}, least=1, most=1).most
+    ends = Automaton("cruise", {("cruise", "hit"): {"to": "crash", **W}, ("cruise", "go"): W})
+    assert ends.graph.longest(6) == 6
+
+
 def test_plain_data_and_analysis_know_it():
     plain = Automaton(
         "a",

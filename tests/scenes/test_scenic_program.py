@@ -188,7 +188,7 @@ class TestWithScenic:
         np.testing.assert_array_equal(pooled(features, 7).signals["gap"], one.signals["gap"])
         pooled.close()
         with pytest.raises(ValueError, match="unknown record 'gapp'; did you mean 'gap'"):
-            program.simulator(steps=2, records=("gapp",))(features, 0)
+            program.simulator(steps=2, records=("gapp",))
         with pytest.raises(ValueError, match="steps must be"):
             program.simulator(steps=0)
 

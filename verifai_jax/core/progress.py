@@ -149,6 +149,13 @@ class SimulationProgress:
         self.bar.update(simulations, figures=figures)
 
 
+def write_line(text: str) -> None:
+    """Write a line to the error stream, above any bar, on what takes long where there is no bar."""
+    stream = _Stream()
+    stream.write(f"{printable(text)}\n")
+    stream.flush()
+
+
 def has_viewer() -> bool:
     """Return whether the error stream is a terminal or a notebook that can draw a bar."""
     if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():

@@ -37,6 +37,9 @@ MOST_NAMES = 12
 
 ONCE_FOR_ALL = "JAX traces the code once for all simulations, so its values are not known yet"
 AS_PYTHON = "; or run the system as plain Python, without gradients, by vj.blackbox"
+AS_NATIVE = (
+    '; or run it with backend="native", which calls a controller in Python, without gradients'
+)
 
 TRACING: tuple[tuple[type[Exception], str], ...] = (
     (
@@ -177,7 +180,7 @@ def source_line(traceback: object) -> str | None:
 
 
 def explain_user_error(
-    error: BaseException, features: object = None, *, system: bool = True
+    error: BaseException, features: object = None, *, system: bool = True, native: bool = False
 ) -> str:
     """Write what a user's code did, where, and what to do about it, in one line.
 
@@ -186,6 +189,7 @@ def explain_user_error(
     - `error`: as the code raised it.
     - `features`: that the code was called with, to tell a misspelt one from another missing key.
     - `system`: whether the code belongs to a system, which could also run as a black box.
+    - `native`: whether that system could run natively, with a controller in Python.
     """
     step = _user_step(error)
     if step is None:
@@ -193,7 +197,11 @@ def explain_user_error(
     line = _line(step.tb_frame.f_code, step.tb_lineno)
     code = f" (`{shorten(line.code, MOST_CODE)}`)" if line.code else ""
     kept = isinstance(error, jax.errors.UnexpectedTracerError)
-    more = AS_PYTHON if system and not kept and _advice_on_tracing(error) else ""
+    more = (
+        (AS_NATIVE if native else AS_PYTHON)
+        if system and not kept and _advice_on_tracing(error)
+        else ""
+    )
     return f"{line}{code}: {_sentence(error, step, features)}{more}"
 
 

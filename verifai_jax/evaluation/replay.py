@@ -33,7 +33,8 @@ class Replay:
 
     `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
     random key of the simulation. `duration` are the seconds that it would have lasted without an
-    early end, over which Signals lie; None for a single sample.
+    early end, over which Signals lie; None for a single sample. `engine` says which other engine of
+    the system simulated it, because that compiles nothing and gives the number of the row.
     """
 
     problem: Problem
@@ -46,6 +47,7 @@ class Replay:
     duration: float | None = None
     changed: str = ""
     finding: str = ""
+    engine: str = ""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -95,6 +97,7 @@ class Replay:
         if len(self.rho) > 1 and self.status == Status.OK:
             lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
         lines.append(f"  {'features':<12} {self.describe_features()}")
+        lines += [f"  {'engine':<12} {self.engine}"] if self.engine else []
         span, *signals = str(self.trace).splitlines()
         return "\n".join([*lines, f"  {span}", *(f"  {line}" for line in signals)])
 

@@ -21,7 +21,7 @@ from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.progress import SimulationProgress, write_line
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
@@ -525,6 +525,11 @@ def _run_rounds(
     stopped, cause = None, None
     try:
         with SimulationProgress(problem.name, ends.budget, progress) as bar:
+            slow = problem.system.why_slow_to_compile(search.wants_gradient or search.wants_clauses)
+            if slow and bar.bar.show:
+                bar.note(slow)
+            elif slow and progress is not False:
+                write_line(f"note: {slow}")
             with tracing():
                 rounds.compile(resumed)
             if not resumed:

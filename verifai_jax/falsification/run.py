@@ -31,6 +31,7 @@ from verifai_jax.falsification.checkpoint import (
 )
 from verifai_jax.falsification.model_changes import (
     NEAR,
+    ROUNDING,
     changed_since,
     finding_of,
     has_several_models,
@@ -329,6 +330,9 @@ class Run:
           mapping with the feature columns.
         - `precision`: `"float32"` or `"float64"`; that of the run when left out.
 
+        A row that MJX simulated is replayed in native MuJoCo where that gives its number, within
+        rounding; its `engine` says so then.
+
         **Returns:** the replay; its `changed` says that the model is another one by now, and its
         `finding` that it does not give the number of its row, which its text begins with.
 
@@ -346,14 +350,16 @@ class Run:
             index = getattr(row, "name", None)
             number, values = None if index is None else int(index), row
         precision = self.precision if precision is None else precision
-        seen = replay(self.problem, values, run_keys(self.seed)[1], number, precision)
         if number is None or not 0 <= number < self.simulations:
-            return seen
+            return replay(self.problem, values, run_keys(self.seed)[1], number, precision)
         stored = self.table.row(number).to_dict()
         own = isinstance(row, int | np.integer) or all(
             values[name] == stored[name] or values[name] != values[name]
             for name in self.table.features
         )
+        if own and precision == self.precision and (seen := self._natively(number, values, stored)):
+            return replace(seen, changed=self.changed_since(number))
+        seen = replay(self.problem, values, run_keys(self.seed)[1], number, precision)
         if own and precision == self.precision:
             return self.compared(seen)
         if not own or not finding_of(seen, stored, self._several, NEAR):
@@ -362,6 +368,22 @@ class Run:
         again = replay(self.problem, values, run_keys(self.seed)[1], number, self.precision)
         again = self.compared(again)
         return replace(seen, changed=again.changed, finding=again.finding)
+
+    def _natively(
+        self, number: int, values: "pd.Series | Mapping[str, Any]", stored: Mapping[str, Any]
+    ) -> Replay | None:
+        """Replay a row that MJX simulated in native MuJoCo; None where that has another number.
+
+        MJX compiles a program for it first, for half a minute where there are contacts.
+        """
+        problem = self.problem
+        if problem is None or problem.black_box or "native" not in problem.system.backends:
+            return None
+        key = run_keys(self.seed)[1]
+        seen = replay(problem.on_backend("native"), values, key, number, self.precision)
+        if finding_of(seen, stored, self._several, ROUNDING):
+            return None
+        return replace(seen, engine="native MuJoCo, which gives the number of the row as MJX does")
 
     def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
         """Write counterexamples as small files made for version control; returns their paths.

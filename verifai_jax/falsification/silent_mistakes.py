@@ -41,7 +41,9 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
     """
     if isinstance(search, PointList):
         return ()
+    # What a system finds out while it is traced is among them.
     notes = silent_mistakes(problem)
+    notes = (*problem.system.notes, *notes)
     if needs_gradient(search) and traced_by_default(problem.system) and not has_gradient(problem):
         notes += (
             f"search {search!r} follows gradients and there are none: the robustness is constant "

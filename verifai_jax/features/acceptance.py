@@ -1,5 +1,6 @@
 """Measurement of the share of a space that its constraint accepts."""
 
+import time
 from collections.abc import Callable, Sequence
 
 import jax
@@ -19,6 +20,13 @@ BLOCK = 4096
 ENOUGH = 1000
 """Accepted samples after which the rate is known well enough."""
 
+ON_HOST = 16
+"""Samples at a time of a constraint that Python decides, which may take 40 ms for each."""
+
+PATIENCE, AT_MOST = 1.0, 60.0
+"""Seconds after which one accepted sample of such a constraint is enough, and after which none ends
+the measurement."""
+
 
 def acceptance_rate(
     where: Callable[[Float[Array, " d"]], Array],
@@ -28,6 +36,8 @@ def acceptance_rate(
     seed: int | Key[Array, ""] = 0,
 ) -> float:
     """Estimate the share of the prior's samples that a constraint accepts.
+
+    A constraint that Python decides is asked for a second, or until it has accepted one sample.
 
     **Arguments:**
 
@@ -41,7 +51,8 @@ def acceptance_rate(
     accepts none of the samples.
     """
     try:
-        answer = jax.eval_shape(where, jax.ShapeDtypeStruct((dim,), jnp.float32))
+        form = jax.ShapeDtypeStruct((dim,), jnp.float32)
+        program, answer = jax.make_jaxpr(where, return_shape=True)(form)
     except Exception as error:
         why = explain_user_error(error, dict.fromkeys(names), system=False)
         raise ValueError(f"where must be a JAX function of the features: {why}") from error
@@ -52,9 +63,13 @@ def acceptance_rate(
         raise ValueError(f"where must return one truth value; got {shown}")
     accepted = tried = 0
     random = np.random.default_rng(_entropy(seed))
+    on_host = "callback" in str(program)
+    block, began = ON_HOST if on_host else BLOCK, time.perf_counter()
     while tried < SAMPLES and accepted < ENOUGH:
-        accepted += int(np.sum(accepts(random.random((BLOCK, dim), np.float32))))
-        tried += BLOCK
+        accepted += int(np.sum(accepts(random.random((block, dim), np.float32))))
+        tried += block
+        if on_host and time.perf_counter() - began > (PATIENCE if accepted else AT_MOST):
+            break
     if not accepted:
         most = -np.log(0.05) / tried
         raise ValueError(

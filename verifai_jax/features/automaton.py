@@ -16,7 +16,7 @@ from verifai_jax.core.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
 from verifai_jax.features.event_descriptions import describe_event, read_event
 from verifai_jax.features.event_tables import EventTables
-from verifai_jax.features.transitions import Graph, Transition, unfold
+from verifai_jax.features.transitions import Graph, Transition, check_states, unfold
 from verifai_jax.features.written_events import WrittenEvents, where_there
 
 
@@ -51,7 +51,9 @@ class Automaton(Domain):
     - `least`: events at least, unless no event is possible any longer.
 
     **Raises:** `ValueError` for events that are none, options that are unknown or out of range,
-    guards that tell too many pasts apart; `TypeError` for a parameter that is no domain.
+    states that no event leads to, a `to` that is nearly the name of another state, a `least` that
+    no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter that is
+    no domain.
     """
 
     start: str
@@ -88,7 +90,13 @@ class Automaton(Domain):
         object.__setattr__(self, "least", int(least))
         object.__setattr__(self, "most", int(most))
         self._check_parameters()
-        self.graph  # noqa: B018 - unfolded now, so that what is wrong with guards is said now
+        check_states(start, transitions)
+        longest = self.graph.longest(most)
+        if longest < least:
+            raise ValueError(
+                f"least={least} events are impossible: no sequence from {start!r} has more than "
+                f"{longest}, after which no event is enabled; allow fewer, or add events that go on"
+            )
 
     def _check_parameters(self) -> None:
         """Refuse parameters of one name whose values have different forms."""

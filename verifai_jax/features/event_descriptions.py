@@ -59,6 +59,8 @@ def read_event(place: object, event: object) -> Transition:
     guard: Any = event.get("guard")
     if guard is not None and not callable(guard):
         raise ValueError(f"guard of event {place!r} must be a function of the past; got {guard!r}")
+    if not isinstance(event.get("to", source), str):
+        raise ValueError(f"to of event {place!r} must be the name of a state; got {event['to']!r}")
     after = event.get("after", ())
     at_most = event.get("at_most")
     return Transition(

@@ -358,12 +358,15 @@ class FeatureSpace:
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
         """Measure the share of the prior that the constraint accepts; 1 without one.
 
+        One that Python decides, through a callback, is asked for a second rather than thousands of
+        times.
+
         **Arguments:**
 
         - `seed`: of the samples.
 
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
-        accepts none of 65 536 samples.
+        accepts none of 65 536 samples, or of those that Python can decide in a minute.
         """
         where = self.where
         if where is None:

@@ -8,6 +8,8 @@ Guards look at what has happened before. They are asked here, once for each stat
 be reached, so that a simulation only looks up tables, and what can be covered is counted exactly.
 """
 
+import difflib
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,6 +20,9 @@ from verifai_jax.features.domain import Domain
 
 MOST_NODES = 50_000
 """States, with the pasts that guards tell apart, of an automaton at most."""
+
+NEARLY = 0.82
+"""Similarity of two names from which one is taken for the other, misspelt: one letter in six."""
 
 LEAST_SHARE = 2.0**-20
 """Least probability of a transition: a narrower interval is no distinct one in float32."""
@@ -113,6 +118,52 @@ class Graph:
     reachable_states: tuple[str, ...]
     transitions: tuple[int, ...]
     pairs: tuple[tuple[int, int], ...]
+
+    def longest(self, most: int) -> int:
+        """Return the events of the longest sequence, of at most `most`."""
+        nodes = {0}
+        for length in range(most):
+            nodes = {
+                int(self.following[node, number])
+                for node in nodes
+                for number in np.flatnonzero(self.enabled[node])
+            }
+            if not nodes:
+                return length
+        return most
+
+
+def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
+    """Refuse states that are misspelt, or that no sequence of events can lead to.
+
+    **Raises:** `UnknownNameError`, `ValueError`.
+    """
+    sources = dict.fromkeys(each.source for each in transitions)
+    for each in transitions:
+        if each.to not in sources:
+            near = difflib.get_close_matches(each.to, sources, n=1, cutoff=NEARLY)
+            near += [name for name in sources if sorted(name) == sorted(each.to)]
+            if near and not _is_numbered(each.to, near[0]):
+                raise ValueError(
+                    f"no event leaves the state {each.to!r} that {each.label} leads to; did you "
+                    f"mean {near[0]!r}? A state in which a sequence ends needs a name less like it"
+                )
+    reached, added = {start}, True
+    while added:
+        ways = {each.to for each in transitions if each.source in reached}
+        reached, added = reached | ways, not ways <= reached
+    for each in transitions:
+        if each.source not in reached:
+            raise ValueError(
+                f"no sequence of events leads from {start!r} to the state {each.source!r} of "
+                f"{each.label}; it leads to {', '.join(sorted(reached))}: correct its name, or add "
+                f"an event with to={each.source!r}"
+            )
+
+
+def _is_numbered(one: str, other: str) -> bool:
+    """Return whether two names differ by their digits alone, as `lane1` and `lane2` do."""
+    return re.sub(r"\d+", "", one) == re.sub(r"\d+", "", other)
 
 
 def unfold(start: str, transitions: tuple[Transition, ...], most: int) -> Graph:

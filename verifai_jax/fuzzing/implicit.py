@@ -67,6 +67,15 @@ class CheckedSystem(System):
         self.traced_factor = system.traced_factor
         self.backends, self.backend, self.likely = system.backends, system.backend, system.likely
 
+    def why_slow_to_compile(self, gradient: bool) -> str:
+        """Say what the system says."""
+        return self.system.why_slow_to_compile(gradient)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The system's own."""
+        return self.system.notes
+
     def __repr__(self) -> str:
         return repr(self.system)
 

@@ -300,7 +300,8 @@ class Problem:
         return trace
 
     def _wrong_system(self, error: Exception, features: Mapping[str, Any]) -> ProblemError:
-        why = explain_user_error(error, features)
+        native = "native" in self.system.backends and self.system.backend != "native"
+        why = explain_user_error(error, features, native=native)
         if isinstance(error, TypeError) and "positional arg" in why and user_line(error) is None:
             function = getattr(self.system, "__wrapped__", self.system)
             why += f"; a system is called with (features, key){defined_at(function)}"

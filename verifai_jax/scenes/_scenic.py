@@ -42,7 +42,8 @@ def scenic(
 
     Each random value becomes a feature by the inverse of its cumulative distribution, with the name
     of the property or parameter that it feeds. What has no inverse (mutations, points in regions
-    that are random or no polygons, distributions of one's own) shares a coordinate `seed`. A soft
+    that are random or no polygons, distributions of one's own) shares a coordinate `seed`, which is
+    the only one where a program draws nothing before it runs. A soft
     requirement, `require[p]`, is a feature that is on or off; it is on with probability p among the
     scenes that are accepted, as in Scenic.
 
@@ -62,7 +63,9 @@ def scenic(
     compiled, sampling = recipe.compiled()
     if not sampling.domains:
         raise ProgramError(
-            f"{compiled.filename} draws nothing at random, so it has one scene and no feature"
+            f"{compiled.filename} draws nothing at random, and nothing happens over time in it (no "
+            "behaviour, compose block, monitor, record, end or simulator), so it has one scene and "
+            "no feature: write Range(1, 2) where a number may vary"
         )
     constraint = Constraint(sampling, compiled, mode2D)
     outputs = Outputs(sampling, mode2D)

@@ -12,6 +12,7 @@ import contextlib
 import io
 import random
 import sys
+import traceback
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -143,7 +144,22 @@ def _message(error: BaseException, filename: str, source: str) -> str:
     first = text[0] if text else ""
     if first.startswith(str(file)) and len(text) > 1:
         first = text[-1]
-    return f"{where}{type(error).__name__}: {first}"
+    return f"{where}{type(error).__name__}: {first or _raised_at(error)}"
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the kind of an error and its message, or the line that raised it where it has none."""
+    return f"{type(error).__name__}: {str(error).strip() or _raised_at(error)}"
+
+
+def _raised_at(error: BaseException) -> str:
+    """Return words for an error without a message: the line of code that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return "it came without a message"
+    last = frames[-1]
+    line = f" at `{last.line}`" if last.line else ""
+    return f"it came without a message, from {Path(last.filename).name}, line {last.lineno}{line}"
 
 
 @contextlib.contextmanager

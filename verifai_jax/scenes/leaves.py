@@ -40,6 +40,10 @@ LABEL = 24
 """Letters of the text of an option that has no name."""
 
 
+class NothingToDrawError(ValueError):
+    """A leaf that has no value in this scene, such as a choice from an empty list."""
+
+
 @dataclass(frozen=True, eq=False)
 class Leaf(abc.ABC):
     """A place where a program draws at random.
@@ -186,6 +190,8 @@ class Place(Leaf):
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
         low, high = self._ends(given, xp)
+        if xp is np and high < low:
+            raise NothingToDrawError(f"there is no integer from {low:g} to {high:g}")
         count = xp.maximum(high - low + 1, 1)
         place = low + xp.minimum(xp.floor(parts[self.feature] * count), count - 1)
         return int(place) if xp is np else place

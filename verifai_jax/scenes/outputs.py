@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.scenes.compilation import ProgramError
+from verifai_jax.scenes.compilation import ProgramError, describe_error
 from verifai_jax.scenes.graph import field, is_random, kind_of
 from verifai_jax.scenes.meaning import Values, as_output
 from verifai_jax.scenes.sampling import LOCK, Refused, Sampling
@@ -105,7 +105,7 @@ class Outputs:
                 continue
             except Exception as error:
                 raise ProgramError(
-                    f"Scenic cannot sample this program: {type(error).__name__}: {error}"
+                    f"Scenic cannot sample this program: {describe_error(error)}"
                 ) from error
         return None
 

@@ -1,6 +1,5 @@
 """A Scenic program as a feature space, with its scenes as a function of JAX (`ScenicProgram`)."""
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from verifai_jax.scenes.outputs import Outputs
 from verifai_jax.scenes.recipe import Recipe
 from verifai_jax.scenes.requirements import Constraint
 from verifai_jax.scenes.sampling import LOCK, Refused, Sampling
+from verifai_jax.scenes.scene_code import scene_code
 from verifai_jax.scenes.simulation import OnScenes, ScenicSimulation, check_simulation
 from verifai_jax.systems.base import Seed, System
 from verifai_jax.systems.blackbox import blackbox
@@ -81,9 +81,12 @@ class ScenicProgram:
 
         **Arguments:**
 
-        - `features`: as `space.unflatten` gives them.
+        - `features`: as `space.unflatten` gives them, or as a person writes them and `features_of`
+          gives them.
+
+        **Raises:** `ValueError` for features whose names or shapes are not those of the space.
         """
-        return self._outputs(features)
+        return self._outputs(self.space.convert(features))
 
     def system(self, function: Callable[..., Trace]) -> System:
         """Return a system that JAX traces, given one of scenes.
@@ -144,7 +147,7 @@ class ScenicProgram:
         **Raises:** `ValueError` for steps, records or a step that can be none, and as
         `verifai_jax.blackbox`.
         """
-        named = check_simulation(steps, records, dt)
+        named = check_simulation(steps, records, dt, self.scenario)
         simulation = ScenicSimulation(self._recipe, steps, named, dt)
         return blackbox(simulation, seeded=True, workers=workers, timeout=timeout, **options)
 
@@ -183,26 +186,34 @@ class ScenicProgram:
     def features_of(self, scene: Any) -> dict[str, Any]:
         """Return the features at which a scene of Scenic's own sampler would come.
 
-        The seed, which a scene does not tell, is in the middle of its domain.
+        What a scene does not tell, such as the seed and the ends of an interval that Scenic's bytes
+        leave out, is in the middle of its domain, or where the scene is possible.
+
+        **Raises:** `ValueError` for a scene of another program or compilation.
         """
         return self._sampling.features_of(scene)
 
     def refusal(self, features: Mapping[str, Any]) -> str | None:
         """Return why Scenic's own checker refuses a scene; None where it accepts it."""
-        here = jax.tree.map(np.asarray, self.space.root.coerce(features))
+        here = jax.tree.map(np.asarray, self.space.convert(features))
         try:
             return self._sampling.refusal(self._sampling.values(here), here)
         except Refused as error:
             return str(error)
 
     def code(self, scene: Any) -> str:
-        """Return Scenic code that reproduces one scene of the program."""
-        stream = io.StringIO()
-        scene.dumpAsScenicCode(stream)
-        return stream.getvalue()
+        """Return a Scenic program whose only scene is this one, to compile in the same `mode2D`.
+
+        What code cannot write, such as behaviours and meshes, is named in a comment.
+        """
+        return scene_code(scene, self._recipe.planar)
 
     def to_bytes(self, scene: Any) -> bytes:
-        """Return a scene as bytes that Scenic's `sceneFromBytes` restores."""
+        """Return a scene as bytes that Scenic's `sceneFromBytes` restores.
+
+        **Raises:** `ValueError` for a scene of another program or compilation.
+        """
+        self._sampling.check_own(scene)
         with LOCK:
             return self.scenario.sceneToBytes(scene)
 

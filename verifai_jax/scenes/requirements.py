@@ -9,6 +9,7 @@ they have a meaning in JAX; the others are decided by Scenic, on the points that
 accept.
 """
 
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from verifai_jax.core.progress import write_line
 from verifai_jax.scenes.compilation import Compiled
 from verifai_jax.scenes.conditions import Condition, conditions
 from verifai_jax.scenes.geometry import (
@@ -38,6 +40,10 @@ MOST_DECISIONS = 100_000
 """Decisions of Scenic that are kept: a run asks about some points more than once."""
 
 
+FIRST_SHOWN, SHOWN_EVERY = 2.0, 10.0
+"""Seconds of one round of decisions after which a line says so, and seconds between such lines."""
+
+
 class Constraint:
     """All requirements of one program.
 
@@ -53,6 +59,7 @@ class Constraint:
         self._checks: list[tuple[str, Check, str | None]] = []
         self._left: list[Any] = []
         self._decisions: dict[tuple, bool] = {}
+        self._began = self._shown = 0.0
         self._soft = {id(requirement): name for name, requirement in sampling.soft.items()}
         shape = {
             name: jax.eval_shape(domain.from_unit, jnp.zeros(domain.size))
@@ -75,6 +82,8 @@ class Constraint:
             else:
                 self.compiled.append(name)
                 self._checks.append((name, check, self._soft.get(id(requirement))))
+        # Those of arithmetic take microseconds, those of meshes milliseconds.
+        self._left.sort(key=lambda requirement: kind_of(requirement) != "CompiledRequirement")
         # A scene that Scenic may refuse while it draws it is drawn before it is accepted.
         self.draws = any(
             kind_of(node) == "DiscreteRange" and is_random(node) and is_random(field(node, "high"))
@@ -131,9 +140,23 @@ class Constraint:
             return np.asarray(bool(holds) and self._accepts(features))
         features = {name: np.asarray(column) for name, column in features.items()}
         verdicts = holds.copy()
-        for row in np.flatnonzero(holds):
+        asked = np.flatnonzero(holds)
+        for number, row in enumerate(asked):
             verdicts[row] = self._accepts({name: c[row] for name, c in features.items()})
+            self._show(number + 1, len(asked))
         return verdicts
+
+    def _show(self, decided: int, points: int) -> None:
+        """Say on the error stream what takes so long, after some seconds and then now and then."""
+        now = time.perf_counter()
+        if decided == 1:
+            self._began, self._shown = now, now + FIRST_SHOWN - SHOWN_EVERY
+        if now - self._shown > SHOWN_EVERY:
+            self._shown = now
+            write_line(
+                f"vj.scenic: Scenic decides requirements in Python: {decided} of {points} points "
+                f"so far, {1000 * (now - self._began) / decided:.0f} ms each"
+            )
 
     def _accepts(self, features: Mapping[str, Any]) -> bool:
         """Return whether Scenic accepts a point, by the requirements that are not compiled."""

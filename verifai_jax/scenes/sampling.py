@@ -17,13 +17,14 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.features import Box, Categorical
 from verifai_jax.features.domain import Domain
 from verifai_jax.scenes.compilation import Compiled
 from verifai_jax.scenes.graph import field, is_constructed, is_random, kind_of, law, nodes
-from verifai_jax.scenes.leaves import Leaf, OnPolyline, leaf_of
+from verifai_jax.scenes.leaves import Leaf, NothingToDrawError, OnPolyline, leaf_of
 from verifai_jax.scenes.naming import leaf_names, owner_names, unique
 
 SEED = "seed"
@@ -36,6 +37,9 @@ COMPUTED = {
     *("MultiplexerDistribution", "Options", "VerifaiOptions", "UniformDistribution"),
 }
 """Distributions of Scenic that draw nothing themselves."""
+
+GUESSES = 64
+"""Random places that are tried for what a scene does not tell."""
 
 LOCK = threading.RLock()
 """Held while Scenic computes."""
@@ -73,8 +77,22 @@ class Sampling:
             probability = float(self.soft[name].prob)
             weights = [1 - probability, probability]
             self.domains[name] = Categorical(False, True, weights=weights)
-        if self.seeded:
+        if self.seeded or (not self.domains and self.is_dynamic):
             self.domains[SEED] = Box(0, 1)
+
+    @property
+    def is_dynamic(self) -> bool:
+        """True where something happens over time, in which program or simulator may draw."""
+        parts = self.scenario.dynamicScenario
+        behaves = any(field(body, "behavior") is not None for body in self.scenario.objects)
+        composed = getattr(parts, "_compose", None) is not None
+        over_time = (
+            *self.scenario.monitors,
+            *self.scenario.recordedExprs,
+            *self.scenario.terminationConditions,
+            *self.scenario.terminateSimulationConditions,
+        )
+        return behaves or composed or bool(over_time) or self.scenario.simulator is not None
 
     def _place(self, names: Mapping[int, str]) -> None:
         """Give each random leaf its features, or a part in the seed."""
@@ -124,7 +142,7 @@ class Sampling:
         seed = f"{float(features.get(SEED, 0.0)):.9g}"
         with LOCK, _seeded_generators(0):
             if self.scenario.externalSampler is not None:
-                _seed_generators(_digest(seed, "external"))
+                _seed_generators(digest(seed, "external"))
                 self.scenario.externalSampler.sample(None)
             try:
                 for i, node in enumerate(self.order):
@@ -133,9 +151,9 @@ class Sampling:
                         values[node] = self._drawn(leaf, features, values.__getitem__)
                         continue
                     if id(node) in self.seeded:
-                        _seed_generators(_digest(seed, str(i)))
+                        _seed_generators(digest(seed, str(i)))
                     values[node] = law(node).sampleGiven(values)
-            except distributions.RejectionException as error:
+            except (distributions.RejectionException, NothingToDrawError) as error:
                 raise Refused(str(error)) from error
         return values
 
@@ -171,20 +189,81 @@ class Sampling:
         with LOCK:
             return self.scenario._makeSceneFromSample(values)
 
+    def check_own(self, scene: Any) -> None:
+        """Refuse a scene that does not come from this compilation of the program.
+
+        **Raises:** `ValueError`.
+        """
+        if not hasattr(scene, "sample") or not hasattr(scene, "dynamicScenario"):
+            raise ValueError(f"a scene is one that Scenic draws; got {type(scene).__name__}")
+        if scene.dynamicScenario is not self.scenario.dynamicScenario:
+            raise ValueError(
+                "this scene comes from another program, or from another compilation of this one, "
+                "whose random values are other objects: carry it over as bytes, by "
+                "program.from_bytes(other.to_bytes(scene)), where `other` made it"
+            )
+
     def features_of(self, scene: Any) -> dict[str, Any]:
         """Return the features at which Scenic's own scene would come.
 
-        A feature that the scene does not tell has the middle of its domain: the seed, and soft
-        requirements that the scene meets.
+        A feature that the scene does not tell has the middle of its domain, as the seed has, or
+        another place where what the scene tells is impossible in the middle.
+
+        **Raises:** `ValueError` for a scene of another compilation.
         """
-        given = scene.sample.__getitem__
-        features: dict[str, Any] = {}
-        for leaf in self.leaves.values():
-            features.update(leaf.invert(given(leaf.node), given))
+        self.check_own(scene)
+        random = np.random.default_rng(0)
+        refusals = sys.modules["scenic.core.distributions"].RejectionException
+        why = ""
+        with LOCK, _seeded_generators(0):
+            for place in (0.5, 0.0, 1.0, *([None] * GUESSES)):
+                try:
+                    features, complete = self._inverted(scene.sample, place, random)
+                    if not complete:
+                        for name, value in features.items():
+                            self.domains[name].check(value, name)
+                    break
+                except (ValueError, refusals) as error:
+                    why = f": {error}"
+            else:
+                raise ValueError(
+                    f"this scene does not tell the features at which it would come{why}"
+                )
         features.update({name: bool(r.active) for name, r in self.soft.items()})
-        if self.seeded:
+        if SEED in self.domains:
             features[SEED] = 0.5
         return {name: features[name] for name in self.domains}
+
+    def _inverted(
+        self, sample: Any, place: float | None, random: np.random.Generator
+    ) -> tuple[dict[str, Any], bool]:
+        """Return the features of what Scenic drew, and whether it tells all of them.
+
+        Scenic keeps no value of an option that was not chosen, and its bytes none of the ends of an
+        interval: their features are at this place of the unit interval, or at random ones.
+        """
+        values = sys.modules["scenic.core.utils"].DefaultIdentityDict()
+        features: dict[str, Any] = {}
+        complete = True
+        for node in self.order:
+            leaf, told = self.leaves.get(id(node)), node in sample
+            if told:
+                values[node] = sample[node]
+            elif leaf is not None:
+                complete = False
+                unit = {name: random.random() if place is None else place for name in leaf.domains}
+                guess = {
+                    name: np.asarray(
+                        domain.from_unit(jnp.full(domain.size, unit[name], jnp.float32))
+                    )
+                    for name, domain in leaf.domains.items()
+                }
+                values[node] = self._drawn(leaf, guess, values.__getitem__)
+            else:
+                values[node] = law(node).sampleGiven(values)
+            if leaf is not None:
+                features.update(leaf.invert(values[node], values.__getitem__))
+        return features, complete
 
 
 def _draws(drawn: Any) -> bool:
@@ -201,7 +280,8 @@ def _plain(value: Any) -> Any:
     return np.asarray(value).item() if np.ndim(value) == 0 else value
 
 
-def _digest(*texts: str) -> int:
+def digest(*texts: str) -> int:
+    """Return a seed of 32 bits that depends on all of these texts."""
     return int.from_bytes(hashlib.blake2b("/".join(texts).encode(), digest_size=4).digest(), "big")
 
 

@@ -17,7 +17,7 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import require, unknown_name
 from verifai_jax.core.trace import Trace
 from verifai_jax.scenes.recipe import Recipe
-from verifai_jax.scenes.sampling import LOCK
+from verifai_jax.scenes.sampling import LOCK, SEED, digest
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,15 @@ class ScenicSimulation:
     dt: float | None
 
     def __call__(self, features: Mapping[str, Any], seed: int) -> Trace:
-        """Simulate a scene; behaviours draw from the seed of the row.
+        """Simulate a scene; behaviours draw from the seed of the row, and from a feature `seed`.
 
         **Raises:** `SimulationRejected` where a requirement over time is broken.
         """
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         _, sampling = self.recipe.compiled()
         scene = sampling.scene(sampling.values(features))
+        if SEED in features:
+            seed = digest(str(seed), f"{float(features[SEED]):.9g}")
         with LOCK:
             random.seed(seed)
             np.random.seed(seed % 2**32)  # noqa: NPY002 - what Scenic draws from
@@ -87,9 +89,7 @@ class ScenicSimulation:
         recorded = simulation.result.records
         names = self.records or tuple(n for n, r in recorded.items() if _is_series(r))
         if not names:
-            raise ValueError(
-                "the program records nothing over time: add `record EXPRESSION as NAME` to it"
-            )
+            raise ValueError(NOTHING_RECORDED)
         for name in names:
             if name not in recorded:
                 raise unknown_name("record", name, recorded)
@@ -133,15 +133,37 @@ def _simulator(scenario: Any) -> Any:
     return made
 
 
-def check_simulation(steps: int, records: Sequence[str], dt: float | None) -> tuple[str, ...]:
+NOTHING_RECORDED = (
+    "the program records nothing over time: add `record EXPRESSION as NAME` to it, such as "
+    "`record (distance from ego to other) as gap`"
+)
+
+
+def check_simulation(
+    steps: int, records: Sequence[str], dt: float | None, scenario: Any
+) -> tuple[str, ...]:
     """Check what a simulation needs, and return its records.
 
-    **Raises:** `ValueError` for steps that are no positive integer, records that are no names, or
-    a step that is not positive.
+    **Raises:** `ValueError` for steps that are no positive integer, records that are no names or
+    that the program does not record over time, and a step that is not positive.
     """
     check_count("steps", steps)
     if isinstance(records, str) or not all(isinstance(name, str) for name in records):
         raise ValueError(f"records must be names, such as ('gap',); got {records!r}")
     if dt is not None and not (isinstance(dt, int | float) and 0 < dt < math.inf):
         raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")
+    if getattr(scenario.dynamicScenario, "_compose", None) is not None:
+        return tuple(records)  # What is composed may record too, which shows when it runs.
+    series = [each.name for each in scenario.recordedExprs]
+    single = [*scenario.recordedInitialExprs, *scenario.recordedFinalExprs]
+    if not series:
+        raise ValueError(NOTHING_RECORDED)
+    for name in records:
+        if name in (each.name for each in single):
+            raise ValueError(
+                f"record {name!r} is one value, at the first or last step, and no signal: write "
+                f"`record EXPRESSION as {name}` for one of each step"
+            )
+        if name not in series:
+            raise unknown_name("record", name, series)
     return tuple(records)

@@ -42,6 +42,7 @@ class System:
     - `effort`: how much XLA does to make programs that simulate it fast; one for all numbers of
       rows, since a row's last digits may depend on it.
     - `forward_up_to`: features up to which forward mode is no slower than reverse mode.
+    - `notes`: sentences for the notes of a run, on what the system changed in what it was given.
     - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
     - `dt`: the sampling period in seconds of what `fold` simulates.
     - `exact_step`: True where the step is part of what the system is, as in an environment that its
@@ -57,6 +58,7 @@ class System:
     lanes: int = 512
     effort: Effort = "most"
     forward_up_to: int = 1
+    notes: tuple[str, ...] = ()
     reverse_hint: str = ""
     dt: float | None = None
     exact_step: bool = False
@@ -150,6 +152,15 @@ class System:
     def why_not(self, backend: str) -> str | None:
         """Return the reason why an engine cannot simulate this system, None where it can."""
         return None if backend in self.backends else "the system has no such backend"
+
+    def why_slow_to_compile(self, gradient: bool) -> str:
+        """Say why compiling this system takes minutes, and what is cheaper; empty if it is quick.
+
+        **Arguments:**
+
+        - `gradient`: whether derivatives are compiled too.
+        """
+        return ""
 
     def why_error(self, features: Features) -> str | None:
         """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.

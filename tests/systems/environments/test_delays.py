@@ -9,8 +9,8 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.trace import Status
+from verifai_jax.systems.delays import Delay, Line, as_delay, through
 from verifai_jax.systems.environments._gymnasium import gymnasium
-from verifai_jax.systems.environments.delays import Delay, Line, as_delay, through
 
 STEPS = 40
 

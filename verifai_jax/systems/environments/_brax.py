@@ -29,6 +29,14 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.delays import (
+    NO_DELAY,
+    Delay,
+    DelayOption,
+    Delays,
+    as_delay,
+    first_refusal,
+)
 from verifai_jax.systems.environments.brax_joined import Joined, join
 from verifai_jax.systems.environments.brax_model import (
     Env,
@@ -42,14 +50,6 @@ from verifai_jax.systems.environments.brax_model import (
     with_start,
     with_system,
     with_value,
-)
-from verifai_jax.systems.environments.delays import (
-    NO_DELAY,
-    Delay,
-    DelayOption,
-    Delays,
-    as_delay,
-    first_refusal,
 )
 from verifai_jax.systems.environments.episode import (
     Episode,

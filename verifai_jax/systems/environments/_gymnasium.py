@@ -25,7 +25,7 @@ from verifai_jax.core.trace import Status, Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform, set_durations
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
-from verifai_jax.systems.environments.delays import NO_DELAY, Delay, DelayOption, as_delay
+from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
 from verifai_jax.systems.environments.episode import (
     Moment,
     check_features,

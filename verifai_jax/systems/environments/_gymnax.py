@@ -28,7 +28,7 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
-from verifai_jax.systems.environments.delays import (
+from verifai_jax.systems.delays import (
     NO_DELAY,
     Delay,
     DelayOption,

@@ -25,7 +25,7 @@ from verifai_jax.core.user_errors import check_called_with
 from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.checkpointing import checkpointed_scan
-from verifai_jax.systems.environments.delays import NO_DELAYS, Delays, Line, through
+from verifai_jax.systems.delays import NO_DELAYS, Delays, Line, through
 from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
 
 Time: TypeAlias = Float[Array, ""] | float

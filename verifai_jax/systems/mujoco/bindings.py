@@ -21,11 +21,12 @@ from verifai_jax.core.waveform import is_waveform
 from verifai_jax.systems.mujoco.derived_constants import (
     SolidBody,
     bodies_of_geoms,
+    masses_of_geoms,
     recompute_inertia,
 )
-from verifai_jax.systems.mujoco.model import Model, Place, free_centres_of_mass, place
+from verifai_jax.systems.mujoco.model import GEOM_MASS, Model, Place, free_centres_of_mass, place
 
-STATE = ("qpos", "qvel", "act")
+STATE = ("qpos", "qvel", "act", "mocap_pos", "mocap_quat")
 APPLIED = ("ctrl", "xfrc_applied", "qfrc_applied")
 
 # Parameters from which `mj_setConst` derives others.
@@ -82,8 +83,9 @@ class Bindings:
     def arrays(self) -> frozenset[str]:
         """The model's arrays that differ between rows, derived ones included."""
         changed = {binding.place.array for binding in self.parameters}
-        if changed & {"geom_size", "geom_pos", "geom_quat"} and self.solids:
+        if changed & {"geom_size", "geom_pos", "geom_quat", GEOM_MASS} and self.solids:
             changed |= {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
+        changed.discard(GEOM_MASS)
         if "body_mass" in changed:
             changed.add("body_inertia")
         return frozenset(changed)
@@ -98,15 +100,17 @@ class Bindings:
 
         Geometry comes first, then masses, along which inertia scales, then what is bound itself.
         """
-        ordered = ("geom_size", "geom_pos", "geom_quat")
+        ordered = ("geom_size", "geom_pos", "geom_quat", GEOM_MASS)
         groups = [
             [b for b in self.parameters if b.place.array in ordered],
             [b for b in self.parameters if b.place.array == "body_mass"],
             [b for b in self.parameters if b.place.array not in (*ordered, "body_mass")],
         ]
-        leaves = {name: jnp.asarray(self._base(name), _float()) for name in sorted(self.arrays)}
+        bound = self.arrays | {binding.place.array for binding in groups[0]}
+        leaves = {name: jnp.asarray(self._base(name), _float()) for name in sorted(bound)}
         leaves = _set(leaves, groups[0], features, self._base)
         leaves = recompute_inertia(self.model.compiled, self.solids, leaves)
+        leaves.pop(GEOM_MASS, None)
         before = leaves.get("body_mass")
         leaves = _set(leaves, groups[1], features, self._base)
         if before is not None:
@@ -117,12 +121,13 @@ class Bindings:
         return _set(leaves, groups[2], features, self._base)
 
     def start(self, features: Mapping[str, Any]) -> dict[str, Float[Array, " k"]]:
-        """Return `qpos`, `qvel` and `act` at time 0."""
-        compiled = self.model.compiled
+        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set."""
+        begin = self.model.begin
+        bound = {"qpos", "qvel", "act"} | {b.place.array for b in self.state} | set(begin)
         values = {
-            "qpos": jnp.asarray(compiled.qpos0, _float()),
-            "qvel": jnp.zeros(compiled.nv, _float()),
-            "act": jnp.zeros(compiled.na, _float()),
+            name: jnp.asarray(begin.get(name, self._base(name)), _float())
+            for name in STATE
+            if name in bound
         }
         return _set(values, self.state, features, self._base)
 
@@ -135,6 +140,8 @@ class Bindings:
         shapes["qfrc_applied"] = (compiled.nv,)
         bound = {binding.place.array for binding in self.applied}
         values = {name: jnp.zeros(shapes[name], _float()) for name in APPLIED if name in bound}
+        if "ctrl" in values and "ctrl" in self.model.begin:
+            values["ctrl"] = jnp.asarray(self.model.begin["ctrl"], _float())
         given = {binding.feature: features[binding.feature] for binding in self.applied}
         now = {name: value(time) if is_waveform(value) else value for name, value in given.items()}
         return _set(values, self.applied, now, self._base)
@@ -169,8 +176,18 @@ class Bindings:
 
     def _base(self, array: str) -> np.ndarray:
         compiled = self.model.compiled
-        if array == "qpos":
-            return compiled.qpos0
+        if array in ("qpos", "qvel", "act"):
+            return (
+                compiled.qpos0
+                if array == "qpos"
+                else np.zeros(compiled.nv if array == "qvel" else compiled.na)
+            )
+        if array in ("mocap_pos", "mocap_quat"):
+            value = compiled.body_pos if array == "mocap_pos" else compiled.body_quat
+            bodies = np.flatnonzero(compiled.body_mocapid >= 0)
+            return value[bodies[np.argsort(compiled.body_mocapid[bodies])]]
+        if array == GEOM_MASS:
+            return masses_of_geoms(compiled, self.solids)
         owner, name = (compiled.opt, array[4:]) if array.startswith("opt.") else (compiled, array)
         return np.asarray(getattr(owner, name), np.float64)
 
@@ -197,7 +214,14 @@ def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
                 _claim(taken, where, feature)
                 sorted_[group].append(Binding(feature, where, isinstance(target, Scaled)))
     parameters, state, applied = (tuple(group) for group in sorted_.values())
-    solids = bodies_of_geoms(model, _rows(parameters, "geom_size", "geom_pos", "geom_quat"))
+    masses = {
+        int(i): b.place.path
+        for b in parameters
+        if b.place.array == GEOM_MASS
+        for i in b.place.index
+    }
+    changed = _rows(parameters, "geom_size", "geom_pos", "geom_quat")
+    solids = bodies_of_geoms(model, changed, masses)
     model = free_centres_of_mass(model, _moving_bodies(model, parameters, solids))
     return Bindings(model, parameters, state, applied, solids)
 

@@ -8,7 +8,7 @@
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from verifai_jax.core.devices import enable_compile_cache
-from verifai_jax.systems.mujoco.model import MjModel, MjxModel, Model, mjx_module
+from verifai_jax.systems.mujoco.model import (
+    GEOM_MASS,
+    MjModel,
+    MjSpec,
+    MjxModel,
+    Model,
+    mjx_module,
+)
 
 _PLANE, _HFIELD, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = range(7)
 _SHAPES = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX)
@@ -33,6 +40,7 @@ class SolidBody:
     - `geoms`: their numbers; `kinds`: their MuJoCo types.
     - `masses`: in kg where the model states a geom's mass, else None.
     - `densities`: in kg/m^3.
+    - `bound`: whether a feature sets a geom's mass.
     """
 
     body: int
@@ -40,18 +48,46 @@ class SolidBody:
     kinds: tuple[int, ...]
     masses: tuple[float | None, ...]
     densities: tuple[float, ...]
+    bound: tuple[bool, ...]
 
 
-def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[SolidBody, ...]:
+def bodies_of_geoms(
+    model: Model, changed: Collection[int], massive: Mapping[int, str] | None = None
+) -> tuple[SolidBody, ...]:
     """Return the bodies with a `changed` geom whose inertia comes from their geoms.
 
     A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
 
-    **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells).
+    **Arguments:**
+
+    - `model`: with the spec that it came from.
+    - `changed`: numbers of geoms of another size or in another place.
+    - `massive`: numbers of geoms with another mass, and the paths that say so.
+
+    **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells), and
+    for the mass of a geom that its body's does not come from.
     """
-    compiled, spec = model.compiled, model.spec
-    if spec is None or not changed:
+    compiled, spec, massive = model.compiled, model.spec, massive or {}
+    changed = {*changed, *massive}
+    if not changed:
         return ()
+    solids = () if spec is None else _solids(compiled, spec, changed, massive)
+    found = {geom for solid in solids for geom in solid.geoms}
+    for geom, path in massive.items():
+        if geom not in found:
+            body = compiled.body(int(compiled.geom_bodyid[geom])).name
+            raise ValueError(
+                f"{path!r}: the inertia of body {body!r} is stated, and does not come from its "
+                f"geoms; bind 'body/{body}/mass' instead"
+                if body != "world"
+                else f"{path!r}: the world has no mass"
+            )
+    return solids
+
+
+def _solids(
+    compiled: MjModel, spec: MjSpec, changed: Collection[int], massive: Mapping[int, str]
+) -> tuple[SolidBody, ...]:
     mode = int(spec.compiler.inertiafromgeom)  # 0 never, 1 always, 2 where none is given
     stated = {body.id: bool(body.explicitinertial) for body in spec.bodies}
     low, high = spec.compiler.inertiagrouprange
@@ -66,8 +102,9 @@ def bodies_of_geoms(model: Model, changed: Collection[int]) -> tuple[SolidBody, 
             if not low <= int(compiled.geom_group[g]) <= high:
                 continue
             mass = None if math.isnan(geoms[g].mass) else float(geoms[g].mass)
-            if (mass if mass is not None else geoms[g].density) > 0:
-                parts.append((g, int(compiled.geom_type[g]), mass, float(geoms[g].density)))
+            if g in massive or (mass if mass is not None else geoms[g].density) > 0:
+                kind, density = int(compiled.geom_type[g]), float(geoms[g].density)
+                parts.append((g, kind, mass, density, g in massive))
         if not parts:
             continue
         solid = SolidBody(body, *(tuple(column) for column in zip(*parts, strict=True)))  # pyright: ignore[reportArgumentType]
@@ -89,6 +126,7 @@ def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
     with jax.enable_x64():
         enable_compile_cache()
         leaves = {n: jax.device_put(getattr(compiled, n)) for n in (*names, "body_iquat")}
+        leaves[GEOM_MASS] = jax.device_put(masses_of_geoms(compiled, (solid,)))
         again = jax.jit(lambda leaves: recompute_inertia(compiled, (solid,), leaves))(leaves)
         again = {name: np.asarray(again[name]) for name in ("body_mass", "body_inertia")}
     same = np.allclose(again["body_mass"], compiled.body_mass, rtol=1e-6) and np.allclose(
@@ -103,14 +141,26 @@ def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
         )
 
 
+def masses_of_geoms(compiled: MjModel, solids: Collection[SolidBody]) -> np.ndarray:
+    """Return the mass of each geom of these bodies as the model has it, in kg; NaN of others."""
+    masses = np.full(compiled.ngeom, np.nan)
+    for solid in solids:
+        for geom, kind, mass, density in zip(
+            solid.geoms, solid.kinds, solid.masses, solid.densities, strict=True
+        ):
+            size = compiled.geom_size[geom]
+            masses[geom] = density * _volume(kind, size) if mass is None else mass
+    return masses
+
+
 def recompute_inertia(compiled: MjModel, solids: Collection[SolidBody], leaves: Leaves) -> Leaves:
     """Return the leaves with mass, centre and inertia of the `solids` as their geoms have them."""
     leaves = dict(leaves)
     for solid in solids:
         parts = [
-            _geom(leaves, compiled, geom, kind, mass, density)
-            for geom, kind, mass, density in zip(
-                solid.geoms, solid.kinds, solid.masses, solid.densities, strict=True
+            _geom(leaves, compiled, geom, kind, leaves[GEOM_MASS][geom] if bound else mass, density)
+            for geom, kind, mass, density, bound in zip(
+                *(solid.geoms, solid.kinds, solid.masses, solid.densities, solid.bound), strict=True
             )
         ]
         mass, centre, inertia, quat = parts[0] if len(parts) == 1 else _combine(parts)
@@ -125,7 +175,7 @@ def recompute_inertia(compiled: MjModel, solids: Collection[SolidBody], leaves: 
 
 
 def _geom(
-    leaves: Leaves, compiled: MjModel, geom: int, kind: int, mass: float | None, density: float
+    leaves: Leaves, compiled: MjModel, geom: int, kind: int, mass: Any, density: float
 ) -> tuple[Array, Array, Array, Array]:
     """Return mass, centre, principal inertia and its orientation of a geom, in its body's frame."""
 
@@ -139,7 +189,7 @@ def _geom(
     return total, leaf("geom_pos"), total * _inertia(kind, size), leaf("geom_quat")
 
 
-def _volume(kind: int, size: Float[Array, "3"]) -> Float[Array, ""]:
+def _volume(kind: int, size: Float[Array, "3"] | Float[np.ndarray, "3"]) -> Any:
     a, b, c = size
     if kind == _SPHERE:
         return 4 / 3 * math.pi * a**3

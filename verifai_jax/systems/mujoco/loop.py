@@ -5,16 +5,20 @@ It is therefore the same computation on both, down to the order of operations.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.core.errors import check_names
+from verifai_jax.core.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
+from verifai_jax.systems.delays import NO_DELAY, Delay, Line, through
 from verifai_jax.systems.mujoco.bindings import Bindings, RecordingFeatures
 from verifai_jax.systems.mujoco.model import Place, names, reading
 from verifai_jax.systems.pytree_checks import check_like, check_signals, outline
@@ -67,6 +71,7 @@ class Progress(NamedTuple):
     memory: Any
     age: Int[Array, ""]
     finite: Bool[Array, ""]
+    line: Line | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +89,11 @@ class Loop:
     substeps: int
     # Integration steps in one of the model's; JAX may trace it.
     finer: Any = 1
+    # Control periods from a decision until it takes effect.
+    delay: Delay = NO_DELAY
+    # Whether a controller that JAX cannot trace is called by the host; and of one, why it is.
+    on_host: bool = False
+    said: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def compiled(self) -> Any:
@@ -168,8 +178,16 @@ class Loop:
     def initial_progress(self) -> Progress:
         """Return the progress before the first sample."""
         return Progress(
-            jax.tree.map(jnp.asarray, self.controller_memory), jnp.int32(0), jnp.array(True)
+            jax.tree.map(jnp.asarray, self.controller_memory),
+            jnp.int32(0),
+            jnp.array(True),
+            Line.of(self.rest(), self.delay.most),
         )
+
+    def rest(self) -> Float[Array, " nu"]:
+        """Return the control where nothing controls: the keyframe's, or zero."""
+        real = jnp.result_type(float)
+        return jnp.asarray(self.bindings.model.begin.get("ctrl", np.zeros(self.compiled.nu)), real)
 
     def sample(
         self, k: Int[Array, ""], arrays: Mapping[str, Array], progress: Progress, features: Features
@@ -181,6 +199,7 @@ class Loop:
         time = progress.age.astype(jnp.result_type(float)) * self.control_period
         state, sensors = self.state(time, arrays)
         ctrl, memory = self.control(state, progress.memory, features)
+        ctrl, line = through(progress.line, ctrl, self.delay.steps(features))
         inputs = {"ctrl": ctrl, **self.bindings.applied_at(features, time)}
         frozen = k >= self.periods
         if self.terminate is not None:
@@ -189,8 +208,8 @@ class Loop:
         finite = progress.finite
         for value in (*inputs.values(), *(arrays[name] for name in ("qpos", "qvel", "act"))):
             finite &= jnp.all(jnp.abs(value) <= HUGE)
-        after = Progress(memory, progress.age + 1, finite)
-        unchanged = Progress(progress.memory, progress.age, finite)
+        after = Progress(memory, progress.age + 1, finite, line)
+        unchanged = progress._replace(finite=finite)
         after = jax.tree.map(lambda new, old: jnp.where(frozen, old, new), after, unchanged)
         return Sample(inputs, signals, frozen), after
 
@@ -209,13 +228,53 @@ class Loop:
         """Return the controller's output as `[nu]`, and its memory."""
         nu = self.compiled.nu
         if self.controller is None:
-            return jnp.zeros(nu, state.time.dtype), memory
-        if self.controller_memory is None:
-            control = self.controller(state.time, state, features)
-        else:
-            control, memory = self.controller(state.time, state, memory, features)
+            return self.rest().astype(state.time.dtype), memory
+        decided = self._decide(state, memory, features)
+        control, memory = (decided, memory) if self.controller_memory is None else decided
         control = jnp.asarray(control, state.time.dtype)
         return control.reshape(nu), memory
+
+    def _decide(self, state: State, memory: PyTree, features: Features) -> Any:
+        """Call the controller: under JAX, or on the host where JAX cannot trace it and it may."""
+        assert self.controller is not None
+        first = (
+            (state.time, state) if self.controller_memory is None else (state.time, state, memory)
+        )
+        if "controller" not in self.said:
+            try:
+                return self.controller(*first, features)
+            except Exception as error:
+                if not self.on_host or not isinstance(state.time, Tracer):
+                    raise
+                self.said["controller"] = self._why_on_host((*first, dict(features)), error)
+        form = jax.ShapeDtypeStruct((self.compiled.nu,), state.time.dtype)
+        if self.controller_memory is not None:
+            like = jax.tree.map(lambda m: jax.ShapeDtypeStruct(jnp.shape(m), m.dtype), memory)
+            form = (form, like)
+        given = (*first, {name: features[name] for name in features})
+        return jax.pure_callback(self._on_host, form, *given, vmap_method="sequential")
+
+    def _on_host(self, *arguments: Any) -> Any:
+        """Call the controller with arrays of NumPy, and return such."""
+        assert self.controller is not None
+        decided = self.controller(*jax.tree.map(np.asarray, arguments))
+        control, memory = (decided, None) if self.controller_memory is None else decided
+        control = np.asarray(control, arguments[0].dtype).reshape(self.compiled.nu)
+        if memory is None:
+            return control
+        like = lambda old, new: np.asarray(new, old.dtype)  # noqa: E731
+        return control, jax.tree.map(like, arguments[2], memory)
+
+    def _why_on_host(self, arguments: tuple[Any, ...], error: Exception) -> str:
+        """Return why a controller runs on the host, once it has run there.
+
+        **Raises:** what it raises there.
+        """
+        self._on_host(*jax.tree.map(lambda leaf: np.zeros(np.shape(leaf), leaf.dtype), arguments))
+        return (
+            "the controller runs in Python, for one simulation after another, because JAX cannot "
+            f"trace it: {explain_user_error(error, system=False)}"
+        )
 
     def signal_values(
         self, state: State, sensors: Array, ctrl: Array, features: Features
@@ -273,8 +332,11 @@ class Loop:
         **Raises:** `ValueError`.
         """
         self.bindings.check(features)
+        if self.delay.feature is not None:
+            check_names("feature of action_delay:", self.delay.features, features)
+        self.delay.check(features)
         nu = self.compiled.nu
-        used = {binding.feature for binding in self.bindings.all}
+        used = {binding.feature for binding in self.bindings.all} | {*self.delay.features}
         key = jax.eval_shape(lambda: jax.random.key(0))
 
         def everything(features: Features, key: Key[Array, ""]) -> Any:
@@ -307,9 +369,9 @@ class Loop:
         nu = self.compiled.nu
         assert self.controller is not None
         if self.controller_memory is None:
-            control = self.controller(state.time, state, features)
+            control = self._decide(state, memory, features)
         else:
-            decided = self.controller(state.time, state, memory, features)
+            decided = self._decide(state, memory, features)
             role = "(control, memory), its memory in the form of controller_memory"
             if not (isinstance(decided, tuple) and len(decided) == 2):
                 raise ValueError(f"controller must return {role}; got {outline(decided)}")

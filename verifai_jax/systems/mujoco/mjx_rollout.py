@@ -7,6 +7,7 @@ but accelerations and forces.
 
 import copy
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -15,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from verifai_jax.core.errors import require
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.mujoco.bindings import Bindings
 from verifai_jax.systems.mujoco.derived_constants import recompute_constants
 from verifai_jax.systems.mujoco.loop import Loop, Progress, Sample
-from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, mjx_module
+from verifai_jax.systems.mujoco.model import MjModel, MjxData, MjxModel, Model, mjx_module
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
@@ -46,6 +48,7 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         model = model.tree_replace({"opt.timestep": model.opt.timestep / loop.finer})
     substeps = loop.substeps * loop.finer
     start = loop.start(features, key)
+    blank = blank.replace(**{n: v for n, v in start.items() if n not in Physics._fields})
     physics = Physics(
         **{name: start[name] for name in ("qpos", "qvel", "act")},
         qacc_warmstart=jnp.zeros_like(start["qvel"]),
@@ -121,11 +124,12 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         jnp.arange(loop.periods + 1),
     )
     ends = loop.terminate is not None
+    status = jnp.where(progress.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
     return Trace(
         signals,
         dt=loop.control_period,
         valid=progress.age + 1 if ends else None,
-        status=jnp.where(progress.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE)),
+        status=jnp.where(loop.delay.valid(features), status, jnp.int32(Status.ERROR)),
         held=ends,
         finite=loop.finite_signals(),
     )
@@ -226,13 +230,89 @@ def why_not(bindings: Bindings) -> str | None:
     try:
         _mjx_model(bindings)
     except NotImplementedError as error:
-        return f"MJX cannot do this model: {error}"
+        return f"MJX cannot do this model: {error}{_cure(bindings.model)}"
     compiled = bindings.model.compiled
     places = {"body_pos", "body_quat", "site_pos", "site_quat"}
     if compiled.neq and bindings.arrays & places:
         return "MJX does not recompute the anchors of equality constraints that features move"
     if compiled.nplugin:
         return "MJX has no plugins"
+    return None
+
+
+def _cure(model: Model) -> str:
+    """Return the lines that make MJX take a model, tried out; empty where none are known."""
+    mujoco = require("mujoco", extra="mujoco")
+    compiled, lines = copy.copy(model.compiled), []
+    known = {int(kind) for kind in mjx_module().SensorType}
+    sensors = sorted({int(kind) for kind in compiled.sensor_type} - known)
+    if sensors and model.spec is not None:
+        spec, kinds = model.spec.copy(), [mujoco.mjtSensor(kind) for kind in sensors]
+        for sensor in [each for each in spec.sensors if each.type in kinds]:
+            spec.delete(sensor)
+        compiled = spec.compile()
+        compiled.opt.enableflags = model.compiled.opt.enableflags
+        shown = ", ".join(f"mujoco.mjtSensor.{kind.name}" for kind in kinds)
+        lines.append(f"for s in [s for s in spec.sensors if s.type in ({shown},)]: spec.delete(s)")
+    refused = _refusal(compiled)
+    cures = list(_CURES)
+    while refused is not None and cures:
+        line, attribute, value = cures.pop(0)
+        changed = copy.copy(compiled)
+        _assign(mujoco, changed, attribute, value)
+        now = _refusal(changed)
+        if now != refused:
+            # What did not help against the refusal before may help against this one.
+            cures = [cure for cure in _CURES if cure[0] not in lines and cure[1] != attribute]
+            compiled, refused, lines = changed, now, [*lines, line]
+    if refused is not None or not lines:
+        return ""
+    file = next(iter(model.source_files), "model.xml")
+    spec = f"spec = mujoco.MjSpec.from_file({Path(file).name!r})"
+    return f". Give it the model so: `{'; '.join([spec, *lines])}`, and `spec` instead of the file"
+
+
+_CURES = (
+    (
+        "spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON",
+        "solver",
+        "mjtSolver.mjSOL_NEWTON",
+    ),
+    (
+        "spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST",
+        "integrator",
+        "mjtIntegrator.mjINT_IMPLICITFAST",
+    ),
+    (
+        "spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER",
+        "integrator",
+        "mjtIntegrator.mjINT_EULER",
+    ),
+    ("spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL", "cone", "mjtCone.mjCONE_PYRAMIDAL"),
+    ("spec.option.enableflags = 0", "enableflags", 0),
+    ("for geom in spec.geoms: geom.margin = geom.gap = 0", "geom", 0.0),
+)
+"""Lines on a spec, and what each does to a compiled model: the nearest to the model comes first."""
+
+
+def _assign(mujoco: ModuleType, compiled: MjModel, attribute: str, value: Any) -> None:
+    """Do to a compiled model what a line of `_CURES` does to its spec."""
+    if attribute == "geom":
+        compiled.geom_margin[:] = compiled.geom_gap[:] = value
+        return
+    if isinstance(value, str):
+        kind, name = value.split(".")
+        value = getattr(getattr(mujoco, kind), name)
+    setattr(compiled.opt, attribute, value)
+
+
+def _refusal(compiled: MjModel) -> str | None:
+    """Return what MJX says against a model; None where it takes it."""
+    try:
+        mjx = mjx_module()
+        mjx.make_data(mjx.put_model(compiled, impl="jax"))
+    except NotImplementedError as error:
+        return str(error)
     return None
 
 

@@ -12,7 +12,7 @@ import contextlib
 import copy
 import io
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -60,9 +60,13 @@ _OPTION = ("gravity", "wind", "magnetic", "density", "viscosity", "impratio")
 
 KINDS = ("body", "joint", "geom", "site", "actuator", "tendon", "equality", "pair")
 
+GEOM_MASS = "geom_mass"
+"""The masses of geoms, `[ngeom]`, of which MuJoCo keeps only what they add up to in their body."""
+
 # What can be set, beside parameters of the model: the state at time 0, and what acts on it.
 _INPUTS = {
     "body": ("force", "torque"),
+    "geom": ("mass",),
     "joint": ("qpos", "qvel", "springref", "force"),
     "actuator": ("kp", "kv", "ctrl", "act"),
 }
@@ -116,19 +120,28 @@ class Model:
     """A compiled model, and the spec that it came from where there was one.
 
     - `source_files`: the files that it was read from, with their hashes at that time.
+    - `begin`: arrays of the keyframe that simulations begin with, by name; none without one.
+    - `notes`: sentences on what was changed in the model.
     """
 
     compiled: Any
     spec: Any = None
     contact_sensors: tuple[str, ...] = ()
     source_files: Mapping[str, str] = field(default_factory=dict)
+    begin: Mapping[str, np.ndarray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         # A spec cannot be pickled, and is compiled by now. The compiled model is sent bit by bit.
         return {**self.__dict__, "spec": None}
 
 
-def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | None) -> Model:
+def load(
+    source: ModelSource,
+    contacts: tuple[str, ...] = (),
+    keyframe: str | int | None = None,
+    **options: int | None,
+) -> Model:
     """Read and compile a model.
 
     **Arguments:**
@@ -136,10 +149,12 @@ def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | N
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
     - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added behind
       the model's own.
+    - `keyframe`: name or number of the keyframe that simulations begin with.
     - `options`: fields of the model's options to set, where they are not None.
 
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for text that is
-    no model, and for contacts of an `MjModel`, which takes no more sensors.
+    no model, for contacts of an `MjModel`, which takes no more sensors, and for a keyframe that
+    the model lacks.
     """
     mujoco = require("mujoco", extra="mujoco")
     if isinstance(source, mujoco.MjModel):
@@ -161,7 +176,50 @@ def load(source: ModelSource, contacts: tuple[str, ...] = (), **options: int | N
     # A simulation that becomes NaN must be seen, not silently begin again.
     compiled.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     sensors = tuple(f"__contact{k}" for k in range(len(contacts)))
-    return Model(compiled, spec, sensors, _hashes_of_files(source))
+    begin = {} if keyframe is None else _keyframe(compiled, keyframe)
+    notes = tuple(_clear_idle_flags(mujoco, compiled))
+    return Model(compiled, spec, sensors, _hashes_of_files(source), begin, notes)
+
+
+def _clear_idle_flags(mujoco: ModuleType, compiled: MjModel) -> Iterator[str]:
+    """Clear the flags that change no step and that MJX refuses; yield a sentence for each."""
+    for name in ("mjENBL_ENERGY", "mjENBL_FWDINV"):
+        flag = int(getattr(mujoco.mjtEnableBit, name))
+        if compiled.opt.enableflags & flag:
+            compiled.opt.enableflags &= ~flag
+            yield f"the model's flag {name} is cleared: it changes no step, and MJX refuses it"
+
+
+def _keyframe(compiled: MjModel, keyframe: str | int) -> dict[str, np.ndarray]:
+    """Return the arrays of a keyframe.
+
+    **Raises:** `ValueError` for one that the model lacks.
+    """
+    known = names(compiled, "key")
+    if isinstance(keyframe, str):
+        if keyframe not in known:
+            raise unknown_name("keyframe", keyframe, known)
+        number = int(compiled.key(keyframe).id)
+    else:
+        number = keyframe
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, int)
+            or not 0 <= number < compiled.nkey
+        ):
+            raise ValueError(
+                f"keyframe must be a name or a number from 0 to {compiled.nkey - 1}; got "
+                f"{keyframe!r}"
+                if compiled.nkey
+                else f"the model has no keyframe; got keyframe={keyframe!r}"
+            )
+    arrays = {
+        name: getattr(compiled, f"key_{name}")[number] for name in ("qpos", "qvel", "act", "ctrl")
+    }
+    if compiled.nmocap:
+        arrays["mocap_pos"] = compiled.key_mpos[number].reshape(-1, 3)
+        arrays["mocap_quat"] = compiled.key_mquat[number].reshape(-1, 4)
+    return {name: np.array(value) for name, value in arrays.items()}
 
 
 def _hashes_of_files(source: ModelSource) -> dict[str, str]:
@@ -199,7 +257,7 @@ def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
     new = spec.compile()
     for name in ("mass", "inertia", "ipos", "iquat"):
         getattr(new, f"body_{name}")[:] = getattr(old, f"body_{name}")
-    for name in ("iterations", "ls_iterations", "disableflags"):
+    for name in ("iterations", "ls_iterations", "disableflags", "enableflags"):
         setattr(new.opt, name, getattr(old.opt, name))
     mujoco.mj_setConst(new, mujoco.MjData(new))
     return replace(model, compiled=new)
@@ -276,6 +334,7 @@ def names(model: MjModel, kind: str) -> list[str]:
         "equality": "neq",
         "pair": "npair",
         "sensor": "nsensor",
+        "key": "nkey",
     }[kind]
     every = (mujoco.mj_id2name(model, code, i) for i in range(getattr(model, count)))
     return [name for name in every if name]
@@ -297,6 +356,11 @@ def place(model: MjModel, path: str) -> list[Place]:
     element = _element(model, kind, name, path)
     if field not in fields:
         raise unknown_name(f"field of a {kind} in {path!r}: field", field, fields)
+    if kind == "body" and field in ("pos", "quat") and model.body_mocapid[element] >= 0:
+        # Where a mocap body is belongs to the state: what the model has is where it begins.
+        width = 3 if field == "pos" else 4
+        where = int(model.body_mocapid[element]) * width + np.arange(width)
+        return [_pick(path, f"mocap_{field}", where, index)]
     if field in _FIELDS[kind]:
         array = _FIELDS[kind][field]
         rows = _dofs(model, element) if array.startswith("dof_") else np.array([element])
@@ -310,6 +374,8 @@ def _place_input(
     if kind == "body":
         start = 6 * element + (3 if field == "torque" else 0)
         return [_pick(path, "xfrc_applied", start + np.arange(3), index)]
+    if kind == "geom":
+        return [_pick(path, GEOM_MASS, np.array([element]), index)]
     if kind == "joint":
         if field in ("qpos", "springref"):
             array = "qpos" if field == "qpos" else "qpos_spring"

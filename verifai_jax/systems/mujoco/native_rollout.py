@@ -184,8 +184,11 @@ class _Part:
         keys: Key[Array, " n"],
         alive: np.ndarray,
     ) -> None:
-        self.alive, self.failed = alive, np.zeros(len(alive), bool)
         self.loop, self.program = native.loop, program
+        self.alive = alive
+        self.failed = np.broadcast_to(
+            ~np.asarray(self.loop.delay.valid(features)), alive.shape
+        ).copy()
         count = len(keys)
         self.batch = native.batch(count, number)
         self.features = jax.device_put(features)

@@ -24,6 +24,7 @@ from verifai_jax.core.trace import Trace
 from verifai_jax.core.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.clock import count_periods
+from verifai_jax.systems.delays import DelayOption, as_delay
 from verifai_jax.systems.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.systems.mujoco.loop import Loop, Signals
 from verifai_jax.systems.mujoco.mjx_rollout import has_constraints, reverse_hint, rollout, why_not
@@ -68,6 +69,37 @@ class MuJoCo(System):
         return BACKENDS if self.why_not("mjx") is None else ("native",)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what was changed in the model, and on a controller that runs in Python."""
+        return (*self.loop.bindings.model.notes, *self.loop.said.values())
+
+    def why_slow_to_compile(self, gradient: bool) -> str:
+        """Say why MJX compiles this model for minutes, and what is cheaper; empty if it is quick.
+
+        **Arguments:**
+
+        - `gradient`: whether derivatives are compiled too.
+        """
+        compiled = self.loop.compiled
+        stages = compiled.opt.integrator == 1  # Runge-Kutta
+        if self.backend != "mjx" or not (stages or gradient) or not has_constraints(compiled):
+            return ""
+        reason = "its constraints are solved in a loop"
+        reason += ", four times in each Runge-Kutta step" if stages else ""
+        sweeps = ", whose derivatives take forward sweeps" if stages and gradient else ""
+        reason += sweeps or (", through which derivatives are taken" if gradient else "")
+        euler = 'integrator="implicitfast" in the model, or ' if stages else ""
+        search = ' with a search without gradients, such as "cross_entropy"' if gradient else ""
+        return (
+            f"MJX compiles this model for minutes: {reason}. Cheaper: {euler}"
+            f'backend="native"{search}, which compiles nothing of the physics'
+        )
+
+    def why_error(self, features: Features) -> str | None:
+        """Return what is wrong with the delay of a simulation that ended with `ERROR`, if it is."""
+        return self.loop.delay.refusal(features, "this system") if self.loop.delay.most else None
+
+    @property
     def likely(self) -> str:
         """The engine that is likely faster on a CPU: MJX pays for contacts, native for the policy.
 
@@ -89,7 +121,9 @@ class MuJoCo(System):
         """
         if name != "auto" and (reason := self.why_not(name)) is not None:
             raise ValueError(f"backend {name!r} is not possible: {reason}")
-        return replace(self, backend=name)
+        return replace(
+            self, backend=name, loop=replace(self.loop, on_host=name == "native", said={})
+        )
 
     @property
     def traced_factor(self) -> bool:
@@ -196,6 +230,8 @@ def mujoco(
     backend: str = "auto",
     solver_iterations: int | None = None,
     ls_iterations: int | None = None,
+    keyframe: str | int | None = None,
+    action_delay: DelayOption = 0,
 ) -> MuJoCo:
     """Make a system `(features, key) -> Trace` from a MuJoCo model and a controller.
 
@@ -208,7 +244,8 @@ def mujoco(
     - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `Scaled(path)`
       for a factor on the model's value, or a list of these. See docs/mujoco.md for all paths.
     - `controller(time, state, features) -> control`: `[nu]`, or one number for one actuator;
-      `state` is a `systems.mujoco.loop.State`.
+      `state` is a `systems.mujoco.loop.State`. JAX traces it; with `backend="native"` one that JAX
+      cannot trace, of NumPy or PyTorch, is called with arrays of NumPy, once for each decision.
     - `controller_memory`: as in `ode`.
     - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
     - `signals`: for a signal's name a path (`"joint/slider/qpos"`, `"body/torso/xpos[2]"`,
@@ -220,6 +257,11 @@ def mujoco(
       needs them, else the faster.
     - `solver_iterations`, `ls_iterations`: of the constraint solver and its line search, instead
       of the model's.
+    - `keyframe`: name or number of the model's keyframe that each simulation begins with, before
+      `bind`. Its `ctrl` is the control where there is no controller.
+    - `action_delay`: control periods after which a decision of the controller takes effect, or the
+      feature that says so with the greatest that it may be, `{"latency": 5}`. Until the first one
+      does, the control is the keyframe's, or zero.
 
     **Returns:** a `MuJoCo` system.
 
@@ -249,7 +291,16 @@ def mujoco(
             for path in signals.values()
             if isinstance(path, str) and path.startswith("contact/")
         )
-    loaded = load(model, contacts, iterations=solver_iterations, ls_iterations=ls_iterations)
+    delay = as_delay(action_delay, "action_delay")
+    if delay.most and controller is None:
+        raise ValueError("action_delay needs a controller; got none")
+    loaded = load(
+        model,
+        contacts,
+        keyframe,
+        iterations=solver_iterations,
+        ls_iterations=ls_iterations,
+    )
     timestep = float(loaded.compiled.opt.timestep)
     loop = Loop(
         bindings=resolve_bindings(loaded, bind),
@@ -261,6 +312,7 @@ def mujoco(
         control_period=float(control_period),
         periods=count_periods(duration, control_period, "duration", "control_period"),
         substeps=count_periods(control_period, timestep, "control_period", "the model's timestep"),
+        delay=delay,
     )
     _ = loop.places
     system = MuJoCo(loop)

@@ -1,11 +1,11 @@
-"""Delays between an environment and its policy, in whole steps, fixed or by a feature.
+"""Delays between a system and its policy, in whole steps, fixed or by a feature.
 
 brax("hopper", policy, action_delay=2)
 brax("hopper", policy, observation_delay={"latency": 5})    # the feature `latency`, at most 5
 
 A policy decides on the observation of so many steps ago, the first one until there is one of then;
 an action takes effect so many steps after its decision, and until the first one does the
-environment gets zeros (the first of its choices).
+system gets zeros (an environment the first of its choices).
 """
 
 from collections.abc import Iterable, Mapping
