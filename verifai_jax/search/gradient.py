@@ -8,9 +8,9 @@ Methods of Optimization, 1987, section 14.6); for one clause it is a jump along 
 gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
 does a plain gradient, because the gradients of all clauses count.
 
-The first descent starts near the middle, and its box is the whole cube. It shrinks while points turn
-out no better, several sizes in one batch where there is room, and grows again on success. A corner
-that nothing points out of is left by its weakest coordinates, one at a time, since a small
+The first descent starts near the middle, and its box is the whole cube. It shrinks while points
+turn out no better, several sizes in one batch where there is room, and grows again on success. A
+corner that nothing points out of is left by its weakest coordinates, one at a time, since a small
 derivative says little about the other end of the range. After that, or when gradients are zero or
 not finite, the descent starts again elsewhere.
 
@@ -349,7 +349,7 @@ class Gradient(Search[GradientState]):
     def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:
-        """Return the points to differentiate: new starts for fresh descents, near the middle first."""
+        """Return the points to differentiate: starts of fresh descents, near the middle first."""
         number = state.starts + jnp.cumsum(state.fresh).astype(jnp.uint32) - 1
         points = halton_points(number, cube.dim, state.key)
         free = np.array(cube.levels) == 0

@@ -58,8 +58,8 @@ OPENING = 6
 """Descents before the budget is shared by evidence."""
 
 FEW = 4
-"""Dimensions below which points that are spread find sooner what descents find: the fewer there are,
-the fewer simulations the descents get before there is evidence."""
+"""Dimensions below which points that are spread find sooner what descents find: the fewer there
+are, the fewer simulations the descents get before there is evidence."""
 
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare."""
