@@ -18,6 +18,7 @@ from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 
 MOST_TRAINED = 4000
 MOST_TESTED = 2000
@@ -38,7 +39,7 @@ MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Importance:
+class Importance(InNotebook):
     """Losses of a model of the table when a feature is shuffled.
 
     **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
@@ -85,7 +86,7 @@ class Importance:
             losses = self.table[target].to_numpy(float)
             order = [i for i in np.argsort(-losses, kind="stable") if losses[i] >= LEAST_LOSS]
             listed = ", ".join(
-                f"{self.table.index[i]} ({losses[i]:.2f})" for i in order[:MOST_NAMED]
+                f"{self.table.index[i]} ({losses[i]:z.2f})" for i in order[:MOST_NAMED]
             )
             if self.is_reliable(target):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
@@ -98,7 +99,7 @@ class Importance:
 
     def score_words(self, target: str) -> str:
         """Write the score of the model of `"failing"` or `"rho"`."""
-        return f"{SCORES[target]} {self.scores[target]:.2f} on rows kept aside"
+        return f"{SCORES[target]} {self.scores[target]:z.2f} on rows kept aside"
 
 
 def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance:
@@ -167,7 +168,7 @@ def _unlearnable(target: str, values: np.ndarray) -> str:
         rows = "row" if len(values) == 1 else "rows"
         return f"{len(values)} {rows} with a robustness, too few to learn from"
     elif np.ptp(values) == 0:
-        return f"it is {values[0]:.4g} in every row"
+        return f"it is {values[0]:z.4g} in every row"
     return ""
 
 

@@ -150,7 +150,7 @@ class Analysis:
             parts.append(f"<h4>{html.escape(part.title)}</h4><p>{words}</p>")
             table = getattr(part.result, "table", None)
             if table is not None and len(table):
-                parts.append(table.head(10).to_html(float_format=lambda x: f"{x:.3g}"))
+                parts.append(table.head(10).to_html(float_format=lambda x: f"{x:z.3g}"))
         return "\n".join(parts)
 
 
@@ -223,7 +223,7 @@ def _describe_failures(source: object, samples: Samples) -> str:
         more = ", ..." if len(samples.names) > MOST_NAMED else ""
         lines.append(
             f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
-            f"robustness {samples.rho[place]:.4g} at {where}{more}"
+            f"robustness {samples.rho[place]:z.4g} at {where}{more}"
         )
     return "\n".join(lines)
 

@@ -145,7 +145,7 @@ class SimulationProgress:
 
     def update(self, simulations: int, counterexamples: int, best: float) -> None:
         """Show the simulations made, the counterexamples among them and the least robustness."""
-        figures = f"{self.bar.speed:,.0f}/s  best {best:.3g}  {counterexamples} counterexamples"
+        figures = f"{self.bar.speed:z,.0f}/s  best {best:z.3g}  {counterexamples} counterexamples"
         self.bar.update(simulations, figures=figures)
 
 

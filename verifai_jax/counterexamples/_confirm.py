@@ -17,6 +17,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmation import Confirmer
@@ -40,7 +41,7 @@ Simulator: TypeAlias = Callable[..., Any] | Problem | str | None
 
 
 @dataclass(frozen=True, repr=False)
-class Confirmation:
+class Confirmation(InNotebook):
     """The verdict of finer replays on one counterexample.
 
     **Fields:**
@@ -79,7 +80,7 @@ class Confirmation:
         if self.why and self.why not in self.notes:
             text += f": {self.why}"
         words = {"as_run": f"as run ({self.precision})", **IN_WORDS}
-        values = [f"{rho:.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
+        values = [f"{rho:z.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
         text += f". Robustness {', '.join(values)}" if values else ""
         text = ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
         return "\n".join([*(each for each in (self.changed, self.finding) if each), text])
@@ -88,7 +89,7 @@ class Confirmation:
 
 
 @dataclass(frozen=True, eq=False)
-class Confirmations:
+class Confirmations(InNotebook):
     """The verdicts of finer replays on all counterexamples of a run.
 
     **Fields:**
@@ -151,7 +152,7 @@ class Confirmations:
             worst = self.confirmed["rho"].idxmin()
             lines.append(
                 f"  the worst confirmed is row {worst}, robustness "
-                f"{self.confirmed.loc[worst, 'rho']:.4g}: run.replay({worst}) shows it"
+                f"{self.confirmed.loc[worst, 'rho']:z.4g}: run.replay({worst}) shows it"
             )
         return "\n".join(lines)
 
@@ -288,7 +289,7 @@ def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
     if not values["violated"]:
         raise ValueError(
             f"{which} is no counterexample: it keeps the property with robustness "
-            f"{values['rho']:.4g}; confirm(run) checks those that do not"
+            f"{values['rho']:z.4g}; confirm(run) checks those that do not"
         )
 
 

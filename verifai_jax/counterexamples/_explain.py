@@ -22,6 +22,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
@@ -39,7 +40,7 @@ MATTERS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class Explained(InNotebook):
     """Reasons of a failure; `str()` is a paragraph, `plot` a picture.
 
     **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:

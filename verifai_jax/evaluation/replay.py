@@ -3,7 +3,7 @@
 replay(problem, row, key, number).trace             # the trace behind a row of a table
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Key
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
@@ -28,13 +29,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(InNotebook):
     """One simulation, looked at again.
 
     `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
     random key of the simulation. `duration` are the seconds that it would have lasted without an
     early end, over which Signals lie; None for a single sample.
     """
+
+    _internal = frozenset(("changed", "finding"))
 
     problem: Problem
     row: int | None
@@ -93,16 +96,19 @@ class Replay:
         which = "a simulation" if self.row is None else f"row {self.row}"
         lines = [*self.warnings, f"{which} of {self.problem.name}: {self._verdict()}"]
         if len(self.rho) > 1 and self.status == Status.OK:
-            lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
+            lines += [f"  {name:<12} robustness {rho:z.4g}" for name, rho in self.rho.items()]
         lines.append(f"  {'features':<12} {self.describe_features()}")
         span, *signals = str(self.trace).splitlines()
         return "\n".join([*lines, f"  {span}", *(f"  {line}" for line in signals)])
+
+    def _notebook_parts(self) -> Iterator[str]:
+        yield picture_html(self.plot())
 
     def _verdict(self) -> str:
         if self.status != Status.OK:
             return f"no verdict, {self.status.name.lower()}"
         verb = "violates" if self.violated else "keeps"
-        return f"{verb} the property, robustness {min(self.rho.values()):.4g}"
+        return f"{verb} the property, robustness {min(self.rho.values()):z.4g}"
 
     def plot(self, path: str | Path | None = None, signals: Sequence[str] | None = None) -> Any:
         """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
@@ -154,7 +160,7 @@ def replay(
             row=number,
             features=features,
             trace=trace.trim(),
-            rho=dict(zip(problem.formulas, np.asarray(rho).tolist(), strict=True)),
+            rho=dict(zip(problem.formulas, (np.asarray(rho) + 0.0).tolist(), strict=True)),
             status=Status(int(status)),
             key=key,
             # Of the whole trace: what an early end leaves of it is shorter.

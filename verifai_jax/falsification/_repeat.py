@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.programs import Slot
 from verifai_jax.core.trace import Status
@@ -42,7 +43,7 @@ SIMULATIONS_A_CALL = 512
 
 
 @dataclass(frozen=True, eq=False)
-class Trials:
+class Trials(InNotebook):
     """The histories of one search from many seeds; what `repeat` returns.
 
     - `name`, `search`: of the problem; the repr of the search.
@@ -122,8 +123,8 @@ class Trials:
         return (
             f"{self.name}: {self.search} falsified from {self.falsified} of {len(self.seeds)} "
             f"seeds within {self.rho.shape[1]} simulations ({meant}); mean "
-            f"{self.mean_simulations:.4g}, median {self.median_simulations:.4g} simulations to the "
-            "first failure"
+            f"{self.mean_simulations:z.4g}, median {self.median_simulations:z.4g} simulations to "
+            "the first failure"
         )
 
 

@@ -54,7 +54,7 @@ def plot_arms(
     label = metric.replace("_", " ")
     left.set_xlabel(f"{label}{unit}: seeds and their mean")
     points = " (points)" if metric in SHARES else ""
-    sure = f"{100 * result.confidence:g} % t interval"
+    sure = f"{100 * result.confidence:zg} % t interval"
     right.set_xlabel(f"{label} minus that of {reference}{points}, {sure}")
     right.axvline(0, color=BOUND, linewidth=0.8, linestyle=":")
     for axes in (left, right):

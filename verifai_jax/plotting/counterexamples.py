@@ -193,7 +193,7 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
                 )  # fmt: skip
             else:
                 axes.annotate("no verdict", (explained.rho, y), fontsize=8, va="center")
-        axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:.3g})")
+        axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:z.3g})")
         axes.set_title("what removes the failure", fontsize=9, loc="left")
     else:
         sizes = [float(np.abs(np.nan_to_num(i.gradient)).max(initial=0.0)) for i in shown]
@@ -242,7 +242,7 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
     left.set_ylim(max(len(places), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")
-    title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:.3g}"
+    title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:z.3g}"
     left.set_title(title, fontsize=9, loc="left")
     tidy(left)
     left.grid(visible=False, axis="y")

@@ -390,7 +390,7 @@ def _labelled(
     failed = motion.decisive is not None and sample >= motion.decisive
     ink = (190, 45, 65) if failed else (48, 50, 61)
     pen.text((10, 5), caption, fill=ink, font=font)
-    pen.text((width - 10, 5), f"{motion.clock[sample]:.2f} s", fill=ink, font=font, anchor="ra")
+    pen.text((width - 10, 5), f"{motion.clock[sample]:z.2f} s", fill=ink, font=font, anchor="ra")
     if failed:
         pen.rectangle((0, 0, width - 1, height - 1), outline=ink, width=3)
     return np.asarray(picture)

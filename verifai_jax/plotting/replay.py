@@ -95,7 +95,7 @@ def plot_replay(
         _name_signal(axes, f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
         # A power of ten above the axis, as matplotlib writes it, would cover the predicates there.
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.10g}".replace("-", "\u2212"))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:z.10g}".replace("-", "\u2212"))
         named = {}
         for predicate, limits in _bounds(replay, signal, shown).items():
             margin = np.asarray(robustness_signal(predicate, trace, end=replay.problem.end))
@@ -114,7 +114,7 @@ def plot_replay(
     left_out = _left_out([signal for signal in ordered if signal not in shown])
     panels[-1].set_xlabel("time [s]" + left_out, wrap=True)
     figure.align_ylabels(panels)
-    worst = f"robustness {replay.rho[name]:.4g}"
+    worst = f"robustness {replay.rho[name]:z.4g}"
     verdict = f"{worst} ({'violated' if replay.violated else 'ok'})"
     if replay.status != Status.OK:
         verdict = f"no verdict ({replay.status.name.lower()})"
@@ -347,7 +347,7 @@ def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
     right = sample > trace.length / 2
     low, high = axes.get_ylim()
     axes.annotate(
-        f"{signal} = {value:.4g} at {format_time(time, 4)} s",
+        f"{signal} = {value:z.4g} at {format_time(time, 4)} s",
         (time, value),
         textcoords="offset points",
         xytext=(-12 if right else 12, -12 if value > (low + high) / 2 else 8),

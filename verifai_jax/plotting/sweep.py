@@ -285,7 +285,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             hatch=hatch,
             edgecolor="white",
             linewidth=0,
-            label=f"{what} (model: R² {importance.scores[target]:.2f})",
+            label=f"{what} (model: R² {importance.scores[target]:z.2f})",
         )
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
