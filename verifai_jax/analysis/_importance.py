@@ -19,6 +19,7 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 
 MOST_TRAINED = 4000
 MOST_TESTED = 2000
@@ -102,7 +103,10 @@ class Importance(InNotebook):
         return f"{SCORES[target]} {self.scores[target]:z.2f} on rows kept aside"
 
 
-def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance:
+@shows_progress("finding importances in")
+def importance(
+    source: Source, *, repeats: int = 5, seed: int = 0, progress: bool | None = None
+) -> Importance:
     """Measure how important each feature is to a model trained on the table; nothing is simulated.
 
     **Arguments:**
@@ -111,6 +115,8 @@ def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance
       verdict.
     - `repeats`: how often each feature is shuffled.
     - `seed`: of all that is drawn at random.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** an `Importance`.
 

@@ -28,6 +28,7 @@ from verifai_jax.analysis.data.verdicts import unconfirmed
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features, one_line, printable
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
@@ -154,13 +155,18 @@ class Analysis:
         return "\n".join(parts)
 
 
-def analyze(source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0) -> Analysis:
+@shows_progress("analyzing")
+def analyze(
+    source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0, progress: bool | None = None
+) -> Analysis:
     """Apply every analysis of the error table that fits it, and say why others do not.
 
     **Arguments:**
 
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: of all that is drawn at random.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** an `Analysis`.
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmation import Confirmer
@@ -161,7 +162,12 @@ class Confirmations(InNotebook):
 
 @overload
 def confirm(
-    run: Run, row: None = None, *, simulator: Simulator = None, most: int | None = None
+    run: Run,
+    row: None = None,
+    *,
+    simulator: Simulator = None,
+    most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmations: ...
 @overload
 def confirm(
@@ -170,14 +176,17 @@ def confirm(
     *,
     simulator: Simulator = None,
     most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmation: ...
 @suggests_options
+@shows_progress("confirming", "replays")
 def confirm(
     run: Run,
     row: Row = None,
     *,
     simulator: Simulator = None,
     most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmation | Confirmations:
     """Replay counterexamples more finely than they were found, and decide which are real.
 
@@ -191,6 +200,8 @@ def confirm(
     - `most`: how many rows are replayed at least, by default 256, and more where a row takes few
       replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `confirmation.Confirmer`).
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 

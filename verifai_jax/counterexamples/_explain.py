@@ -24,6 +24,7 @@ from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
 from verifai_jax.counterexamples.fixed_key import fix_key
@@ -91,7 +92,14 @@ class Explained(InNotebook):
 
 
 @suggests_options
-def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = None) -> Explained:
+@shows_progress("explaining a counterexample of")
+def explain(
+    run: Run,
+    row: Row = None,
+    *,
+    nominal: Mapping[str, Any] | None = None,
+    progress: bool | None = None,
+) -> Explained:
     """Explain a counterexample: the predicate that decides, when, and the features that matter.
 
     **Arguments:**
@@ -99,6 +107,8 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     Takes one simulation for each feature and each unit coordinate, and one gradient. Without
     nominal features only the gradient tells what matters.

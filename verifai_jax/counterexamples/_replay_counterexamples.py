@@ -14,6 +14,7 @@ import numpy as np
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.sources import Change, Sources
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.core.trace import Status
@@ -129,11 +130,13 @@ class CorpusReplay(InNotebook):
 
 
 @suggests_options
+@shows_progress("replaying the counterexamples of", "replays")
 def replay_counterexamples(
     problem: Problem,
     folder: str | Path,
     *,
     rename: Mapping[str, str] | None = None,
+    progress: bool | None = None,
 ) -> CorpusReplay:
     """Simulate the counterexamples of a corpus again, all in one batch.
 
@@ -146,6 +149,8 @@ def replay_counterexamples(
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.

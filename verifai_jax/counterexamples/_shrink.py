@@ -25,6 +25,7 @@ from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
@@ -172,6 +173,7 @@ class Shrunk(InNotebook):
 
 
 @suggests_options
+@shows_progress("shrinking a counterexample of")
 def shrink(
     run: Run,
     row: Row = None,
@@ -182,6 +184,7 @@ def shrink(
     seed: int = 0,
     others: bool = True,
     stay: bool = False,
+    progress: bool | None = None,
 ) -> Shrunk:
     """Search the least departure from the nominal features that still fails.
 
@@ -203,6 +206,8 @@ def shrink(
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     All simulations have the random key of the row. The result was simulated alone and failed, in
     the precision of the run, and in float64 too unless the system draws random numbers or is a

@@ -17,6 +17,7 @@ from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
 from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.host_engine import on_host_clock
@@ -134,6 +135,7 @@ class Replay(InNotebook):
         return late("verifai_jax.plotting.animation", "animate")(self, path)
 
 
+@shows_progress("replaying a simulation of", "simulations")
 def replay(
     problem: Problem,
     row: "Mapping[str, Any] | pd.Series",
