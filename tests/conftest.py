@@ -1,6 +1,7 @@
 """Settings of all tests: no compile cache, checked annotations, memory given back between files."""
 
 import ctypes
+import functools
 import gc
 import os
 import resource
@@ -14,6 +15,7 @@ os.environ.setdefault("VERIFAI_JAX_CACHE", "off")
 import matplotlib
 import pytest
 from jaxtyping import install_import_hook
+from legible import faults, on_curves
 
 matplotlib.use("Agg")
 
@@ -57,6 +59,25 @@ CHECKED_ROOMS: list[str] = [
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")
 
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
+from verifai_jax.core import figure  # noqa: E402
+
+_plain_figure = figure._figure_class
+
+
+@functools.cache
+def _legible_figure() -> Any:
+    """Return a figure of which no text may be cut off or lie on another when it is written."""
+
+    class Legible(_plain_figure()):
+        def savefig(self, *arguments: Any, **options: Any) -> None:
+            super().savefig(*arguments, **options)
+            found = faults(self) + on_curves(self)
+            assert not found, "a picture that cannot be read: " + "; ".join(found)
+
+    return Legible
+
+
+figure._figure_class = _legible_figure
 
 LONG_FILES = (
     "test_documents.py",

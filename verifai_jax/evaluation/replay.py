@@ -123,16 +123,29 @@ class Replay(InNotebook):
         """
         return late("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
 
-    def animate(self, path: str | Path | None = None) -> Any:
+    def animate(
+        self,
+        path: str | Path | None = None,
+        *,
+        camera: str | None = None,
+        size: tuple[int, int] | None = None,
+        fps: float | None = None,
+    ) -> Any:
         """Draw the simulation as an animated GIF, which a notebook shows.
 
         **Arguments:**
 
         - `path`: of a file to write too; none when left out.
+        - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
+          left out.
+        - `size`: width and height of a frame in pixels.
+        - `fps`: frames a second; chosen when left out.
 
-        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
+        environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """
-        return late("verifai_jax.plotting.animation", "animate")(self, path)
+        draw = late("verifai_jax.plotting.animation", "animate")
+        return draw(self, path, camera=camera, size=size, fps=fps)
 
 
 @shows_progress("replaying a simulation of", "simulations")

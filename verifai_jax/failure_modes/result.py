@@ -81,16 +81,17 @@ class Mode(InNotebook):
         )
         return replace(again, row=None)
 
-    def animate(self, path: str | Path | None = None) -> Any:
+    def animate(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the likeliest failure as an animated GIF.
 
         **Arguments:**
 
         - `path`: of a file to write too; none when left out.
+        - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
 
-        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        **Raises:** as `Replay.animate`.
         """
-        return self.replay().animate(path)
+        return self.replay().animate(path, **options)
 
     def explain(self, nominal: Mapping[str, Any] | None = None) -> Explained:
         """Explain the likeliest failure: predicate, instant, and the features that matter.

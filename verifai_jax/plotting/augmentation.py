@@ -50,7 +50,8 @@ def plot_arms(
             right.plot(ends, [place, place], color=color, linewidth=3, alpha=0.5)
         right.plot(scale * difference.mean, place, "o", color=color)
     left.set_yticks(range(len(arms)), [arm.replace("_", " ") for arm in arms])
-    left.invert_yaxis()
+    # The marks of the first and the last arm are as high as a row.
+    left.set_ylim(len(arms) - 0.4, -0.6)
     label = metric.replace("_", " ")
     left.set_xlabel(f"{label}{unit}: seeds and their mean")
     points = " (points)" if metric in SHARES else ""
