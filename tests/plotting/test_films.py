@@ -69,7 +69,7 @@ def test_a_film_sees_what_moves(gl, speed):
 
 @pytest.mark.thorough
 def test_a_models_own_camera_is_taken_where_it_sees_the_motion(gl):
-    side = '<camera name="side" pos="1 -3 0.3" xyaxes="1 0 0 0 0 1" fovy="60"/>'
+    side = '<camera name="side" pos="0.5 -2 0.2" xyaxes="1 0 0 0 0 1" fovy="60"/>'
     motion = rolling(side, speed=1.0)
     with canvas(motion.model, (120, 80)) as draw:
         view = best_view(motion, draw, (120, 80))

@@ -128,7 +128,7 @@ class Replay(InNotebook):
         path: str | Path | None = None,
         *,
         camera: str | None = None,
-        size: tuple[int, int] | None = None,
+        size: Sequence[int] | None = None,
         fps: float | None = None,
     ) -> Any:
         """Draw the simulation as an animated GIF, which a notebook shows.

@@ -139,7 +139,10 @@ def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> 
     indent = 0.02 + 0.016 * depth
     weight = "bold" if node.decides else "normal"
     color = PATH if node.decides else QUIET
-    text = _shortened(name, int((0.31 - indent) * width * 11.5))
+    # In two lines where one is too short; letters in bold are wider.
+    room = int((0.31 - indent) * width * (10 if node.decides else 11.5))
+    lines = textwrap.wrap(name, room)
+    text = "\n".join([lines[0], _shortened(" ".join(lines[1:]), room)] if lines[1:] else lines)
     figure.text(indent, middle, text, va="center", fontsize=10.5, weight=weight, color=color)
     value = "" if np.isnan(node.robustness) else f"{node.robustness:+z.3g}"
     figure.text(

@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -49,7 +49,7 @@ def animate(
     path: str | Path | None = None,
     *,
     camera: str | None = None,
-    size: tuple[int, int] | None = None,
+    size: Sequence[int] | None = None,
     fps: float | None = None,
 ) -> Animation:
     """Draw a simulation as a GIF, in real time where it has not too many frames.
@@ -74,20 +74,21 @@ def animate(
     _check_gif(path)
     check_film(size, fps)
     draw, system = replay.problem.draw, replay.problem.system
+    pixels = None if size is None else (int(size[0]), int(size[1]))
     if camera is not None and (draw is not None or not can_draw(system)):
         raise ValueError(
             f"camera names a camera of a MuJoCo model, which does not draw problem "
             f"{replay.problem.name!r}; leave it out, got {camera!r}"
         )
     if draw is not None:
-        animation = Animation(_drawn(replay, draw, size or SIZE, fps))
+        animation = Animation(_drawn(replay, draw, pixels or SIZE, fps))
     elif can_draw(system):
         with TemporaryDirectory() as folder:
             place = Path(folder) / "animation.gif"
-            file = film(record(replay), place, size, camera=camera, fps=fps)
+            file = film(record(replay), place, pixels, camera=camera, fps=fps)
             animation = Animation(file.read_bytes())
     elif episode_of(system) is not None:
-        animation = Animation(film_episode(replay, size, fps))
+        animation = Animation(film_episode(replay, pixels, fps))
     else:
         raise ValueError(
             f"problem {replay.problem.name!r} cannot be animated: it has no draw function "

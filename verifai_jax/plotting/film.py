@@ -27,7 +27,7 @@ LAST = 1500
 """Milliseconds that the last frame stays, which is the one that matters."""
 
 
-def check_film(size: tuple[int, int] | None, fps: float | None) -> None:
+def check_film(size: Sequence[int] | None, fps: float | None) -> None:
     """Check the size in pixels and the frames a second of a film.
 
     **Raises:** `ValueError`, `TypeError`.

@@ -1,8 +1,10 @@
 """Films of environments of Gymnasium, which draw themselves (`render_mode="rgb_array"`)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.plotting.film import (
@@ -27,7 +29,7 @@ def episode_of(system: object) -> EpisodeFunction | None:
 
 
 def film_episode(
-    replay: Replay, size: tuple[int, int] | None = None, fps: float | None = None
+    replay: Replay, size: Sequence[int] | None = None, fps: float | None = None
 ) -> bytes:
     """Simulate an episode again, in this process, and return what the environment draws as a GIF.
 
@@ -62,7 +64,9 @@ def write_episode(replay: Replay, path: Path) -> Path:
     return path
 
 
-def _resized(frame: Frame, size: tuple[int, int] | None) -> Frame:
+def _resized(
+    frame: Frame, size: Sequence[int] | None
+) -> UInt8[np.ndarray, "wanted_height wanted_width 3"]:
     if size is None:
         return frame
     from PIL import Image

@@ -60,20 +60,24 @@ def record(replay: Replay) -> Motion:
     system: Any = replay.problem.system
     if not can_draw(system):
         raise ValueError(f"the system of problem {replay.problem.name!r} has no MuJoCo model")
-    # Kept with the problem, as they are compiled once.
-    simulate, placed = replay.problem.programs.get(RECORDERS, None, lambda: _recorder(system))
     clock = np.asarray(replay.trace.clock(), np.float64)
     samples = len(clock)
-    precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
-    features = set_durations(replay.features, system.duration)
     leaves, acting = {}, {}
-    with jax.enable_x64(precise):
-        trace = simulate(features, getattr(replay, "key", None))
-        qpos = np.asarray(trace["qpos"], np.float64)[:samples]
-        if placed is not None:
-            loop = system.loop
-            times = loop.control_period * np.arange(loop.periods + 1)
-            leaves, acting = placed(features, times)
+    if isinstance(system, Brax) and system.signals is None and "q" in replay.trace.signals:
+        # Its positions are among the signals then.
+        qpos = np.asarray(replay.trace["q"], np.float64).reshape(samples, -1)
+    else:
+        # Kept with the problem, as they are compiled once.
+        simulate, placed = replay.problem.programs.get(RECORDERS, None, lambda: _recorder(system))
+        precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
+        features = set_durations(replay.features, system.duration)
+        with jax.enable_x64(precise):
+            trace = simulate(features, getattr(replay, "key", None))
+            qpos = np.asarray(trace["qpos"], np.float64)[:samples]
+            if placed is not None:
+                loop = system.loop
+                times = loop.control_period * np.arange(loop.periods + 1)
+                leaves, acting = placed(features, times)
     model = copy.copy(system.loop.compiled if isinstance(system, MuJoCo) else _model_of(system))
     if qpos.shape[1] != model.nq:
         raise ValueError(

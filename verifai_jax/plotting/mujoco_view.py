@@ -18,7 +18,7 @@ TRIED = 4
 """Instants at which a camera is tried."""
 LARGE = 0.12
 """Share of a picture that what moves need not exceed: a camera that is nearer sees no more."""
-OWN = 1.6
+OWN = 1.9
 """How much better a model's own camera counts than one that is made for the motion."""
 ANGLES = ((90.0, -15.0), (135.0, -25.0), (45.0, -25.0), (180.0, -15.0), (0.0, -15.0), (90.0, -55.0))
 """Azimuth and elevation in degrees of the cameras that are made."""

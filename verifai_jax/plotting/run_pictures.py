@@ -42,8 +42,9 @@ def write_replay_pictures(
 ) -> list[Path]:
     """Write the pictures of one simulation into a folder, animated too where its problem can.
 
-    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo cannot draw,
-    one line is logged that says what to do, and its pictures are left out.
+    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo, or an
+    environment of Gymnasium, cannot draw, one line is logged that says why, and the pictures are
+    left out.
 
     **Arguments:**
 
@@ -67,9 +68,10 @@ def write_replay_pictures(
             paths.append(film(motion, folder / f"{name}.gif"))
         except NoRenderer as error:
             logging.getLogger(__name__).warning("%s", error)
-    elif (episode := episode_of(replay.problem.system)) is not None and episode.draws:
+    elif (episode := episode_of(replay.problem.system)) is not None:
         try:
-            paths.append(write_episode(replay, folder / f"{name}.gif"))
+            if episode.draws:
+                paths.append(write_episode(replay, folder / f"{name}.gif"))
         except Exception as error:  # What draws there is not this package's.
             logging.getLogger(__name__).warning("no film: %s", format_error(error))
     return paths
