@@ -19,7 +19,7 @@ def shown_texts(figure):
         # Ticks beyond the limits have labels that are not drawn.
         for axis in (axes.xaxis, axes.yaxis):
             low, high = sorted(axis.get_view_interval())
-            slack = 1e-9 * (high - low)
+            slack = 1e-9 * (high - low if axis.get_scale() == "linear" else low)
             for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]:
                 seen = axes.axison and axes.get_visible() and axis.get_visible()
                 if not (seen and low - slack <= tick.get_loc() <= high + slack):

@@ -16,10 +16,12 @@ from verifai_jax.plotting.mujoco_motion import Motion
 
 TRIED = 4
 """Instants at which a camera is tried."""
-LARGE = 0.12
+LARGE = 0.1
 """Share of a picture that what moves need not exceed: a camera that is nearer sees no more."""
 OWN = 1.9
 """How much better a model's own camera counts than one that is made for the motion."""
+FAR = 4.0
+"""Sizes of what moves that it goes at least, for a camera to be carried along."""
 ANGLES = ((90.0, -15.0), (135.0, -25.0), (45.0, -25.0), (180.0, -15.0), (0.0, -15.0), (90.0, -55.0))
 """Azimuth and elevation in degrees of the cameras that are made."""
 
@@ -102,8 +104,9 @@ def _made(
     bodies = np.unique(model.geom_bodyid[moving])
     heaviest = int(bodies[np.argmax(model.body_subtreemass[bodies])])
     views = []
-    for carried in (False, True)[: 1 + (far > 1.5 * once)]:
-        reach = 0.5 * (once if carried else far)
+    for carried in (False, True)[: 1 + (far > FAR * once)]:
+        # One that is carried along shows some of what is around, too.
+        reach = once if carried else 0.5 * far
         for azimuth, elevation in ANGLES:
             view = mujoco.MjvCamera()
             mujoco.mjv_defaultFreeCamera(model, view)
