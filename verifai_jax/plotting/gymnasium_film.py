@@ -54,7 +54,9 @@ def film_episode(
         # An episode that ends earlier than before stays where it ended.
         frame = drawn[min(sample, max(drawn))]
         failed = decided is not None and sample >= decided
-        frames.append(labelled(_resized(frame, size), caption_of(replay), clock[sample], failed))
+        frames.append(
+            labelled(_resized(frame, size), caption_of(replay), float(clock[sample]), failed)
+        )
     return gif(frames, shown)
 
 
@@ -71,4 +73,4 @@ def _resized(
         return frame
     from PIL import Image
 
-    return np.asarray(Image.fromarray(frame).resize(tuple(size)))
+    return np.asarray(Image.fromarray(frame).resize((size[0], size[1])))

@@ -75,7 +75,7 @@ def record(replay: Replay) -> Motion:
             trace = simulate(features, getattr(replay, "key", None))
             qpos = np.asarray(trace["qpos"], np.float64)[:samples]
             if placed is not None:
-                loop = system.loop
+                loop: Any = system.loop  # pyright: ignore[reportAttributeAccessIssue]
                 times = loop.control_period * np.arange(loop.periods + 1)
                 leaves, acting = placed(features, times)
     model = copy.copy(system.loop.compiled if isinstance(system, MuJoCo) else _model_of(system))
