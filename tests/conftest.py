@@ -1,6 +1,7 @@
 """Settings of all tests: no compile cache, checked annotations, memory given back between files."""
 
 import ctypes
+import functools
 import gc
 import os
 import resource
@@ -16,6 +17,7 @@ import matplotlib
 import pytest
 from checked_types import check_first_calls
 from jaxtyping import install_import_hook
+from legible import faults, on_curves
 
 matplotlib.use("Agg")
 
@@ -60,6 +62,25 @@ check_first_calls()
 install_import_hook([f"verifai_jax.{room}" for room in CHECKED_ROOMS], "checked_types.check")
 
 import verifai_jax  # noqa: E402 - before any test starts JAX's backend, as users should
+from verifai_jax.core import figure  # noqa: E402
+
+_plain_figure = figure._figure_class
+
+
+@functools.cache
+def _legible_figure() -> Any:
+    """Return a figure of which no text may be cut off or lie on another when it is written."""
+
+    class Legible(_plain_figure()):
+        def savefig(self, *arguments: Any, **options: Any) -> None:
+            super().savefig(*arguments, **options)
+            found = faults(self) + on_curves(self)
+            assert not found, "a picture that cannot be read: " + "; ".join(found)
+
+    return Legible
+
+
+figure._figure_class = _legible_figure
 
 LONG_FILES = (
     "test_documents.py",

@@ -37,8 +37,9 @@ STANDS_ON = {
     # Neighbours in a layer do not know each other, with these exceptions.
     "statistics": {"core"},
 }
-BESIDE = {"testing", "remote_client", "__init__"}
-"""Files at the root that no room imports: contract suites, a client to copy, the public names."""
+BESIDE = {"testing", "remote_client", "__init__", "__main__"}
+"""Files at the root that no room imports: contract suites, a client to copy, the public names, the
+command line as a module."""
 
 
 def module_name(file: Path) -> str:

@@ -99,3 +99,34 @@ def test_modules_hidden_by_a_function_of_their_name():
     by_others = [pair for pair in hidden if pair[0] != pair[1]]
     assert len(hidden) <= SHADOWED_MODULES, hidden
     assert not by_others, by_others
+
+
+def signed_zeros(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yield lines of format specifications of real numbers that would write `-0`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FormattedValue) and isinstance(node.format_spec, ast.JoinedStr):
+            parts = [
+                p.value if isinstance(p, ast.Constant) else "1" for p in node.format_spec.values
+            ]
+            spec = "".join(map(str, parts))
+            if spec[-1:] in ("e", "f", "g") and "z" not in spec:
+                yield node.lineno, spec
+
+
+def test_no_zero_is_printed_with_a_sign():
+    # `z` makes a zero of what rounds to it: f"{-0.0:zg}" is 0.
+    wrong = [
+        f"{file.relative_to(PACKAGE)}:{line} {spec}"
+        for file in FILES
+        # A client is copied to where Python is older.
+        if file.name != "remote_client.py"
+        for line, spec in signed_zeros(ast.parse(file.read_text()))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_signs_of_zeros_are_noticed():
+    assert list(signed_zeros(ast.parse('f"{a:.3g} {b:z.3g} {c:>3} {d:.{n}f}"'))) == [
+        (1, ".3g"),
+        (1, ".1f"),
+    ]

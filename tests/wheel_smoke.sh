@@ -40,7 +40,7 @@ test -s runs/swing-1/table.parquet
 venv/bin/verifai-jax report runs/swing-1 --traces 2 --no-studies
 test -s runs/swing-1/report.html
 venv/bin/verifai-jax new my_project
-(cd my_project && ../venv/bin/python -m unittest)
+(cd my_project && ../venv/bin/python test_spec.py)
 venv/bin/python -c "
 from importlib.metadata import entry_points
 assert '_verifai_jax_pytest' in [entry.value for entry in entry_points(group='pytest11')]

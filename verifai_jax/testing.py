@@ -387,7 +387,7 @@ def _agree(one: Trace, other: Trace, tolerance: float, law: str) -> None:
         a, b = np.asarray(signal, np.float64), np.asarray(other.signals[name], np.float64)
         size = max(np.max(np.abs(np.nan_to_num(a)), initial=0.0), 1.0)
         assert np.allclose(a, b, rtol=0, atol=tolerance * size, equal_nan=True), (
-            f"{law}: signal {name!r} differs by {np.nanmax(np.abs(a - b)):.3g}"
+            f"{law}: signal {name!r} differs by {np.nanmax(np.abs(a - b)):z.3g}"
         )
 
 

@@ -608,7 +608,11 @@ def test_new_writes_a_project(call, tmp_path):
     assert "cd my_project && verifai-jax falsify spec.py:upright" in output
     for name in ("pendulum.py", "spec.py", "test_spec.py"):
         compile((tmp_path / "my_project" / name).read_text(), name, "exec")
-    assert "# my_project" in (tmp_path / "my_project" / "README.md").read_text()
+    readme = (tmp_path / "my_project" / "README.md").read_text()
+    assert "# my_project" in readme
+    assert "@vj.test" in (tmp_path / "my_project" / "test_spec.py").read_text()
+    # No index has the package: it is installed from where this one was.
+    assert re.search(r"^pip install pytest '(verifai_jax @ file:)?/", readme, re.MULTILINE)
     assert "has .gitignore, README.md" in call("new", "my_project", code=2)
 
 
@@ -616,9 +620,12 @@ def test_new_writes_a_project(call, tmp_path):
 def test_a_new_project_passes_its_tests(call, tmp_path):
     call("new", "my_project")
     place = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, "-m", "unittest"]
-    done = subprocess.run(command, cwd=tmp_path / "my_project", env=place, capture_output=True)
-    assert done.returncode == 0, done.stderr.decode()
+    # By itself, where there is no pytest, and by pytest, which knows `@vj.test`.
+    for command in (["test_spec.py"], ["-m", "pytest", "-p", "no:cacheprovider"]):
+        command = [sys.executable, *command]
+        done = subprocess.run(command, cwd=tmp_path / "my_project", env=place, capture_output=True)
+        assert done.returncode == 0, (done.stdout + done.stderr).decode()
+    assert "2 passed" in done.stdout.decode()
 
 
 @pytest.mark.thorough

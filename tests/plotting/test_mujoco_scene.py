@@ -14,7 +14,8 @@ from PIL import Image, ImageSequence
 import verifai_jax as vj
 from verifai_jax.core.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.plotting import animate
+from verifai_jax.plotting import animate, mujoco_motion
+from verifai_jax.plotting import film as films
 from verifai_jax.plotting import mujoco_scene as scene
 from verifai_jax.plotting.run_pictures import write_replay_pictures
 from verifai_jax.systems.mujoco.system import mujoco
@@ -59,7 +60,7 @@ def seen():
 
 @pytest.fixture(scope="module")
 def motion(seen):
-    return scene.record(seen)
+    return mujoco_motion.record(seen)
 
 
 @pytest.fixture
@@ -98,14 +99,16 @@ def test_what_mjx_simulated_is_recorded_in_mjx():
     row = {"size": 0.2, "wind": 3.0, "vx": 2.0}
     for precision in ("float32", "float64"):
         seen = replay(problem("mjx"), row, jax.random.key(0), 7, precision)
-        motion = scene.record(seen)
+        motion = mujoco_motion.record(seen)
         np.testing.assert_allclose(motion.qpos[:, 0], np.asarray(seen.trace["x"]), rtol=1e-6)
         np.testing.assert_array_equal(motion.pushes[:, 1, 0], 3.0)
 
 
 @pytest.mark.thorough
 def test_the_picture_shows_the_ball_where_it_was(motion, gl):
-    for sample, picture in zip([0, 10], scene.frames(motion, [0, 10], SIZE), strict=True):
+    for sample, picture in zip(
+        [0, 10], scene.frames(motion, [0, 10], SIZE, camera="side"), strict=True
+    ):
         x, z = motion.qpos[sample, 0], 1.5 + motion.qpos[sample, 1]
         right, down, width = red(picture)
         assert right == pytest.approx(FOCAL * x / 4, abs=1.5)
@@ -124,14 +127,14 @@ def test_film_and_strip(motion, gl, tmp_path):
         for frame in ImageSequence.Iterator(image):
             shown.append(image.info["duration"])
             edges.append(np.asarray(frame.convert("RGB"), int)[60, 1])
-    assert image.size == (SIZE[0], SIZE[1] + scene.HEADER)
+    assert image.size == (SIZE[0], SIZE[1] + films.HEADER)
     # Real time, and the end stays.
     assert sum(shown) == 400 + 1500
     # The edge is red on the decisive frame, the last, alone.
     assert edges[-1][0] - edges[-1][1] > 90
     assert edges[-2][0] - edges[-2][1] < 30
     with Image.open(scene.strip(motion, tmp_path / "it.png", count=3, size=(100, 90))) as image:
-        assert image.size == (3 * 100 + 2 * 4, 90 + scene.HEADER)
+        assert image.size == (3 * 100 + 2 * 4, 90 + films.HEADER)
 
 
 def test_a_push_is_an_arrow(motion, gl):
@@ -148,7 +151,7 @@ def test_a_push_is_an_arrow(motion, gl):
 
 def test_a_wind_is_a_push(seen):
     row = {"size": 0.2, "wind": -4.0, "vx": 0.0}
-    pushes = scene.record(replay(seen.problem, row, jax.random.key(0), 0)).pushes
+    pushes = mujoco_motion.record(replay(seen.problem, row, jax.random.key(0), 0)).pushes
     np.testing.assert_array_equal(pushes[:, 1, 0], -4.0)
     assert np.count_nonzero(pushes) == len(pushes)
 
@@ -156,7 +159,7 @@ def test_a_wind_is_a_push(seen):
 def test_a_run_ends_where_it_was_terminated():
     ending = problem(terminate=lambda state, features: state.qpos[1] < -0.1)
     short = replay(ending, {"size": 0.2, "wind": 0.0, "vx": 0.0}, jax.random.key(0), 0)
-    motion = scene.record(short)
+    motion = mujoco_motion.record(short)
     # Euler's step of 0.01 s has fallen 9.81e-4 k (k + 1) / 2 after k: more than 0.1 at k = 14.
     assert len(motion.qpos) == len(motion.clock) == 8
     assert motion.decisive is None
@@ -191,6 +194,8 @@ def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch
 def test_real_settings_draw_or_explain(setting):
     code = f"""
 import mujoco
+from verifai_jax.plotting import film as films
+from verifai_jax.plotting import mujoco_motion
 from verifai_jax.plotting import mujoco_scene as scene
 try:
     with scene.canvas(mujoco.MjModel.from_xml_string({BALL!r}), (32, 32)):

@@ -1,17 +1,27 @@
 """Pictures: that they are drawn at all for odd tables, and what they say of known ones."""
 
 import base64
+import re
 from itertools import combinations
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from legible import faults
 from PIL import Image
 
 import verifai_jax as vj
 from verifai_jax.plotting import plot_features, plot_replay, write_run_pictures
-from verifai_jax.plotting.replay import decisive_instant
+from verifai_jax.plotting.replay import _telling, decisive_instant
 from verifai_jax.plotting.scatter import distinguishing_features
-from verifai_jax.plotting.style import BOUND, SAFE
+from verifai_jax.plotting.style import (
+    BOUND,
+    SAFE,
+    log_ticks,
+    name_points,
+    new_figure,
+    wrap_name,
+)
 
 
 def system(features, key):
@@ -58,7 +68,7 @@ def test_the_decisive_instant_is_marked():
     replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
     assert decisive_instant(problem.formulas["spec"], replay.trace) == ("x", 2)
     texts = [t.get_text() for axes in plot_replay(replay).axes for t in axes.texts]
-    assert any(text.startswith("x = 2.") and text.endswith("at 1 s") for text in texts)
+    assert any(re.fullmatch(r"decided by x = 2\.\d+ at 1 s", text) for text in texts)
 
 
 def pushed(features, key):
@@ -76,8 +86,9 @@ def test_a_replay_shows_inputs_and_the_bounds_of_all_formulas(tmp_path):
     replay = vj.falsify(problem, "uniform", 4, batch=4).replay(0)
     figure = replay.plot()
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["x", "y", "air.wind (input)", "s0", "s1", "s2"]
-    assert "and 4 more, not drawn: s3, s4, s5, s6" in figure.axes[-1].get_xlabel()
+    # The signal s0 does not change, and comes last.
+    assert labels == ["x", "y", "air.wind (input)", "s1", "s2", "s3"]
+    assert "and 4 more, not drawn: s4, s5, s6, s0" in figure.axes[-1].get_xlabel()
     x, drawn = figure.axes[0], figure.axes[2].lines[0]
     assert [text.get_text() for text in x.texts] == ["9 > x", "x < 8", "x < 7", "x > 0.5"]
     assert len({text.xyann for text in x.texts}) == 4
@@ -88,6 +99,41 @@ def test_a_replay_shows_inputs_and_the_bounds_of_all_formulas(tmp_path):
     assert [axes.get_ylabel() for axes in chosen.axes] == ["air.wind (input)", "s5"]
     with pytest.raises(ValueError, match=r"unknown signal .air\.wnd.; did you mean .air\.wind."):
         replay.plot(signals=["air.wnd"])
+
+
+def test_what_moves_is_shown_before_what_stands_and_each_body_once():
+    clock = np.arange(3.0)
+    names = ["ego_x", "ego_speed", "notice", "turning_x", "turning_y", "visible"]
+    curves = dict.fromkeys(names, clock) | {"ego_x": np.full(3, 8.75), "notice": np.ones(3)}
+    ordered = _telling(names, curves, ["gap", "ego_y"])
+    assert ordered == ["turning_x", "visible", "ego_speed", "turning_y", "ego_x", "notice"]
+
+
+def test_names_are_wrapped_and_numbers_on_logarithmic_axes_are_few():
+    assert wrap_name("initial_lateral_offset_of_the_vehicle") == (
+        "initial_lateral_\noffset_of_the_\nvehicle"
+    )
+    assert wrap_name("x") == "x"
+    figure = new_figure(figsize=(4, 3))
+    axes = figure.subplots()
+    axes.set_xscale("log")
+    for low, high in ((0.03, 0.9), (0.2, 0.31), (1e-9, 1.0), (1e-3, 0.02)):
+        axes.set_xlim(low, high)
+        log_ticks(axes.xaxis)
+        assert faults(figure) == []
+
+
+def test_names_of_points_never_lie_on_another():
+    figure = new_figure(figsize=(5, 4))
+    axes = figure.subplots()
+    x = np.array([0.0, 0.0, 0.0, 0.01, 0.5, 0.98])
+    y = np.array([0.0, 0.0, 0.01, 0.0, 0.5, 0.9])
+    axes.set_xlim(0, 1)
+    axes.set_ylim(-0.03, 1)
+    names = ["mass_of_the_trailer", "damping", "road", "wind[3]", "middle", "initial_offset"]
+    name_points(axes, names, x, y, x - 0.05, x + 0.05)
+    assert sorted(text.get_text() for text in axes.texts) == sorted(names)
+    assert faults(figure) == []
 
 
 def ramp(features, key):

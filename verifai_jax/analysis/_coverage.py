@@ -21,6 +21,7 @@ from verifai_jax.analysis.holes import MOST_TREE, largest_hole, uniform_points
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 
 MOST_ROWS = 2000
@@ -39,7 +40,7 @@ MOST_NAMED = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class Coverage(InNotebook):
     """Coverage of the feature space by the rows of a table.
 
     **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
@@ -94,8 +95,8 @@ class Coverage:
         if self.hole is not None:
             where = format_features(dict(list(self.hole.items())[:MOST_NAMED]))
             lines.append(
-                f"largest hole: nothing within {self.dispersion:.2f} in unit coordinates "
-                f"({self.uniform_dispersion:.2f} if uniform) around {where}"
+                f"largest hole: nothing within {self.dispersion:z.2f} in unit coordinates "
+                f"({self.uniform_dispersion:z.2f} if uniform) around {where}"
                 + (", ..." if len(self.hole) > MOST_NAMED else "")
             )
         shares = self.table["occupied"].to_numpy(float)
@@ -242,7 +243,7 @@ def _discrepancy(
 
 def _describe_row(row: dict[Any, Any]) -> str:
     def pair(name: str, value: Any) -> str:
-        return f"{name}={value:g}" if isinstance(value, float) else f"{name}={value}"
+        return f"{name}={value:zg}" if isinstance(value, float) else f"{name}={value}"
 
     words = pair(row["feature"], row["value"])
     return f"{words} with {pair(row['other'], row['other_value'])}" if row["other"] else words
@@ -250,7 +251,7 @@ def _describe_row(row: dict[Any, Any]) -> str:
 
 def _describe_evenness(discrepancy: float) -> str:
     if discrepancy < 0.5:
-        return f"more evenly than uniform samples (discrepancy {discrepancy:.2g} times theirs)"
+        return f"more evenly than uniform samples (discrepancy {discrepancy:z.2g} times theirs)"
     if discrepancy <= 3:
-        return f"as evenly as uniform samples (discrepancy {discrepancy:.2g} times theirs)"
-    return f"more crowded than uniform samples (discrepancy {discrepancy:.3g} times theirs)"
+        return f"as evenly as uniform samples (discrepancy {discrepancy:z.2g} times theirs)"
+    return f"more crowded than uniform samples (discrepancy {discrepancy:z.3g} times theirs)"

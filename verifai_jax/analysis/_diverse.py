@@ -71,10 +71,10 @@ class Diverse:
         shown = ", ".join(map(str, self.rows[:12].tolist())) + ", ..." * (len(self.rows) > 12)
         apart = ""
         if len(self.rows) > 1:
-            apart = f"; they are {self.distances[1:].min():.3g} apart or more"
+            apart = f"; they are {self.distances[1:].min():z.3g} apart or more"
         return (
             f"{len(self.rows)} diverse rows, {self.samples.kind}: {shown}{apart}; "
-            f"every row is within {self.radius:.3g} of one of them"
+            f"every row is within {self.radius:z.3g} of one of them"
         )
 
 

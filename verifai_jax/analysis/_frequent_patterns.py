@@ -139,7 +139,7 @@ class FrequentPatterns:
         single = sizes.count(1)
         lines = [
             f"{_counted(single, 'value')} and {_counted(len(sizes) - single, 'combination')} in at "
-            f"least {self.minimum:.3g} of {self.samples.kind}"
+            f"least {self.minimum:z.3g} of {self.samples.kind}"
         ]
         for column, value in list(self.top.items())[:8]:
             share = self.values.loc[self.values["column"] == column, "share"].max()
@@ -150,7 +150,7 @@ class FrequentPatterns:
             if row.lift > 1:
                 lines.append(
                     f"  {row.combination}: {format_percent(row.share)} of them, "
-                    f"{row.lift:.2f} times the share {against}"
+                    f"{row.lift:z.2f} times the share {against}"
                 )
         return "\n".join(lines)
 
@@ -325,7 +325,7 @@ def _cells(
         labels, edges = [column.near], np.array([column.near, column.near])
     else:
         edges = np.linspace(column.near, column.far, bins + 1)
-        ends = [f"{edge:.4g}" for edge in edges]
+        ends = [f"{edge:z.4g}" for edge in edges]
         labels = [f"[{a}, {b})" for a, b in pairwise(ends)]
         labels[-1] = labels[-1][:-1] + "]"
     codes = np.searchsorted(edges, values, side="right") - 1

@@ -18,6 +18,8 @@ from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 
 MOST_TRAINED = 4000
 MOST_TESTED = 2000
@@ -38,7 +40,7 @@ MOST_NAMED = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Importance:
+class Importance(InNotebook):
     """Losses of a model of the table when a feature is shuffled.
 
     **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
@@ -85,7 +87,7 @@ class Importance:
             losses = self.table[target].to_numpy(float)
             order = [i for i in np.argsort(-losses, kind="stable") if losses[i] >= LEAST_LOSS]
             listed = ", ".join(
-                f"{self.table.index[i]} ({losses[i]:.2f})" for i in order[:MOST_NAMED]
+                f"{self.table.index[i]} ({losses[i]:z.2f})" for i in order[:MOST_NAMED]
             )
             if self.is_reliable(target):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
@@ -98,10 +100,13 @@ class Importance:
 
     def score_words(self, target: str) -> str:
         """Write the score of the model of `"failing"` or `"rho"`."""
-        return f"{SCORES[target]} {self.scores[target]:.2f} on rows kept aside"
+        return f"{SCORES[target]} {self.scores[target]:z.2f} on rows kept aside"
 
 
-def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance:
+@shows_progress("finding importances in")
+def importance(
+    source: Source, *, repeats: int = 5, seed: int = 0, progress: bool | None = None
+) -> Importance:
     """Measure how important each feature is to a model trained on the table; nothing is simulated.
 
     **Arguments:**
@@ -110,6 +115,8 @@ def importance(source: Source, *, repeats: int = 5, seed: int = 0) -> Importance
       verdict.
     - `repeats`: how often each feature is shuffled.
     - `seed`: of all that is drawn at random.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** an `Importance`.
 
@@ -167,7 +174,7 @@ def _unlearnable(target: str, values: np.ndarray) -> str:
         rows = "row" if len(values) == 1 else "rows"
         return f"{len(values)} {rows} with a robustness, too few to learn from"
     elif np.ptp(values) == 0:
-        return f"it is {values[0]:.4g} in every row"
+        return f"it is {values[0]:z.4g} in every row"
     return ""
 
 

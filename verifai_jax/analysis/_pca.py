@@ -35,6 +35,7 @@ from verifai_jax.analysis.data.samples import (
 from verifai_jax.core.checks import check_count, check_positive
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -52,7 +53,7 @@ _REDRAWS = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Components:
+class Components(InNotebook):
     """Principal components of the ordered features of `samples`, the strongest first.
 
     **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
@@ -216,7 +217,7 @@ class Components:
         for i, direction in enumerate(self.directions[:TOLD]):
             order = np.argsort(-np.abs(direction), kind="stable")
             parts = [
-                f"{direction[j]:+.2f} {self.names[j]}" for j in order if _matters(direction[j])
+                f"{direction[j]:+z.2f} {self.names[j]}" for j in order if _matters(direction[j])
             ]
             rest = ", ..." if len(parts) > 4 else ""
             chance = "" if i < self.telling else ", no more than chance"

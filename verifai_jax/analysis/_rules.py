@@ -25,6 +25,7 @@ from verifai_jax.analysis.trees import propose_regions
 from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
@@ -84,7 +85,7 @@ class Rule:
 
 
 @dataclass(frozen=True, eq=False)
-class Rules:
+class Rules(InNotebook):
     """Rules that together describe where a system fails, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
@@ -422,6 +423,6 @@ def _measured(
 
 def _describe_precision(rate: Rate) -> str:
     return (
-        f"precision {rate.estimate:.2f} ({rate.failures:,} of {rate.simulations:,}; "
-        f"{rate.confidence * 100:g} % interval {rate.low:.2f} to {rate.high:.2f})"
+        f"precision {rate.estimate:z.2f} ({rate.failures:,} of {rate.simulations:,}; "
+        f"{rate.confidence * 100:zg} % interval {rate.low:z.2f} to {rate.high:z.2f})"
     )

@@ -210,4 +210,4 @@ def _put(entries: tuple, j: int, entry: object) -> tuple:
 
 
 def _number(value: float) -> str:
-    return f"{value:.12g}"
+    return f"{value:z.12g}"

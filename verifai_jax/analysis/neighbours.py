@@ -74,7 +74,7 @@ class Neighbours:
     def __str__(self) -> str:
         shown = ", ".join(map(str, self.rows[:12].tolist())) + ", ..." * (len(self.rows) > 12)
         reach = np.max(self.distances, initial=0)
-        far = f"; the farthest is {reach:.3g} away" if np.isfinite(reach) and reach > 0 else ""
+        far = f"; the farthest is {reach:z.3g} away" if np.isfinite(reach) and reach > 0 else ""
         return f"{self.how}, {self.samples.kind}: rows {shown}{far}"
 
 

@@ -28,6 +28,7 @@ from verifai_jax.analysis.data.verdicts import unconfirmed
 from verifai_jax.core.errors import unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features, one_line, printable
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
@@ -150,17 +151,22 @@ class Analysis:
             parts.append(f"<h4>{html.escape(part.title)}</h4><p>{words}</p>")
             table = getattr(part.result, "table", None)
             if table is not None and len(table):
-                parts.append(table.head(10).to_html(float_format=lambda x: f"{x:.3g}"))
+                parts.append(table.head(10).to_html(float_format=lambda x: f"{x:z.3g}"))
         return "\n".join(parts)
 
 
-def analyze(source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0) -> Analysis:
+@shows_progress("analyzing")
+def analyze(
+    source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0, progress: bool | None = None
+) -> Analysis:
     """Apply every analysis of the error table that fits it, and say why others do not.
 
     **Arguments:**
 
     - `source`: a run, its table, or a DataFrame with feature columns.
     - `seed`: of all that is drawn at random.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** an `Analysis`.
 
@@ -223,7 +229,7 @@ def _describe_failures(source: object, samples: Samples) -> str:
         more = ", ..." if len(samples.names) > MOST_NAMED else ""
         lines.append(
             f"{'worst' if failures else 'nearest'}: row {samples.rows[place]}, "
-            f"robustness {samples.rho[place]:.4g} at {where}{more}"
+            f"robustness {samples.rho[place]:z.4g} at {where}{more}"
         )
     return "\n".join(lines)
 

@@ -23,6 +23,7 @@ from verifai_jax.core.errors import check_names, unknown_name
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import reproducible_settings
 from verifai_jax.statistics.paired import PairedDifference
 
@@ -31,7 +32,7 @@ TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
 
 
 @dataclass(frozen=True, eq=False)
-class Augmentation:
+class Augmentation(InNotebook):
     """The result of `augment`.
 
     - `task`: what was trained.

@@ -110,7 +110,7 @@ class Study:
         row = {key: value.item() for key, value in entry.items()}
         self.rows.append({"arm": arm, "seed": number, **row})
         self.added.append(decode_frame(added).assign(arm=arm, seed=number))
-        self.bar.advance(1, f"seed {number}, {arm}: error {100 * row['error']:.3g} %")
+        self.bar.advance(1, f"seed {number}, {arm}: error {100 * row['error']:z.3g} %")
 
     def result(self, arms: Sequence[str], confidence: float, complete: bool) -> Augmentation:
         """Return what is finished."""

@@ -90,7 +90,7 @@ def _gain(outcome: Outcome, metric: str) -> list[str]:
         return []
     guided, blind = (-d.mean for d in found if d is not None)
     return [
-        f"Counterexamples lower the mean {_label(metric)} {guided / blind:.2g} times as much as "
+        f"Counterexamples lower the mean {_label(metric)} {guided / blind:z.2g} times as much as "
         "random inputs do, both against none."
     ]
 
@@ -130,14 +130,14 @@ def _table_lines(outcome: Outcome) -> list[str]:
     """Write the table of arms: means, and differences against none and random."""
     means = outcome.means
     references = [arm for arm in REFERENCES if arm in outcome.arms]
-    sure = f"{100 * outcome.confidence:g} % t interval"
+    sure = f"{100 * outcome.confidence:zg} % t interval"
     head = ["arm", "added", *(_label(m) for m in outcome.metrics)]
     head += [f"error against {reference} ({sure})" for reference in references]
     differences = {r: _differences(outcome, "error", r) for r in references}
     rows = [head]
     for arm in means.index:
         mean = means.loc[arm]
-        row = [str(arm), "-" if np.isnan(mean["added"]) else f"{mean['added']:,.0f}"]
+        row = [str(arm), "-" if np.isnan(mean["added"]) else f"{mean['added']:z,.0f}"]
         row += [_value(metric, float(mean[metric])) for metric in outcome.metrics]
         row += [_difference(differences[r].get(str(arm))) for r in references]
         rows.append(row)
@@ -181,10 +181,10 @@ def _differences(outcome: Outcome, metric: str, reference: str) -> dict[str, Pai
 def _difference(difference: PairedDifference | None) -> str:
     if difference is None or not difference.pairs:
         return "-"
-    mean = f"{100 * difference.mean:+.2f} points"
+    mean = f"{100 * difference.mean:+z.2f} points"
     if not math.isfinite(difference.low):
         return mean
-    return f"{mean} ({100 * difference.low:+.2f} to {100 * difference.high:+.2f})"
+    return f"{mean} ({100 * difference.low:+z.2f} to {100 * difference.high:+z.2f})"
 
 
 def _label(metric: str) -> str:
@@ -194,11 +194,11 @@ def _label(metric: str) -> str:
 def _value(metric: str, value: float) -> str:
     if math.isnan(value):
         return "-"
-    return format_percent(value) if metric in SHARES else f"{value:.4g}"
+    return format_percent(value) if metric in SHARES else f"{value:z.4g}"
 
 
 def _size(metric: str, value: float) -> str:
-    return f"{100 * value:.2f} points" if metric in SHARES else f"{value:.3g}"
+    return f"{100 * value:z.2f} points" if metric in SHARES else f"{value:z.3g}"
 
 
 def _span(values: np.ndarray) -> str:

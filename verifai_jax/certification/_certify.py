@@ -21,6 +21,7 @@ from verifai_jax.core.checks import check_count, check_fraction
 from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
+from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -40,6 +41,7 @@ ProgressReport = Callable[[int, int, str], None]
 
 
 @suggests_options
+@shows_progress("certifying")
 def certify(
     problem_of: Callable[[Any], Problem],
     policies: Sequence[Any],
@@ -53,7 +55,7 @@ def certify(
     attack_simulations: int = 256,
     tie: float | None = None,
     remember: Remember | None = None,
-    progress: ProgressReport | None = None,
+    progress: ProgressReport | bool | None = None,
     devices: Sequence[Any] | None = None,
     executor: Executor | None = None,
 ) -> Certificates:
@@ -79,7 +81,9 @@ def certify(
       less: as fine as takes about as many samples again as all policies have at least.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
       gives, or gave under this key.
-    - `progress(done, total, text)`: called with the simulations so far. `total` may not be reached.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere. A function `(done, total, text)` is called instead, with the
+      simulations so far; `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
     - `executor`: whose workers simulate, as in `falsify`; the certificates are the same.
 
@@ -256,7 +260,7 @@ def _columns(space: FeatureSpace, u: np.ndarray) -> dict[str, np.ndarray]:
 class _Report:
     """Progress of both stages, counted in simulations."""
 
-    def __init__(self, progress: ProgressReport | None, attacks: int, budget: int) -> None:
+    def __init__(self, progress: ProgressReport | bool | None, attacks: int, budget: int) -> None:
         self._progress, self._total, self._done = progress, attacks + budget, 0
 
     def attacked(self, simulations: int) -> None:
@@ -267,7 +271,8 @@ class _Report:
 
     def _call(self, simulations: int, text: str) -> None:
         self._done += simulations
-        if self._progress is not None:
+        say_done(self._done, self._total, text)
+        if callable(self._progress):
             self._progress(self._done, self._total, text)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import Rate
 from verifai_jax.statistics.confidence_sequences import UNSAFE, safe_at
@@ -59,12 +60,12 @@ class Certificate:
         if self.not_finite:
             text += f"; {self.not_finite} of them gave no verdict"
         if np.isfinite(self.worst_robustness):
-            text += f"; worst robustness {self.worst_robustness:.4g}"
+            text += f"; worst robustness {self.worst_robustness:z.4g}"
         return text
 
 
 @dataclass(frozen=True, eq=False)
-class Certificates:
+class Certificates(InNotebook):
     """The certificates of all policies; `certificates[i]` is the `Certificate` of policy i.
 
     **Fields:** `p` and `confidence` of the verdicts: with this probability no interval of any
@@ -156,12 +157,12 @@ class Certificates:
         lines = [
             f"certificates of {len(self.rows)} policies for {self.problem}: {len(self.safe)} "
             f"{safe_at(self.p)}, {len(self.unsafe)} unsafe, {open_} undecided "
-            f"(all are right with {self.confidence * 100:g} %)"
+            f"(all are right with {self.confidence * 100:zg} %)"
         ]
         if self.safest is not None and self.chance is not None:
             lines.append(
                 f"  safest: policy {self.safest}, {self._chance(self.chance)} that none is better "
-                f"by more than {self.tie:.2g}"
+                f"by more than {self.tie:z.2g}"
             )
         # The safe ones first, then the least failing.
         order = sorted(self.rows, key=lambda row: (_rank(row, self.p), row.number))
@@ -176,7 +177,7 @@ class Certificates:
         )
         lines.append(
             f"  {self.simulations:,} samples{equal}; {self.attacks:,} more in the attack; "
-            f"{self.seconds:.1f} s, stopped: {self.stopped}"
+            f"{self.seconds:z.1f} s, stopped: {self.stopped}"
         )
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)

@@ -220,7 +220,7 @@ def _describe_saved(path: Path) -> str:
     """Write a saved counterexample: what departs from nominal, or all of its features."""
     saved = SavedCounterexample.read(path)
     robustness = ", ".join(
-        f"{value:.4g}" for value in saved.robustness.values() if value is not None
+        f"{value:z.4g}" for value in saved.robustness.values() if value is not None
     )
     if saved.changed is None:
         lines = [f"  counterexample, robustness {robustness}: {format_features(saved.features)}"]
@@ -236,7 +236,7 @@ def _change(nominal: object, value: object) -> str:
 
 
 def _short(value: object) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{value:z.6g}" if isinstance(value, float) else str(value)
 
 
 def least_budget(probability: float, confidence: float) -> int:

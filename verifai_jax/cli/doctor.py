@@ -247,4 +247,4 @@ def _cache_state() -> str:
         )
     files = [path for path in folder.glob("*") if path.is_file()]
     size = sum(path.stat().st_size for path in files) / 1e6
-    return f"{folder} ({len(files)} files, {size:.1f} MB); VERIFAI_JAX_CACHE=off switches it off"
+    return f"{folder} ({len(files)} files, {size:z.1f} MB); VERIFAI_JAX_CACHE=off switches it off"

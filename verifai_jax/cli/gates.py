@@ -34,7 +34,7 @@ class Gate(NamedTuple):
     bound: float | None = None
 
     def __str__(self) -> str:
-        return self.name if self.bound is None else f"{self.name}>{self.bound:g}"
+        return self.name if self.bound is None else f"{self.name}>{self.bound:zg}"
 
 
 class GateType(click.ParamType):

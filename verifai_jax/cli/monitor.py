@@ -87,7 +87,7 @@ def monitor(
             advice = "Use --end hold or --end truncate, or a longer recording"
             raise ValueError(f"{error.fact}. {advice}") from None
         except mtl.SamplingError as error:
-            advice = f"Resample it: --resample {error.dt:g} --method hold (or linear)"
+            advice = f"Resample it: --resample {error.dt:zg} --method hold (or linear)"
             raise ValueError(f"{error.fact}. {advice}") from None
         try:
             holds = bool(mtl.satisfied(parsed, trace, end, compat))
@@ -95,7 +95,7 @@ def monitor(
             if math.isnan(rho):
                 raise CommandError(str(error), BROKEN) from None
             raise
-        click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:.10g}")
+        click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}")
         for note in trace.notes:
             if any(repr(name) in note for name in parsed.signals()):
                 click.echo(f"note: {printable(note)}")

@@ -67,15 +67,15 @@ def monitor_stream(
             state, bounds = step(state, sample.signals)
             low, high, least, most = (float(bound) for bound in bounds)
             if least > 0 or most < 0:
-                verdict = f"holds, with robustness at least {low:.10g}"
+                verdict = f"holds, with robustness at least {low:z.10g}"
                 if most < 0:
-                    verdict = f"fails, with robustness at most {high:.10g}"
+                    verdict = f"fails, with robustness at most {high:z.10g}"
                 show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
                 return least > 0
         rho, holds = (float(value) for value in finish(state))
     show(
         f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "
-        f"{'holds' if holds > 0 else 'fails'} with robustness {rho:.10g}"
+        f"{'holds' if holds > 0 else 'fails'} with robustness {rho:z.10g}"
     )
     return holds > 0
 

@@ -1,6 +1,8 @@
 """`verifai-jax new my_project`: a small project that works, to be changed into one's own."""
 
-from importlib import resources
+import contextlib
+import json
+from importlib import metadata, resources
 from pathlib import Path
 
 import click
@@ -33,8 +35,27 @@ def new(folder: Path) -> None:
     templates = resources.files("verifai_jax.cli").joinpath("new_project")
     for name, template in FILES.items():
         text = templates.joinpath(template).read_text(encoding="utf-8")
-        text = text.replace("$name", folder.resolve().name)
+        text = text.replace("$name", folder.resolve().name).replace("$package", _package())
         (folder / name).write_text(text, encoding="utf-8")
     give_result(folder=folder, files=list(FILES))
     click.echo(f"  written      {folder}")
     click.echo(f"  next         cd {folder} && verifai-jax falsify spec.py:upright")
+
+
+def _package() -> str:
+    """Return what pip installs this package from: what this installation was made of.
+
+    Only a package that came from an index is found there by its name.
+    """
+    origin: dict[str, object] = {}
+    with contextlib.suppress(metadata.PackageNotFoundError, ValueError, TypeError):
+        text = metadata.distribution("verifai_jax").read_text("direct_url.json")
+        origin = json.loads(text or "{}")
+    url = origin.get("url")
+    if not url:
+        checkout = Path(__file__).resolve().parents[2]
+        return f"'{checkout}'" if (checkout / "pyproject.toml").exists() else "verifai_jax"
+    version = origin.get("vcs_info")
+    if isinstance(version, dict):
+        url = f"{version['vcs']}+{url}@{version['commit_id']}"
+    return f"'verifai_jax @ {url}'"

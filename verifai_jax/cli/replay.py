@@ -59,13 +59,13 @@ def replay(
     for name in run.table.features:
         value = stored[name]
         number_like = isinstance(value, (int, float)) or hasattr(value, "dtype")
-        text = f"{value:.6g}" if number_like else one_line(str(value))
+        text = f"{value:z.6g}" if number_like else one_line(str(value))
         click.echo(f"  {printable(name):<12} {text}")
     for name, rho in again.rho.items():
         click.echo(f"  {printable(run.formulas[name])}")
         # With several formulas `rho` is the least, and each has a column of its own.
         before = stored.get(f"rho.{name}", stored["rho"])
-        click.echo(f"    robustness {rho:.6g} in {precision}, {before:.6g} in the table")
+        click.echo(f"    robustness {rho:z.6g} in {precision}, {before:z.6g} in the table")
     verdict = "violated" if again.violated else "satisfied"
     click.echo(f"  status {again.status.name.lower()}; {verdict}")
     give_result(

@@ -250,7 +250,7 @@ def _format_table(result: "Sweep") -> str:
     some: Any = table.iloc[order[:_MOST_ROWS]][columns]
     if (some["status"] == "trained").all():
         some = some.drop(columns="status")
-    text = some.to_string(float_format=lambda value: f"{value:.4g}", max_colwidth=40)
+    text = some.to_string(float_format=lambda value: f"{value:z.4g}", max_colwidth=40)
     left = len(table) - len(some)
     text = printable(text)
     return text if not left else f"{text}\n  and {left} more in the table"

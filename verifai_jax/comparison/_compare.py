@@ -24,6 +24,7 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.revisions import load_at_revision, split_revision
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.backends import resolved
@@ -42,6 +43,7 @@ BATCH = 512
 
 @suggests_options
 @reproducible_settings()
+@shows_progress("comparing")
 def compare(
     baseline: Problem | str,
     candidates: Problem | str | Mapping[str, Problem | str],
@@ -52,6 +54,7 @@ def compare(
     seed: int = 0,
     max_seconds: float | None = None,
     precision: str = "float32",
+    progress: bool | None = None,
     executor: Executor | None = None,
 ) -> Comparison:
     """Compare failure rates of problems on common random samples, and stop when it is decided.
@@ -72,6 +75,8 @@ def compare(
     - `seed`: of the samples; the same seed gives the same pairs.
     - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
     - `precision`: as in `falsify`.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
     - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
 
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.

@@ -9,6 +9,7 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.features import FeatureSpace
 from verifai_jax.statistics.paired_rates import PairedRates
@@ -60,7 +61,7 @@ class Compared:
 
     def __str__(self) -> str:
         rates, words = self.rates, self.verdict.upper()
-        margin = "" if not self.margin else f" (margin {100 * self.margin:g} points)"
+        margin = "" if not self.margin else f" (margin {100 * self.margin:zg} points)"
         first = rates.only_first + self.both
         second = rates.only_second + self.both
         known = rates.pairs - rates.undecided
@@ -79,7 +80,7 @@ class Compared:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class Comparison(InNotebook):
     """Candidates against a baseline on common samples, as `compare` returns them.
 
     - `baseline`: its name.
@@ -144,7 +145,7 @@ class Comparison:
         lines = [f"against {self.baseline}, on the same samples{together}"]
         lines += [f"  {candidate}" for candidate in self.candidates]
         lines.append(
-            f"  {self.simulations:,} simulations in {self.seconds:.1f} s, seed {self.seed}; "
+            f"  {self.simulations:,} simulations in {self.seconds:z.1f} s, seed {self.seed}; "
             f"stopped: {self.stopped}"
         )
         lines += [f"  note: {note}" for note in self.notes]

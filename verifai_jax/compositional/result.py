@@ -15,6 +15,7 @@ import pandas as pd
 from verifai_jax.compositional.region import FAILS_ANYWAY, NO_VERDICT, SAFE, UNCERTAIN
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_features, format_percent
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification import Run
@@ -26,7 +27,7 @@ FOUND, BUDGET, NOTHING, INTERRUPTED = "found", "budget", "nothing uncertain", "i
 
 
 @dataclass(frozen=True, eq=False)
-class Compositional:
+class Compositional(InNotebook):
     """The result of `vj.perception.abstract`.
 
     - `name`: of the problem.
@@ -155,8 +156,8 @@ class Compositional:
         if len(uncertain):
             severity = uncertain["severity"].quantile([0.0, 0.5]).to_numpy()
             lines.append(
-                f"               least error that fails: {severity[0]:.3g} of the worst at the "
-                f"least, {severity[1]:.3g} in the median"
+                f"               least error that fails: {severity[0]:z.3g} of the worst at the "
+                f"least, {severity[1]:z.3g} in the median"
             )
         if silent := list(uncertain["erring"]).count(0):
             lines.append(

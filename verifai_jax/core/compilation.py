@@ -179,7 +179,7 @@ def describe_compilation() -> str:
         return ""
     names = dict.fromkeys(name for name, _ in running)
     seconds = time.perf_counter() - min(began for _, began in running)
-    return f"compiling {' and '.join(names)}, {seconds:.0f} s"
+    return f"compiling {' and '.join(names)}, {seconds:z.0f} s"
 
 
 @cache

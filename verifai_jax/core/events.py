@@ -150,7 +150,7 @@ class Events:
         )
         if not known or np.ndim(self.kinds) != 1:
             return f"Events of {', '.join(self.names)}"
-        shown = ", ".join(f"{event['kind']} at {event['time']:.4g} s" for event in self.listed())
+        shown = ", ".join(f"{event['kind']} at {event['time']:z.4g} s" for event in self.listed())
         return f"Events({shown or 'none'})"
 
 

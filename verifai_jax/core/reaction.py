@@ -72,7 +72,7 @@ class Reaction:
         names = ", ".join(name for name, _, _ in self.inputs)
         kind = f"{self.hidden} hidden units" if self.hidden else "affine"
         low, high = self.bounds
-        return f"Reaction({names}; {kind}, from {low:g} to {high:g})"
+        return f"Reaction({names}; {kind}, from {low:zg} to {high:zg})"
 
 
 def parameter_count(inputs: int, hidden: int) -> int:

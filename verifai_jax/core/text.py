@@ -18,7 +18,7 @@ def format_percent(share: float) -> str:
     # Between 99.95 and 100 three digits would round to 100.
     if 99.95 <= percent < 100:
         return ">99.9 %"
-    return f"{percent:.3g} %"
+    return f"{percent:z.3g} %"
 
 
 def format_time(seconds: float, digits: int = 6) -> str:
@@ -27,7 +27,7 @@ def format_time(seconds: float, digits: int = 6) -> str:
     A few digits suffice up to 1000 s; of later instants the microseconds are kept.
     """
     if abs(seconds) < 1000 or not math.isfinite(seconds):
-        return f"{seconds:.{digits}g}"
+        return f"{seconds:z.{digits}g}"
     return repr(round(float(seconds), 6)).removesuffix(".0")
 
 
@@ -72,7 +72,7 @@ def _is_real(value: object) -> bool:
 
 
 def _format_value(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float | np.floating) else str(value)
+    return f"{value:z.4g}" if isinstance(value, float | np.floating) else str(value)
 
 
 def format_error(error: BaseException) -> str:

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Int, Real
 
 from verifai_jax.core.gaps import known_times, with_gaps
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_time
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Status(enum.IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Trace(InNotebook):
     """Signals of one simulation, sampled on one clock.
 
     **Arguments:**
@@ -82,6 +83,10 @@ class Trace:
     or a status that is none, and for masked sample times; `TypeError` for signals that hold no
     real numbers.
     """
+
+    _internal = frozenset((
+        "between", "between_until", "finite", "held", "hold", "stride",
+    ))  # fmt: skip
 
     signals: Mapping[str, Samples]
     dt: float | None = None
@@ -271,7 +276,7 @@ class Trace:
         """Return the number of samples, the clock, and how it ended."""
         count = f"{self.length} sample{'s' * (self.length != 1)}"
         if self.dt is not None:
-            text = f"{count} every {self.dt:g} s"
+            text = f"{count} every {self.dt:zg} s"
         else:
             known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
             text = count
@@ -296,8 +301,8 @@ def check_period(dt: float) -> None:
     least = float(np.finfo(np.float32).tiny)
     if not least <= dt < math.inf:
         raise ValueError(
-            f"the sampling period dt must be a finite number of seconds, at least {least:.3g}, the "
-            f"least in single precision; got {dt}"
+            f"the sampling period dt must be a finite number of seconds, at least {least:z.3g}, "
+            f"the least in single precision; got {dt}"
         )
 
 
@@ -359,7 +364,7 @@ def _range(signal: Samples, valid: Leaf) -> str:
         return f"{text}not finite"
     low, high = float(finite.min()), float(finite.max())
     some = "" if finite.size == values.size else ", not finite in places"
-    return f"{text}{f'{low:.4g}' if low == high else f'{low:.4g} to {high:.4g}'}{some}"
+    return f"{text}{f'{low:z.4g}' if low == high else f'{low:z.4g} to {high:z.4g}'}{some}"
 
 
 _CHILDREN = ("times", "valid", "status", "between")

@@ -74,8 +74,8 @@ class Waveform:
         duration = check_duration(duration)
         if self.times is not None and self.times[-1] > duration * (1 + 1e-6):
             raise ValueError(
-                f"the times of a Signal must lie in its duration of {duration:g} s; "
-                f"got {self.times[-1]:g}"
+                f"the times of a Signal must lie in its duration of {duration:zg} s; "
+                f"got {self.times[-1]:zg}"
             )
         return replace(self, duration=duration)
 
@@ -146,7 +146,7 @@ class Waveform:
         return xp.where(on.reshape(on.shape + (1,) * (knots.ndim - 1)), knots[piece], 0)
 
     def __repr__(self) -> str:
-        over = "" if self.duration is None else f", over {self.duration:g} s"
+        over = "" if self.duration is None else f", over {self.duration:zg} s"
         at = "" if self.times is None else f" at {_listed(self.times)} s"
         return f"Waveform({self._outline()}{at}, {self.hold}{over})"
 
@@ -163,7 +163,9 @@ class Waveform:
             return text
         values = np.asarray(self.knots, np.float64)
         low, high = values.min(), values.max()
-        return f"{text}, all {low:.4g}" if low == high else f"{text} from {low:.4g} to {high:.4g}"
+        return (
+            f"{text}, all {low:z.4g}" if low == high else f"{text} from {low:z.4g} to {high:z.4g}"
+        )
 
     def refined(self, factor: int) -> "Waveform":
         """Return the same function by more control points; see `Signal.refined`."""
@@ -344,7 +346,7 @@ def acting_spans(
 
 
 def _listed(times: tuple[float, ...]) -> str:
-    shown = ", ".join(f"{time:g}" for time in times[:6])
+    shown = ", ".join(f"{time:zg}" for time in times[:6])
     return f"[{shown}{', ...' if len(times) > 6 else ''}]"
 
 

@@ -17,6 +17,8 @@ import pandas as pd
 from jaxtyping import Float
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.selection import Row
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmation import Confirmer
@@ -40,7 +42,7 @@ Simulator: TypeAlias = Callable[..., Any] | Problem | str | None
 
 
 @dataclass(frozen=True, repr=False)
-class Confirmation:
+class Confirmation(InNotebook):
     """The verdict of finer replays on one counterexample.
 
     **Fields:**
@@ -79,7 +81,7 @@ class Confirmation:
         if self.why and self.why not in self.notes:
             text += f": {self.why}"
         words = {"as_run": f"as run ({self.precision})", **IN_WORDS}
-        values = [f"{rho:.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
+        values = [f"{rho:z.4g} {words[n]}" for n, rho in self.rho.items() if not np.isnan(rho)]
         text += f". Robustness {', '.join(values)}" if values else ""
         text = ". ".join([text, *(note[0].upper() + note[1:] for note in self.notes)]) + "."
         return "\n".join([*(each for each in (self.changed, self.finding) if each), text])
@@ -88,7 +90,7 @@ class Confirmation:
 
 
 @dataclass(frozen=True, eq=False)
-class Confirmations:
+class Confirmations(InNotebook):
     """The verdicts of finer replays on all counterexamples of a run.
 
     **Fields:**
@@ -151,7 +153,7 @@ class Confirmations:
             worst = self.confirmed["rho"].idxmin()
             lines.append(
                 f"  the worst confirmed is row {worst}, robustness "
-                f"{self.confirmed.loc[worst, 'rho']:.4g}: run.replay({worst}) shows it"
+                f"{self.confirmed.loc[worst, 'rho']:z.4g}: run.replay({worst}) shows it"
             )
         return "\n".join(lines)
 
@@ -160,7 +162,12 @@ class Confirmations:
 
 @overload
 def confirm(
-    run: Run, row: None = None, *, simulator: Simulator = None, most: int | None = None
+    run: Run,
+    row: None = None,
+    *,
+    simulator: Simulator = None,
+    most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmations: ...
 @overload
 def confirm(
@@ -169,14 +176,17 @@ def confirm(
     *,
     simulator: Simulator = None,
     most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmation: ...
 @suggests_options
+@shows_progress("confirming", "replays")
 def confirm(
     run: Run,
     row: Row = None,
     *,
     simulator: Simulator = None,
     most: int | None = None,
+    progress: bool | None = None,
 ) -> Confirmation | Confirmations:
     """Replay counterexamples more finely than they were found, and decide which are real.
 
@@ -190,6 +200,8 @@ def confirm(
     - `most`: how many rows are replayed at least, by default 256, and more where a row takes few
       replays; of more, the worst and those nearest to zero, until the rest
       is far from it (see `confirmation.Confirmer`).
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
 
@@ -288,7 +300,7 @@ def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
     if not values["violated"]:
         raise ValueError(
             f"{which} is no counterexample: it keeps the property with robustness "
-            f"{values['rho']:.4g}; confirm(run) checks those that do not"
+            f"{values['rho']:z.4g}; confirm(run) checks those that do not"
         )
 
 

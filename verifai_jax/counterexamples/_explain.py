@@ -22,7 +22,9 @@ from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.description import describe
 from verifai_jax.counterexamples.fixed_key import fix_key
@@ -39,7 +41,7 @@ MATTERS = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
+class Explained(InNotebook):
     """Reasons of a failure; `str()` is a paragraph, `plot` a picture.
 
     **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:
@@ -90,7 +92,14 @@ class Explained:
 
 
 @suggests_options
-def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = None) -> Explained:
+@shows_progress("explaining a counterexample of")
+def explain(
+    run: Run,
+    row: Row = None,
+    *,
+    nominal: Mapping[str, Any] | None = None,
+    progress: bool | None = None,
+) -> Explained:
     """Explain a counterexample: the predicate that decides, when, and the features that matter.
 
     **Arguments:**
@@ -98,6 +107,8 @@ def explain(run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = No
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of one, or a row of the table; the worst when left out.
     - `nominal`: features that are ordinary, where the problem does not say or others are meant.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     Takes one simulation for each feature and each unit coordinate, and one gradient. Without
     nominal features only the gradient tells what matters.

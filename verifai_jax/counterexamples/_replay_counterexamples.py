@@ -13,6 +13,8 @@ import numpy as np
 
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.sources import Change, Sources
 from verifai_jax.core.text import format_error, one_line
 from verifai_jax.core.trace import Status
@@ -60,7 +62,7 @@ class ReplayedCounterexample:
 
 
 @dataclass(frozen=True, eq=False)
-class CorpusReplay:
+class CorpusReplay(InNotebook):
     """The files of a corpus, replayed against a problem, as `replay_counterexamples` returns them.
 
     - `problem`: its name.
@@ -116,8 +118,8 @@ class CorpusReplay:
         for one in self.replayed:
             if one.state == OTHER:
                 continue
-            robustness = "" if np.isnan(one.robustness) else f", robustness {one.robustness:.4g}"
-            before = f" (was {one.before:.4g})" if robustness else ""
+            robustness = "" if np.isnan(one.robustness) else f", robustness {one.robustness:z.4g}"
+            before = f" (was {one.before:z.4g})" if robustness else ""
             note = f": {one.note}" if one.note else ""
             lines.append(f"  {one.path.name}  {one.state}{robustness}{before}{note}")
         if others := len(self.of(OTHER)):
@@ -128,11 +130,13 @@ class CorpusReplay:
 
 
 @suggests_options
+@shows_progress("replaying the counterexamples of", "replays")
 def replay_counterexamples(
     problem: Problem,
     folder: str | Path,
     *,
     rename: Mapping[str, str] | None = None,
+    progress: bool | None = None,
 ) -> CorpusReplay:
     """Simulate the counterexamples of a corpus again, all in one batch.
 
@@ -145,6 +149,8 @@ def replay_counterexamples(
     - `problem`: as it is now.
     - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
     - `rename`: new names of features by their old ones.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
     is no `Problem`.
@@ -216,7 +222,7 @@ def _replay_batch(
             if state == FAILING and again is not None and not bool(again.violated[i]):
                 state = WITHOUT_VERDICT
                 notes.append(
-                    f"simulated again it has robustness {float(np.min(again.rho[i])):.4g}: the "
+                    f"simulated again it has robustness {float(np.min(again.rho[i])):z.4g}: the "
                     "system has memory or chance of its own"
                 )
         else:

@@ -24,6 +24,8 @@ from verifai_jax.core.events import Events
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
@@ -61,7 +63,7 @@ class Step(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shrunk:
+class Shrunk(InNotebook):
     """The least departure from nominal found to fail.
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
@@ -129,15 +131,15 @@ class Shrunk:
         name = self.problem.name
         if not self.count:
             lines = [
-                f"{name}: the nominal features fail themselves, with robustness {self.rho:.4g}; "
+                f"{name}: the nominal features fail themselves, with robustness {self.rho:z.4g}; "
                 "there is nothing to shrink"
             ]
         else:
             lines = [
                 f"{name}: {_of(self.count, d)} away from nominal "
                 f"{'is' if self.count == 1 else 'are'} enough for a failure, by "
-                f"{self.distance:.3g} of {'its' if self.count == 1 else 'their'} range "
-                f"(robustness {self.rho:.3g})"
+                f"{self.distance:z.3g} of {'its' if self.count == 1 else 'their'} range "
+                f"(robustness {self.rho:z.3g})"
             ]
             names = self.labels
             width = max(map(len, names))
@@ -154,7 +156,7 @@ class Shrunk:
             lines.append(f"  {self._breaks()}")
         lines.append(
             f"  row {self.row} departed in {_of(self.start_count, d)}, by "
-            f"{self.start_distance:.3g}; {self.simulations} simulations"
+            f"{self.start_distance:z.3g}; {self.simulations} simulations"
         )
         lines += [f"  note: {note}" for note in self.notes]
         warnings = [text for text in (self.model_changed, self.finding) if text]
@@ -171,6 +173,7 @@ class Shrunk:
 
 
 @suggests_options
+@shows_progress("shrinking a counterexample of")
 def shrink(
     run: Run,
     row: Row = None,
@@ -181,6 +184,7 @@ def shrink(
     seed: int = 0,
     others: bool = True,
     stay: bool = False,
+    progress: bool | None = None,
 ) -> Shrunk:
     """Search the least departure from the nominal features that still fails.
 
@@ -202,6 +206,8 @@ def shrink(
     - `others`: whether other counterexamples of the run are looked at too.
     - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
       that failures of several kinds are shrunk each by itself.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     All simulations have the random key of the row. The result was simulated alone and failed, in
     the precision of the run, and in float64 too unless the system draws random numbers or is a
@@ -222,7 +228,7 @@ def shrink(
     original = run.compared(replay(problem, first, key, number, run.precision))
     if not original.violated:
         reason = (
-            f"robustness {min(original.rho.values()):.4g}"
+            f"robustness {min(original.rho.values()):z.4g}"
             if original.status == 0
             else original.status.name
         )
@@ -526,11 +532,11 @@ def _of(count: int, d: int) -> str:
 
 
 def _events(events: Events) -> str:
-    each = [f"{event['kind']} at {event['time']:.4g} s" for event in events.listed()]
+    each = [f"{event['kind']} at {event['time']:z.4g} s" for event in events.listed()]
     return f"{len(each)} event{'s' * (len(each) != 1)}{': ' * bool(each)}{', '.join(each)}"
 
 
 def _shown(value: object) -> str:
     if value is None or value == "" or value != value:
         return "absent"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    return f"{value:z.5g}" if isinstance(value, float) else str(value)

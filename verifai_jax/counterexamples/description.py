@@ -23,7 +23,7 @@ MUST = {
 def format_number(value: object, digits: int = 4) -> str:
     """Write a value as a person does: `120.4`, `on`."""
     if isinstance(value, (float, np.floating)):
-        return f"{value:.{digits}g}" if abs(value) < 1e5 else f"{value:.3e}"
+        return f"{value:z.{digits}g}" if abs(value) < 1e5 else f"{value:z.3e}"
     return str(value)
 
 
@@ -73,7 +73,7 @@ def describe_verdict(name: str, row: int, why: Explanation) -> str:
     """Write which predicate decides, when, by how much, and through which sub-formulas."""
     at = f"{format_time(why.time, 4)} s"
     formula = str(why.formula)
-    first = f"Row {row} of {name} breaks  {formula}  with robustness {why.robustness:.4g}"
+    first = f"Row {row} of {name} breaks  {formula}  with robustness {why.robustness:z.4g}"
     predicate = why.predicate
     broken = f"at {at}  {predicate}  decides"
     if isinstance(predicate, Predicate):
@@ -161,7 +161,7 @@ def format_spans(spans: list[Span]) -> str:
             joined[-1] = Span(joined[-1].begin, max(span.end, joined[-1].end))
         else:
             joined.append(span)
-    return _listed([f"from {s.begin:.3g} s to {s.end:.3g} s" for s in joined])
+    return _listed([f"from {s.begin:z.3g} s to {s.end:z.3g} s" for s in joined])
 
 
 def describe_gradient(influences: Sequence[Influence]) -> str:

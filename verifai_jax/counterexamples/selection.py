@@ -59,7 +59,7 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
         some = ", ".join(map(str, failing.index[:5]))
         raise ValueError(
             f"row {number} is no counterexample: status {entry['status']}, robustness "
-            f"{entry['rho']:.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
+            f"{entry['rho']:z.4g}; counterexamples are {some}{', ...' * (len(failing) > 5)}"
         )
     return number, entry
 

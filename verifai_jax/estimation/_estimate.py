@@ -17,7 +17,7 @@ from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.errors import suggests_options, unknown_name
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.progress import SimulationProgress, shows_progress
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
@@ -45,6 +45,7 @@ GRADIENTS_FROM = 3
 
 
 @suggests_options
+@shows_progress("estimating")
 def estimate(
     problem: Problem,
     method: str | None = None,

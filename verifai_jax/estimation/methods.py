@@ -257,8 +257,8 @@ def _without_proposal(
     """
     why = (
         "no proposal fits the failures well enough for importance sampling (it promises "
-        f"{fitted.effective * limit_state.left:.0f} effective failures, tail index "
-        f"{fitted.tail:.2f}; counting {counted:.0f})"
+        f"{fitted.effective * limit_state.left:z.0f} effective failures, tail index "
+        f"{fitted.tail:z.2f}; counting {counted:z.0f})"
     )
     if run.stopped is None and not limit_state.draws and _promised_by(run, limit_state) > counted:
         answer = _splitting_answer(limit_state, rng, plan, [run], counts)
@@ -382,7 +382,8 @@ def _importance_answer(
         )
     if mean.tail > WORST_TAIL:
         answer.notes.append(
-            f"the weights have a heavy tail (index {mean.tail:.2f}): the interval may be too narrow"
+            f"the weights have a heavy tail (index {mean.tail:z.2f}): "
+            "the interval may be too narrow"
         )
     if samples.unresolved > 0.01:
         answer.notes.append(
@@ -421,7 +422,7 @@ def check_by_splitting(
     other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
     answer.low, answer.high = min(interval[0], other[0]), max(interval[1], other[1])
     answer.notes.append(
-        f"splitting gave {run.estimate:.2g}, which does not agree; the interval is made to "
+        f"splitting gave {run.estimate:z.2g}, which does not agree; the interval is made to "
         "hold both. More simulations would tell"
     )
 
@@ -489,10 +490,10 @@ def _bound_only(
     level = run.levels[-1] if run.levels else np.inf
     why = {
         "stuck": "the search found no failure: the robustness gets no lower than "
-        f"{limit_state.least:.4g}, or has no slope to follow",
-        "budget": f"the budget ended at robustness {level:.4g}, which is reached with probability "
-        f"{reached:.1e}; failing is rarer, or impossible",
-    }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:.4g}")
+        f"{limit_state.least:z.4g}, or has no slope to follow",
+        "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
+        f"{reached:z.1e}; failing is rarer, or impossible",
+    }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = _monte_carlo_answer(counts, plan)
     answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}

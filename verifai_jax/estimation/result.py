@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.statistics.binomial import simulations_until
 
@@ -28,7 +29,7 @@ METHODS = {
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Estimate(InNotebook):
     """A failure probability, as `estimate` returns it.
 
     - `name`: name of the problem.
@@ -117,27 +118,27 @@ class Estimate:
         if self.probability is None or self.method is None:
             lines = [
                 f"{self.name}: no estimate of the failure probability; at most "
-                f"{self.upper_bound:.2g} ({sure} bound)"
+                f"{self.upper_bound:z.2g} ({sure} bound)"
             ]
         else:
             lines = [
-                f"{self.name}: fails with probability {self.probability:.3g} "
-                f"({sure} interval {self.low:.3g} to {self.high:.3g}), by {METHODS[self.method]}"
+                f"{self.name}: fails with probability {self.probability:z.3g} "
+                f"({sure} interval {self.low:z.3g} to {self.high:z.3g}), by {METHODS[self.method]}"
             ]
         without = f", {self.no_verdict:,} without a verdict" if self.no_verdict else ""
         lines.append(
             f"  simulations  {self.simulations:,} of {self.budget:,}, {self.failures:,} failing"
-            f"{without}, {self.seconds:.1f} s"
+            f"{without}, {self.seconds:z.1f} s"
         )
         if self.probability is not None and math.isfinite(self.relative_error):
             worth = ""
             if math.isfinite(self.effective):
-                worth = f", worth {self.effective:,.0f} independent failures"
+                worth = f", worth {self.effective:z,.0f} independent failures"
             lines.append(
                 f"  precision    relative error {format_percent(self.relative_error)}{worth}"
             )
         lines.append(
-            f"  guaranteed   at most {self.upper_bound:.2g} at {sure}, by {self.prior_failures:,} "
+            f"  guaranteed   at most {self.upper_bound:z.2g} at {sure}, by {self.prior_failures:,} "
             f"failures in {self.prior_simulations:,} independent samples of the prior alone"
         )
         if self.no_verdict:
@@ -146,7 +147,7 @@ class Estimate:
                 "samples; neither safe nor failing: the upper ends count them as failing"
             )
         if self.p0 is not None:
-            lines.append(f"  p < {self.p0:g}    {self._conclusion(self.p0)}")
+            lines.append(f"  p < {self.p0:zg}    {self._conclusion(self.p0)}")
         lines += [f"  note         {note}" for note in self.notes]
         return "\n".join(lines)
 

@@ -93,7 +93,7 @@ def _fastest(
     if other is None:
         likely = problem.system.likely == traced
         if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
-            seconds = f"{budget / speed:.1f} s for all simulations"
+            seconds = f"{budget / speed:z.1f} s for all simulations"
             return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
         try:
             engine = engine_for(compiled, batch, precision=precision)
@@ -104,7 +104,7 @@ def _fastest(
         other = problem.programs.get(
             SPEEDS, (traced, batch, precision), lambda: _speed(engine, compiled, batch)
         )
-    why = f"measured {speed:,.0f} simulations/s on {on_host}, {other:,.0f} on {traced}"
+    why = f"measured {speed:z,.0f} simulations/s on {on_host}, {other:z,.0f} on {traced}"
     return Choice(compiled, traced, why) if other > speed else Choice(host, on_host, why)
 
 

@@ -318,8 +318,8 @@ class Confirmer:
             note = f"{len(rest)} of {count} were not replayed"
             if self.far(nearest):
                 note += (
-                    f": {nearest:.3g} or more from zero, where none of {self.examined} replays "
-                    f"moved a row by more than {self.band:.2g}"
+                    f": {nearest:z.3g} or more from zero, where none of {self.examined} replays "
+                    f"moved a row by more than {self.band:z.2g}"
                 )
             else:
                 note += f", as {self.examined} rows of this run were before"
@@ -524,7 +524,7 @@ def _remember(decision: _Decision, rows: Mapping[str, np.ndarray], plain: bool) 
     for i in np.flatnonzero(known).tolist():
         decision.verdict[i] = "fragile"
         again = float(rows["rho_again"][i]) if "rho_again" in rows else float("nan")
-        then = "" if np.isnan(again) else f", with robustness {again:.4g}"
+        then = "" if np.isnan(again) else f", with robustness {again:z.4g}"
         decision.why[i] = f"it did not come again when the run simulated it again{then}"
 
 

@@ -156,15 +156,15 @@ def describe_disagreement(
         return f"the replay {_and(lost)} is not finite"
     holds = [name for name, replayed in found.items() if not replayed.violated[i]]
     if holds == ["again"]:
-        run = "" if as_run is None else f", and {as_run:.4g} in the run"
-        return f"it holds when simulated again: robustness {found['again'].least[i]:.4g}{run}"
+        run = "" if as_run is None else f", and {as_run:z.4g} in the run"
+        return f"it holds when simulated again: robustness {found['again'].least[i]:z.4g}{run}"
     if len(holds) == len(found):
         return "it holds in every replay"
     if holds:
         fails = [name for name in found if name not in holds]
         few = len(holds) <= len(fails)
         return f"it holds {_and(holds)}" if few else f"it fails only {_and(fails)}"
-    return f"its robustness {rho:.3g} moves by {band:.2g} between replays"
+    return f"its robustness {rho:z.3g} moves by {band:z.2g} between replays"
 
 
 def _and(names: Sequence[str]) -> str:
@@ -222,13 +222,13 @@ class Repetitions:
         plural = "s" * (self.rows != 1)
         of = f"of {self.rows} violating row{plural} simulated again with the same features and seed"
         if self.moved:
-            by = f" (by up to {self.most:.2g})" if self.most else ""
+            by = f" (by up to {self.most:z.2g})" if self.most else ""
             return (
                 f"the system has memory or chance of its own: {of}, {self.moved} gave another "
                 f"robustness{by}, and {self.lost} did not fail"
             )
         if self.rounded:
-            return f"{of}, {self.rounded} have other last digits, by up to {self.most:.2g}"
+            return f"{of}, {self.rounded} have other last digits, by up to {self.most:z.2g}"
         return ""
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.keys import run_keys
+from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine, engine_for
 from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.host_engine import HostEngine
@@ -126,7 +127,9 @@ class Evaluator:
         count, parts = len(u), []
         if isinstance(self.engine, ExecutorEngine) and count:
             self.simulations = start + count
-            return self.engine.evaluate(u, self.key, start, temperature)
+            verdicts = self.engine.evaluate(u, self.key, start, temperature)
+            count_done(count)
+            return verdicts
         for begin in range(0, count, self.batch):
             block = slice(begin, begin + self.batch)
             some = temperature[block] if isinstance(temperature, np.ndarray) else temperature
@@ -134,6 +137,7 @@ class Evaluator:
             if points.dtype != self._dtype:
                 points = np.asarray(points, self._dtype)
             parts.append(self.engine.evaluate(points, self.key, start + begin, some))
+            count_done(len(points))
         self.simulations = start + count
         if not parts:
             return Verdicts.nothing(len(self.problem.formulas), self.problem.space.dim)

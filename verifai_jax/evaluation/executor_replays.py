@@ -17,6 +17,7 @@ from jaxtyping import Int, Key, PyTree, UInt32
 from verifai_jax.core.executors import Executor, Shipment, check_executor, gather, ship
 from verifai_jax.core.keys import as_key
 from verifai_jax.core.precision import reproducible_settings
+from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.executor_engine import SHIPMENTS, TOGETHER, identity
 from verifai_jax.evaluation.replays import HostReplays
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -82,6 +83,7 @@ class ExecutorReplays(HostReplays):
 
         def ended(place: int, result: dict[str, Any]) -> None:
             found[place] = Verdicts(**result)
+            count_done(len(found[place].status))
 
         gather(futures, ended)
         return Verdicts.concatenate([found[place] for place in range(len(futures))])

@@ -3,7 +3,7 @@
 replay(problem, row, key, number).trace             # the trace behind a row of a table
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,9 @@ from jaxtyping import Array, ArrayLike, Key
 
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.text import format_features
 from verifai_jax.core.trace import Status, Trace
 from verifai_jax.evaluation.host_engine import on_host_clock
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Replay:
+class Replay(InNotebook):
     """One simulation, looked at again.
 
     `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
@@ -36,6 +38,8 @@ class Replay:
     early end, over which Signals lie; None for a single sample. `engine` says which other engine of
     the system simulated it, because that compiles nothing and gives the number of the row.
     """
+
+    _internal = frozenset(("changed", "finding"))
 
     problem: Problem
     row: int | None
@@ -95,17 +99,20 @@ class Replay:
         which = "a simulation" if self.row is None else f"row {self.row}"
         lines = [*self.warnings, f"{which} of {self.problem.name}: {self._verdict()}"]
         if len(self.rho) > 1 and self.status == Status.OK:
-            lines += [f"  {name:<12} robustness {rho:.4g}" for name, rho in self.rho.items()]
+            lines += [f"  {name:<12} robustness {rho:z.4g}" for name, rho in self.rho.items()]
         lines.append(f"  {'features':<12} {self.describe_features()}")
         lines += [f"  {'engine':<12} {self.engine}"] if self.engine else []
         span, *signals = str(self.trace).splitlines()
         return "\n".join([*lines, f"  {span}", *(f"  {line}" for line in signals)])
 
+    def _notebook_parts(self) -> Iterator[str]:
+        yield picture_html(self.plot())
+
     def _verdict(self) -> str:
         if self.status != Status.OK:
             return f"no verdict, {self.status.name.lower()}"
         verb = "violates" if self.violated else "keeps"
-        return f"{verb} the property, robustness {min(self.rho.values()):.4g}"
+        return f"{verb} the property, robustness {min(self.rho.values()):z.4g}"
 
     def plot(self, path: str | Path | None = None, signals: Sequence[str] | None = None) -> Any:
         """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
@@ -119,18 +126,32 @@ class Replay:
         """
         return late("verifai_jax.plotting.replay", "plot_replay")(self, path, signals)
 
-    def animate(self, path: str | Path | None = None) -> Any:
+    def animate(
+        self,
+        path: str | Path | None = None,
+        *,
+        camera: str | None = None,
+        size: Sequence[int] | None = None,
+        fps: float | None = None,
+    ) -> Any:
         """Draw the simulation as an animated GIF, which a notebook shows.
 
         **Arguments:**
 
         - `path`: of a file to write too; none when left out.
+        - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
+          left out.
+        - `size`: width and height of a frame in pixels.
+        - `fps`: frames a second; chosen when left out.
 
-        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
+        environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
         """
-        return late("verifai_jax.plotting.animation", "animate")(self, path)
+        draw = late("verifai_jax.plotting.animation", "animate")
+        return draw(self, path, camera=camera, size=size, fps=fps)
 
 
+@shows_progress("replaying a simulation of", "simulations")
 def replay(
     problem: Problem,
     row: "Mapping[str, Any] | pd.Series",
@@ -157,7 +178,7 @@ def replay(
             row=number,
             features=features,
             trace=trace.trim(),
-            rho=dict(zip(problem.formulas, np.asarray(rho).tolist(), strict=True)),
+            rho=dict(zip(problem.formulas, (np.asarray(rho) + 0.0).tolist(), strict=True)),
             status=Status(int(status)),
             key=key,
             # Of the whole trace: what an early end leaves of it is shorter.

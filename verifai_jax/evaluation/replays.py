@@ -23,6 +23,7 @@ from verifai_jax.core.devices import enable_compile_cache
 from verifai_jax.core.keys import as_key, simulation_key
 from verifai_jax.core.precision import in_precision
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.progress import count_done
 from verifai_jax.core.text import format_error
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
@@ -131,6 +132,7 @@ class Replays:
                 parts.append(engine.evaluate(rows, keys, shared=np.int32(factor)))
             except Exception as error:
                 parts.append(_raised(len(numbers[block]), len(self.problem.formulas), error))
+            count_done(len(numbers[block]))
         self.compile_seconds += engine.compile_seconds - compiled
         verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
         return verdicts.split(len(each))
@@ -236,10 +238,11 @@ class HostReplays:
             if system.can_simulate_batch:
                 keys = jax.vmap(partial(simulation_key, self.key))(jnp.asarray(numbers, jnp.int32))
         seeds = np.concatenate(each_block)[:count]
-        return [
-            engine.evaluate_features(features, seeds, keys)._replace(features=None)
-            for features in each
-        ]
+        parts = []
+        for features in each:
+            parts.append(engine.evaluate_features(features, seeds, keys)._replace(features=None))
+            count_done(count)
+        return parts
 
 
 @jax.jit

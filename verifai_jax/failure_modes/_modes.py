@@ -23,7 +23,7 @@ from verifai_jax.core.checks import check_fraction
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.precision import in_precision
-from verifai_jax.core.progress import SimulationProgress
+from verifai_jax.core.progress import SimulationProgress, shows_progress
 from verifai_jax.core.text import format_time
 from verifai_jax.counterexamples import confirm
 from verifai_jax.counterexamples.description import describe_predicate
@@ -71,6 +71,7 @@ MOST_OF_RUN = 200
 
 
 @suggests_options
+@shows_progress("finding the modes of")
 def modes(
     source: Problem | Run,
     budget: int = 50_000,

@@ -109,8 +109,8 @@ def _short(value: float, outwards: int) -> float:
 
     Failures lie above the value where `outwards` is -1, and below it where it is 1.
     """
-    rounded = float(f"{value:.3g}")
+    rounded = float(f"{value:z.3g}")
     if value and (rounded - value) * outwards < 0:
         unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
-        rounded = float(f"{rounded + outwards * unit:.3g}")
+        rounded = float(f"{rounded + outwards * unit:z.3g}")
     return rounded

@@ -13,6 +13,7 @@ from jaxtyping import Array, Key
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.keys import simulation_key
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook, picture_html
 from verifai_jax.core.text import format_percent
 from verifai_jax.counterexamples import explain, shrink
 from verifai_jax.counterexamples._explain import Explained
@@ -23,7 +24,7 @@ from verifai_jax.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class Mode(InNotebook):
     """One failing region.
 
     - `number`: its place in the order of probability; 0 is the most probable one.
@@ -80,16 +81,17 @@ class Mode:
         )
         return replace(again, row=None)
 
-    def animate(self, path: str | Path | None = None) -> Any:
+    def animate(self, path: str | Path | None = None, **options: Any) -> Any:
         """Draw the likeliest failure as an animated GIF.
 
         **Arguments:**
 
         - `path`: of a file to write too; none when left out.
+        - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
 
-        **Raises:** `ValueError` for a problem without `draw` that is no MuJoCo model.
+        **Raises:** as `Replay.animate`.
         """
-        return self.replay().animate(path)
+        return self.replay().animate(path, **options)
 
     def explain(self, nominal: Mapping[str, Any] | None = None) -> Explained:
         """Explain the likeliest failure: predicate, instant, and the features that matter.
@@ -125,13 +127,13 @@ class Mode:
 
     def __str__(self) -> str:
         return (
-            f"mode {self.number}: {self.name}: probability {self.probability:.3g} "
-            f"({self.low:.3g} to {self.high:.3g})"
+            f"mode {self.number}: {self.name}: probability {self.probability:z.3g} "
+            f"({self.low:z.3g} to {self.high:z.3g})"
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Modes:
+class Modes(InNotebook):
     """All failing regions that were found, the most probable first.
 
     - `name`: of the problem.
@@ -212,17 +214,21 @@ class Modes:
         """
         return late("verifai_jax.plotting.modes", "plot_modes")(self, path)
 
+    def _notebook_parts(self) -> Iterator[str]:
+        if self.modes:
+            yield picture_html(self.plot())
+
     def __str__(self) -> str:
         sure = format_percent(self.confidence)
         if self.probability is None:
             lines = [
                 f"{self.name}: no mode of failure found; a failure has probability "
-                f"{self.upper_bound:.2g} at most ({sure} bound)"
+                f"{self.upper_bound:z.2g} at most ({sure} bound)"
             ]
         else:
             lines = [
-                f"{self.name}: fails with probability {self.probability:.3g} ({sure} interval "
-                f"{self.low:.3g} to {self.high:.3g}), in {len(self.modes)} "
+                f"{self.name}: fails with probability {self.probability:z.3g} ({sure} interval "
+                f"{self.low:z.3g} to {self.high:z.3g}), in {len(self.modes)} "
                 f"mode{'s' if len(self.modes) != 1 else ''}"
             ]
         if self.changed:
@@ -230,23 +236,23 @@ class Modes:
         for mode in self.modes:
             lines.append(
                 f"  {mode.number}  {format_percent(mode.share)} of the failures: "
-                f"{mode.probability:.3g} ({mode.low:.3g} to {mode.high:.3g})  {mode.name}"
+                f"{mode.probability:z.3g} ({mode.low:z.3g} to {mode.high:z.3g})  {mode.name}"
             )
             if mode.cause:
                 lines.append(f"     {mode.cause}")
             lines.append(
-                f"     likeliest at {_listed(mode.features)}, {mode.distance:.3g} standard "
+                f"     likeliest at {_listed(mode.features)}, {mode.distance:z.3g} standard "
                 "deviations out"
             )
         if self.modes:
             low, high = self.unexplained
             lines.append(
                 f"  unexplained  {format_percent(low)} to {format_percent(high)} of the failures "
-                f"are joined to none of these; {self.rest:.2g} is the probability of regions too "
+                f"are joined to none of these; {self.rest:z.2g} is the probability of regions too "
                 "improbable to be listed"
             )
         lines.append(
-            f"  simulations  {self.simulations:,} of {self.budget:,}, {self.seconds:.1f} s"
+            f"  simulations  {self.simulations:,} of {self.budget:,}, {self.seconds:z.1f} s"
         )
         lines += [f"  note         {note}" for note in self.notes]
         return "\n".join(lines)
@@ -257,7 +263,7 @@ class Modes:
 def _listed(features: Mapping[str, Any], most: int = 6) -> str:
     """Write features in one line, the first few of many."""
     parts = [
-        f"{name} = {value:.4g}" if isinstance(value, float | np.floating) else f"{name} = {value}"
+        f"{name} = {value:z.4g}" if isinstance(value, float | np.floating) else f"{name} = {value}"
         for name, value in list(features.items())[:most]
     ]
     return ", ".join(parts) + (", ..." if len(features) > most else "")

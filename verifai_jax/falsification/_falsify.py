@@ -21,7 +21,7 @@ from verifai_jax.core.compilation import tracing
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.executors import Executor
 from verifai_jax.core.precision import in_precision, reproducible_settings
-from verifai_jax.core.progress import SimulationProgress, write_line
+from verifai_jax.core.progress import SimulationProgress, shows_progress, write_line
 from verifai_jax.core.sources import Sources
 from verifai_jax.core.stopwatch import Stopwatch
 from verifai_jax.core.user_errors import explain_user_error, format_user_error
@@ -93,6 +93,7 @@ class RunError(RuntimeError):
 
 @suggests_options
 @reproducible_settings()
+@shows_progress("falsifying")
 def falsify(
     problem: Problem,
     search: str | Search = "auto",
@@ -269,6 +270,7 @@ def simulate(
 
 @suggests_options
 @reproducible_settings()
+@shows_progress("going on with")
 def resume(
     run: Run | str | Path,
     problem: Problem | None = None,

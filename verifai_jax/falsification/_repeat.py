@@ -21,8 +21,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from verifai_jax.core.devices import enable_compile_cache, spread_over_devices
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.keys import run_keys, simulation_key
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.precision import in_precision, reproducible_settings
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.progress import count_done, say_done, shows_progress
 from verifai_jax.core.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import violations
@@ -42,7 +44,7 @@ SIMULATIONS_A_CALL = 512
 
 
 @dataclass(frozen=True, eq=False)
-class Trials:
+class Trials(InNotebook):
     """The histories of one search from many seeds; what `repeat` returns.
 
     - `name`, `search`: of the problem; the repr of the search.
@@ -122,13 +124,14 @@ class Trials:
         return (
             f"{self.name}: {self.search} falsified from {self.falsified} of {len(self.seeds)} "
             f"seeds within {self.rho.shape[1]} simulations ({meant}); mean "
-            f"{self.mean_simulations:.4g}, median {self.median_simulations:.4g} simulations to the "
-            "first failure"
+            f"{self.mean_simulations:z.4g}, median {self.median_simulations:z.4g} simulations to "
+            "the first failure"
         )
 
 
 @suggests_options
 @reproducible_settings()
+@shows_progress("repeating a search of")
 def repeat(
     problem: Problem,
     search: str | Search = "portfolio",
@@ -140,6 +143,7 @@ def repeat(
     precision: str = "float32",
     backend: str | None = None,
     confirm: bool = True,
+    progress: bool | None = None,
 ) -> Trials:
     """Run a search from many seeds at once; each asks for what `falsify` with its seed would.
 
@@ -155,6 +159,8 @@ def repeat(
       each seed only the first violations are replayed, until one is claimed (all of them without
       `stop_early`), those of all seeds together. False to count violations as simulated, which
       compiles nothing but the search.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
     other that learns has its rounds compiled together and learns from them as simulated: behind a
@@ -193,6 +199,7 @@ def repeat(
             "the other"
         )
     in_precision(precision)
+    say_done(0, budget * len(every))
     traced.check()
     search, _ = adapt_search(traced, search)
     batch = min(usual_batch(search, budget) if batch is None else batch, budget)
@@ -288,6 +295,7 @@ class _WholeRounds:
             new = failing.any(axis=1) & ~failed
             failures[new] = u[new, failing[new].argmax(axis=1)]
             failed |= new
+            count_done(rho.size)
             parts.append(rho)
             broken.append(violated)
             refused.append(unclaimed)

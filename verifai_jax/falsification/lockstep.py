@@ -17,6 +17,7 @@ from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.compilation import options_of
 from verifai_jax.core.keys import run_keys, simulation_key
 from verifai_jax.core.programs import Slot
+from verifai_jax.core.progress import count_done
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.claims import SeedClaims
@@ -118,6 +119,7 @@ def lockstep(
                 own = number_keys(run_key[seed[place]], numbers[place].astype(np.int32))
                 some = seed[block], row[block]
                 parts.append(engine.evaluate(u[some], own, temperature=temperature[some]))
+            count_done(len(seed))
             verdicts = Verdicts.concatenate(parts)
             values[seed, row], valid[seed, row] = verdicts.least, verdicts.proper
             broken[seed, row], clauses[seed, row] = verdicts.violated, verdicts.clauses

@@ -139,8 +139,8 @@ def finding_of(
         # Infinite where a formula says nothing of the trace.
         if rho != was and not abs(rho - was) <= rounding:
             return (
-                f"Row {seen.row} does not give its number again: robustness {rho:.6g} here, "
-                f"{was:.6g} in the table"
+                f"Row {seen.row} does not give its number again: robustness {rho:z.6g} here, "
+                f"{was:z.6g} in the table"
             )
     if violated != seen.violated:
         return (

@@ -177,5 +177,5 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | jax.Array | np.generic):
         return plain(value.tolist())
     if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
+        return float(f"{value:z.6g}") if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)

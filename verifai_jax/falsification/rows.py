@@ -25,10 +25,11 @@ def rows_of(
     count = len(verdicts.status)
     assert verdicts.features is not None
     columns: dict[str, np.ndarray] = {**problem.space.rows(verdicts.features)}
-    columns["rho"] = verdicts.least
+    # Adding 0 makes a robustness of -0 one of 0.
+    columns["rho"] = verdicts.least + 0.0
     if len(problem.formulas) > 1:
         for i, name in enumerate(problem.formulas):
-            columns[f"rho.{name}"] = verdicts.rho[:, i]
+            columns[f"rho.{name}"] = verdicts.rho[:, i] + 0.0
     columns |= {"violated": verdicts.violated, "status": STATUS_NAMES[verdicts.status]}
     if verdicts.gradient is not None:
         columns["gradient_finite"] = np.all(np.isfinite(verdicts.gradient), axis=1)

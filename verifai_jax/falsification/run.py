@@ -7,7 +7,7 @@ run.save("runs/mine"); vj.load("runs/mine", problem)
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import numpy as np
 from verifai_jax.core.keys import run_keys
 from verifai_jax.core.lazy import late
 from verifai_jax.core.locks import write_lock
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.seals import sealed
 from verifai_jax.core.sources import Change
 from verifai_jax.core.text import one_line
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(InNotebook):
     """The result of a falsification: its table, its record, and what follows from them.
 
     - `name`: of the problem.
@@ -102,6 +103,11 @@ class Run:
       recorded.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
+
+    _internal = frozenset((
+        "changed_since", "changes", "checkpoint", "compared", "damage", "has_several_models",
+        "origin", "search_data", "space_data", "table_path", "verdict_counts",
+    ))  # fmt: skip
 
     name: str
     formulas: dict[str, str]
@@ -444,6 +450,9 @@ class Run:
                 rows = table.digest(int(self.checkpoint["rows"]))
                 write_checkpoint(self.checkpoint, folder, rows, checksum)
         return folder
+
+    def _notebook_parts(self) -> Iterator[str]:
+        yield from self.table._notebook_parts()
 
     def __repr__(self) -> str:
         return self.summary()

@@ -97,7 +97,7 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     if not verdict.violated[0]:
         return ()
     return (
-        f"{NOMINAL_FAILS}, with robustness {verdict.least[0]:.4g}: "
+        f"{NOMINAL_FAILS}, with robustness {verdict.least[0]:z.4g}: "
         "are the formula and its units right?",
     )
 
@@ -153,7 +153,7 @@ def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[s
         which, order = "grid", "in a random order over the whole of it"
     return (
         f"{which} cut short: {simulated} of its {total} points were simulated "
-        f"({100 * simulated / total:.2g} %), {order}; budget={total} simulates all",
+        f"({100 * simulated / total:z.2g} %), {order}; budget={total} simulates all",
     )
 
 
@@ -174,6 +174,6 @@ def _never_near(which: str, ends: tuple[float, float], count: int) -> list[str]:
     if not 0 < low < high < math.inf or high - low > HARDLY_MOVES * low:
         return []
     return [
-        f"{which} was never near being violated: its robustness lay between {low:.4g} and "
-        f"{high:.4g} in all {count} simulations; are its bounds and units right?"
+        f"{which} was never near being violated: its robustness lay between {low:z.4g} and "
+        f"{high:z.4g} in all {count} simulations; are its bounds and units right?"
     ]

@@ -40,7 +40,7 @@ def summarize(run: Run) -> str:
         verdict = best.get("verdict", "")
         lines.append(
             f"  {'worst' if best['violated'] else 'nearest':<13}row {run.best.name}"
-            f"{f' ({verdict})' if verdict else ''}, robustness {best['rho']:.4g} at {where}"
+            f"{f' ({verdict})' if verdict else ''}, robustness {best['rho']:z.4g} at {where}"
         )
     if failed:
         statuses = ", ".join(f"{n} {status}" for status, n in counts.failed.items())
@@ -145,15 +145,15 @@ _UNDECIDED_IN_WORDS = {
 def _times(run: Run) -> str:
     """Write what the time was spent on: parts that were measured each, and add up."""
     simulating = run.simulate_seconds
-    speed = f" ({run.simulations / simulating:,.0f} simulations/s)" if simulating > 0 else ""
-    parts = [f"{run.compile_seconds:.1f} s to compile"]
+    speed = f" ({run.simulations / simulating:z,.0f} simulations/s)" if simulating > 0 else ""
+    parts = [f"{run.compile_seconds:z.1f} s to compile"]
     if run.search_seconds > 0:
-        parts.append(f"{run.search_seconds:.2f} s to search")
-    parts.append(f"{simulating:.2f} s to simulate{speed}")
+        parts.append(f"{run.search_seconds:z.2f} s to search")
+    parts.append(f"{simulating:z.2f} s to simulate{speed}")
     if run.checked:
-        parts.append(f"{run.confirm_seconds:.2f} s to confirm")
+        parts.append(f"{run.confirm_seconds:z.2f} s to confirm")
     if (rest := run.run_seconds - run.search_seconds - simulating) >= SHOWN:
-        parts.append(f"{rest:.2f} s for callbacks and files")
+        parts.append(f"{rest:z.2f} s for callbacks and files")
     return ", ".join(parts)
 
 

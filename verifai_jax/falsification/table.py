@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Int
 
+from verifai_jax.core.notebook import InNotebook, frame_html
 from verifai_jax.core.text import format_error, printable
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
@@ -74,7 +75,7 @@ _FEW = 256
 """Small batches in memory that are joined to one."""
 
 
-class ErrorTable:
+class ErrorTable(InNotebook):
     """Rows in the order in which they were simulated; append-only.
 
     **Arguments:**
@@ -89,6 +90,11 @@ class ErrorTable:
 
     **Raises:** `ValueError` for a feature with a reserved name.
     """
+
+    _internal = frozenset((
+        "append", "blocks", "close", "count_rows", "counts", "damage", "digest", "exists",
+        "load", "missing", "resumed",
+    ))  # fmt: skip
 
     def __init__(self, features: tuple[str, ...], folder: Path | None = None) -> None:
         for name in features:
@@ -361,6 +367,13 @@ class ErrorTable:
         self._digested = begin, rows, checksums
         names = [segment.path.name for segment in closed]
         return zlib.crc32(json.dumps([names, sorted(checksums.items())]).encode())
+
+    def _notebook_parts(self) -> Iterator[str]:
+        # Of a long table a part is read, not all of it.
+        rows = next(iter(self.blocks())) if self._segments else self.all
+        if len(rows):
+            failing = rows.loc[rows["violated"]]
+            yield frame_html(failing if len(failing) else rows)
 
     def __repr__(self) -> str:
         counts = self.counts

@@ -248,7 +248,7 @@ def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
         search, name = searches.TuRBO(), "turbo"
     else:
         search, name = searches.Bayes(), "bayes"
-    return search, f"search {name}: a simulation takes {seconds:.2g} s; search= sets another"
+    return search, f"search {name}: a simulation takes {seconds:z.2g} s; search= sets another"
 
 
 def check_rule(search: Search, rule: StoppingRule | None) -> None:

@@ -94,12 +94,12 @@ class Categorical(Domain):
             )
         if min(numbers) < 1 / MOST_LEVELS:
             raise ValueError(
-                f"a weight must be at least {1 / MOST_LEVELS:.1g}, which a float32 coordinate can "
+                f"a weight must be at least {1 / MOST_LEVELS:z.1g}, which a float32 coordinate can "
                 f"tell from nothing; got {short(numbers)}"
             )
         if abs(math.fsum(numbers) - 1) > 1e-6:
             raise ValueError(
-                f"weights must sum to one; {short(numbers)} sum to {math.fsum(numbers):.7g}"
+                f"weights must sum to one; {short(numbers)} sum to {math.fsum(numbers):z.7g}"
             )
         return numbers
 

@@ -151,7 +151,7 @@ class Continuous(Domain):
         if not abs(reached - value) <= 0.1 * (upper - lower) + 1e-5 * abs(value):
             raise ValueError(
                 f"{name} is so far in the tail of {self!r} that a float32 coordinate cannot reach "
-                f"it; the nearest value is {reached:.6g}; got {short(value)}"
+                f"it; the nearest value is {reached:z.6g}; got {short(value)}"
             )
 
     def _is_central(self, value: float) -> bool:

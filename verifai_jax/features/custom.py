@@ -59,18 +59,18 @@ class Distribution(Continuous):
         values = self._sampled("inverse_cdf", self.inverse_cdf, u)
         for i in range(len(u)):
             if not np.isfinite(values[i]):
-                raise ValueError(f"inverse_cdf of {self!r} gives {values[i]} at u = {u[i]:.3g}")
+                raise ValueError(f"inverse_cdf of {self!r} gives {values[i]} at u = {u[i]:z.3g}")
             if i and values[i] <= values[i - 1]:
                 raise ValueError(
-                    f"inverse_cdf of {self!r} must increase; it gives {values[i - 1]:.3g} at "
-                    f"u = {u[i - 1]:.3g} and {values[i]:.3g} at u = {u[i]:.3g}"
+                    f"inverse_cdf of {self!r} must increase; it gives {values[i - 1]:z.3g} at "
+                    f"u = {u[i - 1]:z.3g} and {values[i]:z.3g} at u = {u[i]:z.3g}"
                 )
         back = self._sampled("cdf", self.cdf, values)
         worst = int(np.argmax(np.nan_to_num(np.abs(back - u), nan=np.inf)))
         if not abs(back[worst] - u[worst]) <= 1e-3:
             raise ValueError(
-                f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:.3g}) "
-                f"is {values[worst]:.3g} and cdf({values[worst]:.3g}) is {back[worst]:.3g}"
+                f"cdf of {self!r} must be the inverse of inverse_cdf; inverse_cdf({u[worst]:z.3g}) "
+                f"is {values[worst]:z.3g} and cdf({values[worst]:z.3g}) is {back[worst]:z.3g}"
             )
 
         ends = np.array([0, 1], np.float32)

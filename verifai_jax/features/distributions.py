@@ -119,8 +119,8 @@ class TruncatedNormal(Continuous):
             )
         if self._inside < DEEPEST:
             raise ValueError(
-                f"only {self._inside:.1g} of the normal distribution lies between low and high, "
-                f"which float32 cannot resolve (at least {DEEPEST:g} is needed); got {self!r}"
+                f"only {self._inside:z.1g} of the normal distribution lies between low and high, "
+                f"which float32 cannot resolve (at least {DEEPEST:zg} is needed); got {self!r}"
             )
 
     @property
@@ -204,7 +204,7 @@ class LogUniform(Continuous):
         if self.low <= 0:
             raise ValueError(f"low of a LogUniform must be positive; got {self!r}")
         if self.low < LEAST_REAL:
-            raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:g}; got {self!r}")
+            raise ValueError(f"low of a LogUniform must be at least {LEAST_REAL:zg}; got {self!r}")
         check_ends(self, self.low, self.high)
 
     @property

@@ -23,6 +23,8 @@ import numpy as np
 from jax import dtypes
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from verifai_jax.core.notebook import ForUsers
+
 MOST_LEVELS = 2**20
 """Cells of a coordinate at most: narrower ones are not distinct in a float32 coordinate."""
 
@@ -51,13 +53,20 @@ class Row(Protocol):
         ...
 
 
-class Domain(abc.ABC):
+class Domain(ForUsers, abc.ABC):
     """Values of one feature, addressed by `size` coordinates in `[0, 1]`.
 
     Laws: `from_unit(to_unit(value))` is `value` (up to rounding in a `Box`);
     `to_unit(from_unit(u))` is `u` in a continuous coordinate and the middle of its cell in a
     discrete one. Both are pure JAX: they can be jitted, differentiated and vmapped.
     """
+
+    _internal = frozenset((
+        "check_reachable", "closed", "coerce", "coordinates", "ends", "from_columns", "items",
+        "labels", "lengths", "levels", "mark_count", "marks", "nominal", "numeric", "ordered",
+        "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
+        "to_columns", "used", "weights", "without",
+    ))  # fmt: skip
 
     @property
     @abc.abstractmethod

@@ -82,7 +82,7 @@ def describe_event(each: Transition) -> str:
     """Return the entry of `events` that describes a transition, as Python writes it."""
     parts = [f"'to': {each.to!r}", f"'wait': {each.wait!r}"]
     if each.weight != 1:
-        parts.append(f"'weight': {each.weight:g}")
+        parts.append(f"'weight': {each.weight:zg}")
     if each.after:
         parts.append(f"'after': {list(each.after)!r}")
     if each.at_most is not None:

@@ -82,7 +82,9 @@ class Fixed(Domain):
 
     def _format(self) -> str:
         values = [value for _, value in self.row if value is not None]
-        shown = [f"{value:.4g}" if isinstance(value, float) else str(value) for value in values[:6]]
+        shown = [
+            f"{value:z.4g}" if isinstance(value, float) else str(value) for value in values[:6]
+        ]
         return f"{', '.join(shown)}{', ...' * (len(values) > 6)}"
 
     def __repr__(self) -> str:

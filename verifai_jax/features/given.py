@@ -224,7 +224,7 @@ def _check_absent(space: FeatureSpace, columns: Mapping[str, Any]) -> None:
                     row = int(np.argmax(beyond))
                     raise ValueError(
                         f"{_at(row, len(lengths))}{column} must be empty where {name}.length is "
-                        f"{lengths[row]:g}; got {entries[row]!r}"
+                        f"{lengths[row]:zg}; got {entries[row]!r}"
                     )
 
 

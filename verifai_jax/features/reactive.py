@@ -119,8 +119,8 @@ class Reactive(Domain):
         inputs = tuple(ranges) if plain else ranges
         low, high = self.bounds
         return (
-            f"Reactive({inputs!r}, hidden={self.hidden}, bounds=({low:g}, {high:g}), "
-            f"scale={self.scale:g})"
+            f"Reactive({inputs!r}, hidden={self.hidden}, bounds=({low:zg}, {high:zg}), "
+            f"scale={self.scale:zg})"
         )
 
 

@@ -99,8 +99,8 @@ class Signal(Domain):
             object.__setattr__(self, "duration", check_duration(self.duration))
             if times is not None and times[-1] > self.duration:
                 raise ValueError(
-                    f"the times of a Signal must lie in its duration of {self.duration:g} s; got "
-                    f"{times[-1]:g}"
+                    f"the times of a Signal must lie in its duration of {self.duration:zg} s; got "
+                    f"{times[-1]:zg}"
                 )
 
     @property
@@ -166,7 +166,7 @@ class Signal(Domain):
             times = [_format_span(*span) for span in self.spans(length or math.inf)]
         else:
             instants = control_times(self.knots, self.hold, self.times, length or math.inf)
-            times = [f"at {time:.4g} s" for time in instants]
+            times = [f"at {time:z.4g} s" for time in instants]
         return tuple(f"{part} {time}" for time in times for part in parts)
 
     def spans(self, duration: float) -> list[tuple[float, float]]:
@@ -231,8 +231,8 @@ class Signal(Domain):
 
     def __repr__(self) -> str:
         points = f"knots={self.knots}" if self.times is None else f"times={short(self.times)}"
-        duration = "" if self.duration is None else f", duration={self.duration:g}"
-        width = "" if self.width is None else f", width={self.width:g}"
+        duration = "" if self.duration is None else f", duration={self.duration:zg}"
+        width = "" if self.width is None else f", width={self.width:zg}"
         return f"Signal({self.domain!r}, {points}, hold={self.hold!r}{width}{duration})"
 
 
@@ -241,9 +241,9 @@ def _format_course(course: Course) -> str:
     text = f"hold={hold!r} and duration={duration}"
     if times is not None:
         text += f", times={short(times)}"
-    return text if width is None else f"{text}, width={width:g}"
+    return text if width is None else f"{text}, width={width:zg}"
 
 
 def _format_span(begin: float, end: float) -> str:
-    until = f" to {end:.4g} s" if math.isfinite(end) else " on"
-    return f"from {begin:.4g} s{until}"
+    until = f" to {end:z.4g} s" if math.isfinite(end) else " on"
+    return f"from {begin:z.4g} s{until}"

@@ -9,7 +9,6 @@ FeatureSpace({...}, where=lambda f: f["x"] < f["y"])                 # a constra
 space.only("x0", nominal={"alg": "ppo"})                             # a view
 """
 
-import html
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -23,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.cube import Cube
 from verifai_jax.core.errors import check_names, unknown_name
+from verifai_jax.core.notebook import ForUsers, rows_html
 from verifai_jax.features.acceptance import acceptance_rate
 from verifai_jax.features.choice import Constant
 from verifai_jax.features.compound import Struct
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class FeatureSpace:
+class FeatureSpace(ForUsers):
     """Named domains over `dim` unit coordinates; uniform coordinates are the prior on features.
 
     **Arguments:**
@@ -48,6 +48,14 @@ class FeatureSpace:
     **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
     `TypeError` for a value that is no domain, or a `where` that is no function.
     """
+
+    _internal = frozenset((
+        "accepts_points", "breaks_constraint", "check_where", "coerce", "completed",
+        "constraint", "convert", "cube", "distance", "feature_form", "features_at", "fixed",
+        "items", "labels", "lengths", "levels", "marks_at", "nudged", "ordered", "point_form",
+        "point_of", "points", "points_at", "refined", "root", "settle", "signals",
+        "unflatten_given", "used", "weights", "width", "without_items",
+    ))  # fmt: skip
 
     def __init__(
         self,
@@ -585,16 +593,7 @@ class FeatureSpace:
 
     def _repr_html_(self) -> str:
         header, *rows = self._summary()
-        return (
-            "<table><thead><tr>"
-            + "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
-            + "</tr></thead><tbody>"
-            + "".join(
-                "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>"
-                for row in rows
-            )
-            + "</tbody></table>"
-        )
+        return rows_html(header, rows)
 
     def _summary(self) -> list[tuple[str, str, str]]:
         rows = [("feature", "domain", "coordinates")]

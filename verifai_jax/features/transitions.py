@@ -247,9 +247,9 @@ def _tables(
     if enabled.any() and shares[enabled].min() < LEAST_SHARE:
         node, number = (int(i) for i in np.argwhere(enabled & (shares < LEAST_SHARE))[0])
         raise ValueError(
-            f"the weight of {transitions[number].label}, {transitions[number].weight:g}, is too "
+            f"the weight of {transitions[number].label}, {transitions[number].weight:zg}, is too "
             f"small beside the others of its state: its probability must be at least "
-            f"{LEAST_SHARE:.1g}; leave out what never happens"
+            f"{LEAST_SHARE:z.1g}; leave out what never happens"
         )
     last = np.where(
         enabled.any(axis=1), shape[1] - 1 - np.argmax(enabled[:, ::-1], axis=1), -1

@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.core.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.features import Domain, FeatureSpace
@@ -24,6 +25,7 @@ from verifai_jax.search import Coverage, Search
 
 
 @suggests_options
+@shows_progress("fuzzing")
 def fuzz(
     problem: Problem | None = None,
     budget: int = 10_000,

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.trace import Status
 from verifai_jax.features import Automaton, Domain, Struct
 from verifai_jax.problem.problem import Problem
@@ -69,7 +70,7 @@ _NOUNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class FuzzCoverage:
+class FuzzCoverage(InNotebook):
     """Coverage of a run; `parts` are a `Covered` for each feature and kind."""
 
     parts: tuple[Covered, ...]

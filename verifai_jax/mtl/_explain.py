@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_time
 from verifai_jax.core.trace import Trace
 from verifai_jax.mtl import formula as ast
@@ -80,7 +81,7 @@ class Instant:
 
 
 @dataclass(frozen=True)
-class Explanation:
+class Explanation(InNotebook):
     """The reason why a formula holds or fails on a trace; `str()` writes it, `draw` shows it."""
 
     formula: Formula
@@ -107,7 +108,7 @@ class Explanation:
 
     def __str__(self) -> str:
         lines = [
-            f"{'Holds' if self.holds else 'Fails'} with robustness {self.robustness:.4g}, decided "
+            f"{'Holds' if self.holds else 'Fails'} with robustness {self.robustness:z.4g}, decided "
             f"by  {self.predicate}  at {format_time(self.time)} s",
             "",
         ]
@@ -122,10 +123,10 @@ class Explanation:
                 name += "  (as above)"
             listed.add(id(node))
             at = format_time(node.time)
-            lines.append(f"{mark} {node.robustness:>10.4g} at {at:<{width}} {'  ' * depth}{name}")
+            lines.append(f"{mark} {node.robustness:>z10.4g} at {at:<{width}} {'  ' * depth}{name}")
         lines += ["", "Most critical instants:"]
         lines += [
-            f"  {i.share:>6.1%} at {at:<{width}} {i.robustness:>10.4g}  {i.predicate}"
+            f"  {i.share:>6.1%} at {at:<{width}} {i.robustness:>z10.4g}  {i.predicate}"
             for i, at in zip(self.critical, map(format_time, instants[len(flat) :]), strict=True)
         ]
         return "\n".join(lines)

@@ -33,13 +33,13 @@ def samples(time: float, dt: float, interval: Interval) -> float:
     n = time / dt
     if math.isinf(n):
         raise IntervalError(
-            f"the interval {interval} has more samples of {dt:g} s than can be counted"
+            f"the interval {interval} has more samples of {dt:zg} s than can be counted"
         )
     if abs(n - round(n)) > 1e-6 * max(1.0, abs(n)):
         low, high = math.floor(n), math.ceil(n)
         raise IntervalError(
-            f"the interval {interval} does not fit the sampling period of {dt:g} s: {time:g} s is "
-            f"not a multiple of it; the nearest are {low * dt:g} s and {high * dt:g} s"
+            f"the interval {interval} does not fit the sampling period of {dt:zg} s: {time:zg} s "
+            f"is not a multiple of it; the nearest are {low * dt:zg} s and {high * dt:zg} s"
         )
     return round(n)
 

@@ -11,11 +11,13 @@ is written, and restored when it is printed; their meaning lives in `evaluate`.
 """
 
 import abc
+import html
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, TypeAlias, Union
 
+from verifai_jax.core.lazy import late
 from verifai_jax.mtl.node import Node, postorder
 from verifai_jax.mtl.words import Text, number_text, operator_text
 
@@ -227,6 +229,13 @@ class Formula(Node):
 
     def __str__(self) -> str:
         return self.text().text
+
+    def _repr_latex_(self) -> str:
+        return f"${late('verifai_jax.mtl._latex', 'latex')(self)}$"
+
+    def _repr_html_(self) -> str:
+        # Notebooks set mathematics within HTML, and prefer HTML to LaTeX.
+        return html.escape(self._repr_latex_())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -9,11 +9,17 @@ import functools
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
+from verifai_jax.core.notebook import ForUsers
+
 N = TypeVar("N", bound="Node")
 
 
-class Node:
+class Node(ForUsers):
     """A node that is equal to another of the same kind with equal fields."""
+
+    _internal = frozenset((
+        "below", "children", "depth", "is_signal", "operands", "temporal_depth", "terms", "text",
+    ))  # fmt: skip
 
     def below(self) -> tuple["Node", ...]:
         """Return the nodes among its fields, left to right."""

@@ -78,7 +78,7 @@ def _spreads(formula: Formula, trace: Trace) -> dict[Formula, float]:
             margin = np.asarray(evaluator.value(leaf, 0, setting.length - 1))
             spread = float(np.ptp(margin[np.isfinite(margin)])) if np.isfinite(margin).any() else 0
             # Three digits are plenty for a scale, and the formula stays readable.
-            spreads[leaf] = float(f"{spread:.3g}") or 1.0
+            spreads[leaf] = float(f"{spread:z.3g}") or 1.0
     return spreads
 
 

@@ -51,7 +51,7 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     )
     verdict = "holds" if explanation.holds else "fails"
     decided = (
-        f"{verdict} with robustness {explanation.robustness:.4g}: decided by  "
+        f"{verdict} with robustness {explanation.robustness:z.4g}: decided by  "
         f"{explanation.predicate}  at {format_time(explanation.time)} s"
     )
     above, below = 1 - 0.15 / size[1], 1 - (head - 0.5) / size[1]
@@ -139,9 +139,12 @@ def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> 
     indent = 0.02 + 0.016 * depth
     weight = "bold" if node.decides else "normal"
     color = PATH if node.decides else QUIET
-    text = _shortened(name, int((0.31 - indent) * width * 11.5))
+    # In two lines where one is too short; letters in bold are wider.
+    room = int((0.31 - indent) * width * (10 if node.decides else 11.5))
+    lines = textwrap.wrap(name, room)
+    text = "\n".join([lines[0], _shortened(" ".join(lines[1:]), room)] if lines[1:] else lines)
     figure.text(indent, middle, text, va="center", fontsize=10.5, weight=weight, color=color)
-    value = "" if np.isnan(node.robustness) else f"{node.robustness:+.3g}"
+    value = "" if np.isnan(node.robustness) else f"{node.robustness:+z.3g}"
     figure.text(
         0.91,
         middle,

@@ -52,7 +52,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
         steps = np.floor((elapsed[-1] * (1 + 1e-9) + 1e-9 * dt + resolution) / dt)
     if not steps < MOST_SAMPLES:
         raise ValueError(
-            f"resampling {elapsed[-1]:g} s every {dt:g} s makes {steps + 1:.3g} samples, "
+            f"resampling {elapsed[-1]:zg} s every {dt:zg} s makes {steps + 1:z.3g} samples, "
             f"more than {MOST_SAMPLES}: take a longer period"
         )
     clock = dt * np.arange(int(steps) + 1)
@@ -174,7 +174,7 @@ def check_increasing(times: np.ndarray) -> None:
     """
     if not np.all(np.isfinite(times)):
         k = int(np.argmin(np.isfinite(times)))
-        raise ValueError(f"sample times must be finite; row {k + 1} has {times[k]:g} s")
+        raise ValueError(f"sample times must be finite; row {k + 1} has {times[k]:zg} s")
     # Compared, and not subtracted: small integers would wrap.
     rises = times[1:] > times[:-1]
     if not np.all(rises):

@@ -39,7 +39,7 @@ class SamplingError(ValueError):
         self.fact, self.dt = fact, dt
         super().__init__(
             f"{fact}. Resample it first, as in "
-            f'resample(trace, dt={dt:g}, method="hold") or method="linear"'
+            f'resample(trace, dt={dt:zg}, method="hold") or method="linear"'
         )
 
 
@@ -135,7 +135,7 @@ def period(trace: Trace) -> float:
     elapsed, resolution = since_first(times)
     if not np.all(np.isfinite(elapsed)):
         k = int(np.argmin(np.isfinite(elapsed)))
-        raise ValueError(f"sample times must be finite; sample {k} is at {times[k]:g} s")
+        raise ValueError(f"sample times must be finite; sample {k} is at {times[k]:zg} s")
     if len(elapsed) == 1:
         return 1.0
     steps = np.diff(elapsed)
@@ -149,12 +149,12 @@ def period(trace: Trace) -> float:
         )
     if resolution > 0.1 * dt:
         raise ValueError(
-            f"the sample times do not tell a period of {dt:g} s{_too_coarse(trace, resolution)}"
+            f"the sample times do not tell a period of {dt:zg} s{_too_coarse(trace, resolution)}"
         )
     if np.any(np.abs(steps - dt) > EVEN * dt + resolution):
         k = int(np.argmax(np.abs(steps - dt)))
         raise SamplingError(
-            f"the trace is not evenly sampled: steps of {steps.min():g} s to {steps.max():g} s, "
+            f"the trace is not evenly sampled: steps of {steps.min():zg} s to {steps.max():zg} s, "
             f"as at {_at(trace, k)}",
             float(np.median(steps)),
         )
@@ -193,7 +193,7 @@ def plain_period(dt: float, error: float) -> float:
     """
     error = max(error, 1e-9 * dt)
     for digits in range(1, 10):
-        for meant in (float(f"{dt:.{digits}g}"), 1 / float(f"{1 / dt:.{digits}g}")):
+        for meant in (float(f"{dt:z.{digits}g}"), 1 / float(f"{1 / dt:z.{digits}g}")):
             if abs(meant - dt) <= error:
                 return meant
     return dt
@@ -202,7 +202,7 @@ def plain_period(dt: float, error: float) -> float:
 def _too_coarse(trace: Trace, resolution: float) -> str:
     return (
         f": at {_at(trace, -1)} they are {np.asarray(trace.times).dtype} numbers, which lie "
-        f"{resolution:.3g} s apart; give them in double precision, or in seconds since the first"
+        f"{resolution:z.3g} s apart; give them in double precision, or in seconds since the first"
     )
 
 
@@ -217,8 +217,8 @@ def _check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
         length = int(np.min(np.asarray(trace.valid)))
     duration = (length - 1) * dt
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
-        what = "has no end" if math.isinf(horizon) else f"looks {horizon:g} s ahead"
-        raise HorizonError(f"the formula {what}, but the trace lasts {duration:g} s: {formula}")
+        what = "has no end" if math.isinf(horizon) else f"looks {horizon:zg} s ahead"
+        raise HorizonError(f"the formula {what}, but the trace lasts {duration:zg} s: {formula}")
 
 
 def evaluator_of(

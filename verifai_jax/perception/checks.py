@@ -56,7 +56,7 @@ def check_scene(scene: Any, camera: Camera, conditions: Conditions | None) -> Co
         height = _known(camera.position)
         if height is not None and height.shape == (3,) and height[2] <= 0:
             raise ValueError(
-                f"the camera is at a height of {height[2]:g} m; it must be above the ground, z > 0"
+                f"the camera is at a height of {height[2]:zg} m; it must be above the ground, z > 0"
             )
     _check(scene.sky, "the sky", 3)
     _check(camera, "the camera", 3)

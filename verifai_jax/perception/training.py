@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.errors import suggests_options
+from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.perception._detector import Detection, Detector, Layer, detector
 
 
@@ -33,6 +34,7 @@ class Labels(NamedTuple):
 
 
 @suggests_options
+@shows_progress("training a detector", "steps")
 def train_detector(
     images: Float[Array, "n height width 3"] | np.ndarray,
     labels: Labels,
@@ -43,6 +45,7 @@ def train_detector(
     learning_rate: float = 2e-3,
     noise: float = 0.02,
     seed: int = 0,
+    progress: bool | None = None,
 ) -> tuple[Detector, Float[np.ndarray, " steps"]]:
     """Train a detector by Adam, the rate of which falls as a cosine.
 
@@ -58,6 +61,8 @@ def train_detector(
     - `learning_rate`: of the first step.
     - `noise`: standard deviation of what is added to each pixel, anew in each step.
     - `seed`: of the weights, the order of the images and the noise.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** the network, and the loss of each step.
 
@@ -88,6 +93,7 @@ def train_detector(
         part = jax.tree.map(lambda leaf, at=chosen: leaf[at], (images, labels))
         trained, state, loss = update(trained, state, *part, jax.random.fold_in(pixels, step))
         losses.append(loss)
+        say_done(step + 1, steps)
     return trained, np.asarray(jax.device_get(losses), np.float32)
 
 

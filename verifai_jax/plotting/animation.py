@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,12 +12,15 @@ import numpy as np
 from jaxtyping import UInt8
 
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.plotting.mujoco_scene import can_draw, film, record
-from verifai_jax.plotting.style import new_figure
+from verifai_jax.plotting.film import LAST, MOST_FRAMES, MOST_WANTED, check_film
+from verifai_jax.plotting.gymnasium_film import episode_of, film_episode
+from verifai_jax.plotting.mujoco_motion import can_draw, record
+from verifai_jax.plotting.mujoco_scene import film
+from verifai_jax.plotting.style import DPI, new_figure
 
 FRAMES_PER_SECOND = 25
-MOST_FRAMES = 150
-"""Frames at most; a longer simulation is played faster."""
+SIZE = (572, 330)
+"""Width and height in pixels of a frame that a problem draws itself."""
 
 
 @dataclass(frozen=True)
@@ -41,32 +44,55 @@ class Animation:
         return {"image/gif": base64.b64encode(self.gif).decode(), "text/plain": repr(self)}
 
 
-def animate(replay: Replay, path: str | Path | None = None) -> Animation:
-    """Draw a simulation as a GIF, in real time where it fits into `MOST_FRAMES` frames.
+def animate(
+    replay: Replay,
+    path: str | Path | None = None,
+    *,
+    camera: str | None = None,
+    size: Sequence[int] | None = None,
+    fps: float | None = None,
+) -> Animation:
+    """Draw a simulation as a GIF, in real time where it has not too many frames.
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
-    system that is a MuJoCo model.
+    system that has a MuJoCo model (`vj.mujoco`, `vj.brax`), and an environment of Gymnasium draws
+    itself.
 
     **Arguments:**
 
     - `replay`: what `run.replay` returned.
     - `path`: of a file to write too; folders are made.
+    - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left
+      out.
+    - `size`: width and height of a frame in pixels.
+    - `fps`: frames a second; chosen when left out.
 
-    **Raises:** `ValueError` for any other problem without `draw`, and for a path that does not end
-    in `.gif`; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.
+    **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
+    `.gif`, a camera where there is no MuJoCo model, and sizes that are none; `UnknownNameError` for
+    a camera that the model lacks; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.
     """
     _check_gif(path)
-    draw = replay.problem.draw
+    check_film(size, fps)
+    draw, system = replay.problem.draw, replay.problem.system
+    pixels = None if size is None else (int(size[0]), int(size[1]))
+    if camera is not None and (draw is not None or not can_draw(system)):
+        raise ValueError(
+            f"camera names a camera of a MuJoCo model, which does not draw problem "
+            f"{replay.problem.name!r}; leave it out, got {camera!r}"
+        )
     if draw is not None:
-        animation = Animation(_drawn(replay, draw))
-    elif can_draw(replay.problem.system):
+        animation = Animation(_drawn(replay, draw, pixels or SIZE, fps))
+    elif can_draw(system):
         with TemporaryDirectory() as folder:
-            file = film(record(replay), Path(folder) / "animation.gif")
+            place = Path(folder) / "animation.gif"
+            file = film(record(replay), place, pixels, camera=camera, fps=fps)
             animation = Animation(file.read_bytes())
+    elif episode_of(system) is not None:
+        animation = Animation(film_episode(replay, pixels, fps))
     else:
         raise ValueError(
             f"problem {replay.problem.name!r} cannot be animated: it has no draw function "
-            "(axes, trace, sample, features)"
+            "(axes, trace, sample, features), no MuJoCo model and no environment of Gymnasium"
         )
     if path is not None:
         animation.save(path)
@@ -78,13 +104,16 @@ def _check_gif(path: str | Path | None) -> None:
         raise ValueError(f"an animation is a GIF, a file with the ending .gif; got {str(path)!r}")
 
 
-def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
+def _drawn(
+    replay: Replay, draw: Callable[..., None], size: tuple[int, int], fps: float | None
+) -> bytes:
     """Return the GIF of what the problem draws itself."""
     from PIL import Image
 
     clock = np.asarray(replay.trace.clock())
     seconds = float(clock[-1] - clock[0])
-    count = max(2, min(MOST_FRAMES, round(seconds * FRAMES_PER_SECOND)))
+    rate, most = (FRAMES_PER_SECOND, MOST_FRAMES) if fps is None else (fps, MOST_WANTED)
+    count = max(2, min(most, round(seconds * rate)))
     samples = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count)).clip(
         max=len(clock) - 1
     )
@@ -92,11 +121,11 @@ def _drawn(replay: Replay, draw: Callable[..., None]) -> bytes:
     samples, repeated = np.unique(samples, return_counts=True)
     frames, layout = [], None
     for sample in samples.tolist():
-        frame, layout = _frame(replay, draw, sample, layout)
+        frame, layout = _frame(replay, draw, sample, size, layout)
         frames.append(frame)
     # The last instant is the one that matters: it stays for a while.
-    shown = [1000 / FRAMES_PER_SECOND * int(times) for times in repeated]
-    shown[-1] += 1500 - 1000 / FRAMES_PER_SECOND
+    shown = [1000 / rate * int(times) for times in repeated]
+    shown[-1] += LAST - 1000 / rate
     images = [Image.fromarray(frame).quantize(colors=32) for frame in frames]
     file = io.BytesIO()
     images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=shown, loop=0)
@@ -111,16 +140,20 @@ class _Layout(NamedTuple):
 
 
 def _frame(
-    replay: Replay, draw: Callable[..., None], sample: int, before: _Layout | None
+    replay: Replay,
+    draw: Callable[..., None],
+    sample: int,
+    size: tuple[int, int],
+    before: _Layout | None,
 ) -> tuple[UInt8[np.ndarray, "height width 3"], _Layout | None]:
-    """Return the picture of one sample, and its layout.
+    """Return the picture of one sample, of a width and a height in pixels, and its layout.
 
     - `before`: the layout of the frame before, which stays where nothing has changed that decides
       on it: to lay out a frame takes longer than to draw it.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure = new_figure(figsize=(5.2, 3.0))
+    figure = new_figure(figsize=(size[0] / DPI, size[1] / DPI))
     axes = figure.subplots()
     draw(axes, replay.trace, sample, replay.features)
     texts = (axes.get_title(), axes.get_xlabel(), axes.get_ylabel())

@@ -50,11 +50,12 @@ def plot_arms(
             right.plot(ends, [place, place], color=color, linewidth=3, alpha=0.5)
         right.plot(scale * difference.mean, place, "o", color=color)
     left.set_yticks(range(len(arms)), [arm.replace("_", " ") for arm in arms])
-    left.invert_yaxis()
+    # The marks of the first and the last arm are as high as a row.
+    left.set_ylim(len(arms) - 0.4, -0.6)
     label = metric.replace("_", " ")
     left.set_xlabel(f"{label}{unit}: seeds and their mean")
     points = " (points)" if metric in SHARES else ""
-    sure = f"{100 * result.confidence:g} % t interval"
+    sure = f"{100 * result.confidence:zg} % t interval"
     right.set_xlabel(f"{label} minus that of {reference}{points}, {sure}")
     right.axvline(0, color=BOUND, linewidth=0.8, linestyle=":")
     for axes in (left, right):

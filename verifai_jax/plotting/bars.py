@@ -9,7 +9,15 @@ import pandas as pd
 from verifai_jax.analysis._importance import NAMES, Importance
 from verifai_jax.analysis.sensitivity.sensitivity import Sensitivity
 from verifai_jax.core.figure import Axes, Figure
-from verifai_jax.plotting.style import BOUND, FAILING, new_figure, show_or_save, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    name_points,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 SECOND = "#8d99ae"
 """Colour of what is shown next to failures and to total influence."""
@@ -113,7 +121,7 @@ def draw_bars(axes: Axes, table: pd.DataFrame, columns: Mapping[str, str]) -> No
             xerr=reach,
             error_kw={"ecolor": BOUND, "elinewidth": 1, "capsize": 2},
         )
-    axes.set_yticks(place, [str(name) for name in table.index])
+    axes.set_yticks(place, [wrap_name(str(name)) for name in table.index])
     axes.invert_yaxis()
     axes.axvline(0, color=BOUND, linewidth=0.8)
     tidy(axes)
@@ -147,12 +155,12 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
         ecolor=BOUND,
         elinewidth=0.8,
     )
-    for name, x, y in zip(table.index, across, up, strict=True):
-        axes.annotate(str(name), (x, y), textcoords="offset points", xytext=(5, 5), fontsize=8)
     axes.set_xlim(0, most)
     axes.set_ylim(-0.03 * most, most)
     axes.set_xlabel("mean size of the effect on the robustness")
     axes.set_ylabel("standard deviation of the effect\n(interaction or curvature)")
     tidy(axes)
     figure.suptitle(title, fontsize=10)
+    ends = (table[end].to_numpy(float) for end in ("low", "high"))
+    name_points(axes, [str(name) for name in table.index], across, up, *ends)
     return show_or_save(figure, path)

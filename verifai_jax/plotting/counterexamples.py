@@ -20,7 +20,15 @@ from verifai_jax.counterexamples.description import format_apart, format_number
 from verifai_jax.mtl import Explanation, robustness_signal
 from verifai_jax.mtl.expression import Arithmetic, Number
 from verifai_jax.mtl.formula import Atom, Predicate
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 QUIET = "#8d99ae"
 MOST_BARS = 12
@@ -95,6 +103,7 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
         clock, 0, 1, where=margin[: len(clock)] < 0, transform=axes.get_xaxis_transform(),
         color=FAILING, alpha=0.13, linewidth=0, step="mid",
     )  # fmt: skip
+    decided = ""
     if np.isfinite(why.time):
         place = int(np.argmin(np.abs(clock - why.time)))
         axes.axvline(clock[place], color=FAILING, linewidth=1, linestyle=":")
@@ -103,22 +112,11 @@ def draw_decision(axes: Axes, why: Explanation) -> None:
         if bounds:
             nearest = min(bounds, key=lambda b: abs(b - values[place]))
             shown = format_apart(float(values[place]), nearest)[0]
-        low, high = axes.get_ylim()
-        late = place > len(clock) / 2
-        # Beside the instant's line, at the end of it that is away from the curve.
-        axes.annotate(
-            f"{shown} at {format_time(clock[place], 4)} s",
-            (clock[place], 0.05 if values[place] > (low + high) / 2 else 0.93),
-            xycoords=("data", "axes fraction"),
-            xytext=(-5 if late else 5, 0),
-            textcoords="offset points",
-            ha="right" if late else "left",
-            va="center",
-            fontsize=8,
-            color=FAILING,
-        )
-    axes.set_ylabel(_short(label, 28))
-    axes.set_title(f"decides: {_short(str(predicate), 60)}", fontsize=9, color=FAILING, loc="left")
+        decided = f"\n{shown} at {format_time(clock[place], 4)} s"
+    axes.set_ylabel(wrap_name(label, 28))
+    # Above the axes, where no curve runs through it.
+    title = f"decides: {_short(str(predicate), 100)}{decided}"
+    axes.set_title(title, fontsize=9, color=FAILING, loc="left")
     tidy(axes)
 
 
@@ -144,7 +142,7 @@ def _draw_input(axes: Axes, influence: Influence, explained: Explained) -> None:
     for span, one in zip(influence.spans or (), gain, strict=False):
         if most > 0 and one > 0.02 * most:
             axes.axvspan(*span, color=FAILING, alpha=0.25 * one / most, linewidth=0)
-    axes.set_ylabel(_short(influence.name, 14))
+    axes.set_ylabel(wrap_name(influence.name, 14))
     tidy(axes)
 
 
@@ -183,24 +181,20 @@ def _draw_bars(axes: Axes, explained: Explained) -> None:
         axes.axvline(0, color=BOUND, linewidth=0.9, linestyle="--")
         axes.axvline(explained.rho, color=FAILING, linewidth=1, linestyle=":")
         for y, end in zip(where, ends, strict=True):
-            if np.isfinite(end):
-                inside = end - explained.rho > 0.5 * (np.nanmax(ends) - explained.rho)
-                axes.annotate(
-                    format_number(float(end), 3), (max(end, explained.rho), y),
-                    fontsize=8, va="center",
-                    xytext=(-4 if inside else 4, 0), textcoords="offset points",
-                    ha="right" if inside else "left", color="white" if inside else BOUND,
-                )  # fmt: skip
-            else:
-                axes.annotate("no verdict", (explained.rho, y), fontsize=8, va="center")
-        axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:.3g})")
+            # Beside the axes, where no bar and no line is.
+            said = format_number(float(end), 3) if np.isfinite(end) else "no verdict"
+            axes.annotate(
+                said, (1.02, y), xycoords=axes.get_yaxis_transform(), fontsize=8, va="center",
+                annotation_clip=False,
+            )  # fmt: skip
+        axes.set_xlabel(f"robustness with the feature back at nominal\n(now {explained.rho:z.3g})")
         axes.set_title("what removes the failure", fontsize=9, loc="left")
     else:
         sizes = [float(np.abs(np.nan_to_num(i.gradient)).max(initial=0.0)) for i in shown]
         axes.barh(where, sizes, color=QUIET, height=0.6)
         axes.set_xlabel("change of robustness over the feature's range")
         axes.set_title("steepest features", fontsize=9, loc="left")
-    axes.set_yticks(where, [_short(name, 18) for name in names])
+    axes.set_yticks(where, [wrap_name(name) for name in names])
     axes.set_ylim(max(len(shown), 4) - 0.4, -0.6)
     tidy(axes)
     axes.grid(visible=False, axis="y")
@@ -237,12 +231,12 @@ def plot_shrunk(shrunk: Shrunk, path: str | Path | None = None) -> Figure:
             (0.5, y), xytext=(0, 5), ha="center",
             textcoords="offset points", fontsize=7, color=BOUND,
         )  # fmt: skip
-    labels = [_short(label, 24) for label in shrunk.labels[: len(places)]]
+    labels = [wrap_name(label, 24) for label in shrunk.labels[: len(places)]]
     left.set_yticks(range(len(places)), labels)
     left.set_ylim(max(len(places), 1) - 0.4, -0.8)
     left.set_xlim(-0.03, 1.03)
     left.set_xlabel("share of the range: green nominal, red failing")
-    title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:.3g}"
+    title = f"{shrunk.count} of {len(shrunk.u)} depart, by {shrunk.distance:z.3g}"
     left.set_title(title, fontsize=9, loc="left")
     tidy(left)
     left.grid(visible=False, axis="y")

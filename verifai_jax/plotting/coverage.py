@@ -7,7 +7,15 @@ import numpy as np
 from verifai_jax.analysis._coverage import Coverage
 from verifai_jax.core.figure import Figure
 from verifai_jax.plotting.panels import draw_samples, two_features
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 MOST_SHOWN = 12
 """Features drawn, the least covered first."""
@@ -40,7 +48,7 @@ def plot_coverage(coverage: Coverage, path: str | Path | None = None) -> Figure:
         expected = shown["expected_pairs" if k else "expected"]
         left.plot(expected, at, "|", color=BOUND, markersize=10, markeredgewidth=1.5)
     left.plot([], [], "|", color=BOUND, label="of as many uniform samples")
-    left.set_yticks(place, [str(name) for name in shown.index])
+    left.set_yticks(place, [wrap_name(str(name)) for name in shown.index])
     left.invert_yaxis()
     left.set_xlim(0, 1.02)
     left.set_xlabel("share occupied")

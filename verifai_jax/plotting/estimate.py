@@ -10,7 +10,16 @@ from matplotlib.figure import Figure
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.estimation.result import Estimate
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    log_ticks,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 
 def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
@@ -34,9 +43,7 @@ def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
     if axes:
         assert weights is not None
         _draw_weights(axes.pop(0), weights)
-    if path is not None:
-        figure.savefig(path)
-    return figure
+    return show_or_save(figure, path)
 
 
 def _draw_interval(axes: Axes, estimate: Estimate) -> None:
@@ -53,7 +60,8 @@ def _draw_interval(axes: Axes, estimate: Estimate) -> None:
             axes.plot(high, place, "|", color=color, markersize=14)
     axes.set_xscale("log")
     axes.set_xlim(least, min(1.5, estimate.upper_bound * 4))
-    axes.set_yticks(range(len(rows)), [row[0] for row in rows])
+    log_ticks(axes.xaxis)
+    axes.set_yticks(range(len(rows)), [wrap_name(row[0], 14) for row in rows])
     axes.set_ylim(-0.8, len(rows) - 0.2)
     axes.set_xlabel(f"failure probability ({sure})")
     tidy(axes)
@@ -71,6 +79,7 @@ def _draw_levels(axes: Axes, levels: list[float], fractions: list[float]) -> Non
     if max(shown) > 50 * (np.median([s for s in shown if s > 0] or [1.0])):
         axes.set_xscale("symlog", linthresh=max(min([s for s in shown if s > 0]), 1e-3))
     axes.set_yscale("log")
+    log_ticks(axes.yaxis)
     axes.set_xlabel("robustness at most")
     axes.set_ylabel("probability, by splitting")
     tidy(axes)

@@ -47,7 +47,7 @@ def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None =
         for y, row in zip(place, rows, strict=True):
             if np.isfinite(row.lift):
                 right = max(row.share, row.expected)
-                axes.text(right + 0.015, float(y), f"{row.lift:.2f}x", va="center", fontsize=8)
+                axes.text(right + 0.015, float(y), f"{row.lift:z.2f}x", va="center", fontsize=8)
     axes.set_yticks(place, [shorten(text) for text in shown["combination"]])
     axes.invert_yaxis()
     axes.set_xlim(0, min(1.1, 1.15 * max(shown[["share", "expected"]].max().max(), 0.05)))

@@ -9,12 +9,23 @@ from matplotlib.figure import Figure
 
 from verifai_jax.core.text import format_percent
 from verifai_jax.failure_modes.result import Modes
-from verifai_jax.plotting.style import BOUND, FAILING, INPUT, NOT_CLAIMED, SAFE, new_figure, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    INPUT,
+    NOT_CLAIMED,
+    SAFE,
+    log_ticks,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 COLORS = (FAILING, INPUT, SAFE, NOT_CLAIMED, "#8e6c8a", "#7f4f24", "#4ea8de", "#90a955")
 """Colours of the modes, in turn."""
-LONGEST = 34
-"""Characters of a name beside its bar."""
+WIDEST = 30
+"""Characters of a line of a name beside its bar."""
 
 
 def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
@@ -29,14 +40,12 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     differ most, beside their likeliest ones.
     """
     numeric = _apart(modes)
-    figure = new_figure(figsize=(9.6 if numeric else 5.4, 0.5 * max(len(modes), 4) + 1.6))
+    figure = new_figure(figsize=(10.4 if numeric else 6.2, 0.6 * max(len(modes), 4) + 1.6))
     axes = list(np.atleast_1d(figure.subplots(1, 2 if numeric else 1)))
     _draw_bars(axes[0], modes)
     if numeric:
         _draw_failures(axes[1], modes, numeric)
-    if path is not None:
-        figure.savefig(path)
-    return figure
+    return show_or_save(figure, path)
 
 
 def _draw_bars(axes: Axes, modes: Modes) -> None:
@@ -44,11 +53,12 @@ def _draw_bars(axes: Axes, modes: Modes) -> None:
         color = COLORS[mode.number % len(COLORS)]
         axes.plot([mode.low, mode.high], [mode.number] * 2, color=color, linewidth=4, alpha=0.6)
         axes.plot(mode.probability, mode.number, "o", color=color)
-    names = [f"{mode.number}: {_shorten(mode.name)}" for mode in modes]
+    names = [wrap_name(f"{mode.number}: {mode.name}", WIDEST, 3) for mode in modes]
     axes.set_yticks(range(len(modes)), names)
     axes.set_ylim(len(modes) - 0.4, -0.6)
     if len(modes):
         axes.set_xscale("log")
+        log_ticks(axes.xaxis)
     axes.set_xlabel(f"failure probability ({format_percent(modes.confidence)})")
     axes.set_title(f"modes of failure of {modes.name}", fontsize=10)
     tidy(axes)
@@ -89,7 +99,3 @@ def _apart(modes: Modes) -> tuple[str, str] | None:
 
     first, second, *_ = sorted(numeric, key=apart)
     return first, second
-
-
-def _shorten(name: str) -> str:
-    return name if len(name) <= LONGEST else f"{name[: LONGEST - 3]}..."

@@ -8,42 +8,27 @@ by the environment variable `MUJOCO_GL`. Where nothing is named and there is no 
 used.
 """
 
-import copy
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Int, UInt8
 
-from verifai_jax.core.errors import require, unknown_name
-from verifai_jax.core.programs import Slot
-from verifai_jax.core.waveform import set_durations
-from verifai_jax.evaluation.replay import Replay
-from verifai_jax.plotting.replay import decisive_instant
-from verifai_jax.systems.mujoco.system import MuJoCo
-
-Frame = UInt8[np.ndarray, "height width 3"]
+from verifai_jax.core.errors import require
+from verifai_jax.plotting.film import BACKGROUND, Frame, check_film, film_samples, gif, labelled
+from verifai_jax.plotting.mujoco_motion import Motion
+from verifai_jax.plotting.mujoco_view import best_view, named_view
 
 FRAMES_PER_SECOND = 20
-MOST_FRAMES = 120
-"""Frames at most; a longer motion is played faster."""
 SIZE = (480, 320)
 """Width and height of a frame in pixels."""
-COLORS = 128
-"""Colours of a GIF."""
 AMBIENT = 0.35
 """Ambient light at least, from 0 to 1."""
-HEADER = 24
-"""Pixels above a frame for its caption."""
-BACKGROUND = np.array([232, 237, 242], np.uint8)
-"""Colour where a model has no sky."""
 ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
 
 
@@ -51,134 +36,37 @@ class NoRenderer(RuntimeError):
     """There is no OpenGL to draw with; one line that says what to install or set."""
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """A model, and where it was at each sample that counts.
-
-    - `model`: a `mujoco.MjModel` of its own, with the features in place.
-    - `clock`: seconds of each sample.
-    - `pushes`: forces and torques on the bodies, from outside.
-    - `caption`: what is written above the frames.
-    - `decisive`: the sample that decided a failure, None for a simulation that kept its spec.
-    """
-
-    model: Any
-    clock: Float[np.ndarray, " samples"]
-    qpos: Float[np.ndarray, "samples nq"]
-    pushes: Float[np.ndarray, "samples nbody 6"]
-    caption: str = ""
-    decisive: int | None = None
-
-
-def can_draw(system: object) -> bool:
-    """Return whether a system is a MuJoCo model, which can be drawn by itself."""
-    return isinstance(system, MuJoCo)
-
-
-def record(replay: Replay) -> Motion:
-    """Simulate a replay once more, on the same engine, and keep the positions.
-
-    **Raises:** `ValueError` for a system that is no MuJoCo model.
-    """
-    system: Any = replay.problem.system
-    if not can_draw(system):
-        raise ValueError(f"the system of problem {replay.problem.name!r} is no MuJoCo model")
-    features, loop = set_durations(replay.features, system.duration), system.loop
-    # Kept with the problem, as they are compiled once.
-    simulate, placed = replay.problem.programs.get(RECORDERS, None, lambda: _recorder(system))
-    clock = np.asarray(replay.trace.clock(), np.float64)
-    samples = len(clock)
-    precise = any(np.asarray(v).dtype == np.float64 for v in replay.trace.signals.values())
-    with jax.enable_x64(precise):
-        trace = simulate(features, getattr(replay, "key", None))
-        qpos = np.asarray(trace["qpos"], np.float64)[:samples]
-        times = loop.control_period * np.arange(loop.periods + 1)
-        leaves, acting = placed(features, times)
-    model = copy.copy(loop.compiled)
-    for name, value in leaves.items():
-        owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
-        array = getattr(owner, field)
-        array[...] = np.asarray(value).reshape(array.shape)
-    pushes = np.zeros((samples, model.nbody, 6))
-    if "xfrc_applied" in acting:
-        pushes[...] = acting["xfrc_applied"][:samples]
-    decided = None
-    if replay.violated:
-        formula = replay.problem.formulas[replay.worst]
-        decided = decisive_instant(formula, replay.trace, replay.problem.end)
-    row = "" if replay.row is None else f", row {replay.row}"
-    verdict = "violated" if replay.violated else replay.status.name.lower()
-    return Motion(
-        model,
-        clock,
-        qpos,
-        pushes,
-        f"{replay.problem.name}{row}: {verdict}",
-        None if decided is None else decided[1],
-    )
-
-
-RECORDERS: Slot[None, tuple[Callable[..., Any], Callable[..., Any]]] = Slot("recorders")
-"""Compiled functions that simulate one replay of a problem with its positions."""
-
-
-def _recorder(system: Any) -> tuple[Any, Any]:
-    """Return the system with its positions as the only signal, and what features set, compiled."""
-    loop = system.loop
-
-    def positions(time: Any, state: Any, control: Any, features: Any) -> dict[str, Any]:
-        return {"qpos": state.qpos}
-
-    def placed(features: Any, times: Any) -> tuple[Any, Any]:
-        acting = jax.vmap(lambda time: loop.bindings.applied_at(features, time))(times)
-        return loop.bindings.leaves(features), acting
-
-    recorder = replace(system, loop=replace(loop, signals=positions))
-    return recorder if recorder.black_box else jax.jit(recorder), jax.jit(placed)
-
-
 def film(
-    motion: Motion, path: str | Path, size: tuple[int, int] = SIZE, **camera: str | None
+    motion: Motion,
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    *,
+    camera: str | None = None,
+    fps: float | None = None,
 ) -> Path:
-    """Write an animated GIF, in real time where it fits into `MOST_FRAMES` frames.
+    """Write an animated GIF, in real time where its frames are not too many.
 
     **Arguments:**
 
     - `motion`: what `record` returned.
     - `path`: of the file; folders are made.
-    - `size`: width and height in pixels.
+    - `size`: width and height in pixels; `SIZE` when left out.
     - `camera`: as for `frames`.
+    - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
 
     **Returns:** the path.
 
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
-    from PIL import Image
-
-    seconds = float(motion.clock[-1] - motion.clock[0])
-    count = max(2, min(MOST_FRAMES, round(seconds * FRAMES_PER_SECOND) + 1))
-    instants = np.linspace(motion.clock[0], motion.clock[-1], count)
-    samples = np.searchsorted(motion.clock, instants - 1e-9).clip(max=len(motion.clock) - 1)
-    plain = frames(motion, samples.tolist(), size, **camera)
+    check_film(size, fps)
+    samples, shown = film_samples(motion.clock, fps, FRAMES_PER_SECOND)
+    plain = frames(motion, samples.tolist(), size or SIZE, camera=camera)
     drawn = [
         _labelled(frame, motion, sample, motion.caption)
         for frame, sample in zip(plain, samples.tolist(), strict=True)
     ]
-    # One palette for all and no dithering, so that what does not move keeps its colour and the file
-    # stays small. Half of it is for the colours that there are, however few their pixels, or floor
-    # and sky would take them all.
-    some = np.concatenate([drawn[i].reshape(-1, 3) for i in (0, count // 2, count - 1)])
-    different = np.unique(some & 0xF8, axis=0) + 4
-    share = some[:: max(1, len(some) // len(different))]
-    both = np.concatenate([different.astype(np.uint8), share])
-    palette = Image.fromarray(both[None]).quantize(COLORS)
-    images = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in drawn
-    ]
-    shown = [max(20, round(1000 * seconds / (count - 1) / 10) * 10)] * (count - 1) + [1500]
     path = _folder_of(path)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=shown, loop=0)
+    path.write_bytes(gif(drawn, shown))
     return path
 
 
@@ -187,7 +75,7 @@ def strip(
     path: str | Path,
     count: int = 6,
     size: tuple[int, int] = (280, 300),
-    **camera: str | None,
+    camera: str | None = None,
 ) -> Path:
     """Write a PNG of `count` instants side by side, from the start to the end.
 
@@ -214,7 +102,7 @@ def strip(
         spread = 1.0 - (1.0 - spread) ** 1.6
     samples = np.unique(np.rint(spread * last).astype(int)).tolist()
     pieces = []
-    for frame, sample in zip(frames(motion, samples, size, **camera), samples, strict=True):
+    for frame, sample in zip(frames(motion, samples, size, camera=camera), samples, strict=True):
         labelled = _labelled(frame, motion, sample, "" if pieces else motion.caption)
         pieces += [labelled, np.full((len(labelled), 4, 3), 255, np.uint8)]
     path = _folder_of(path)
@@ -236,8 +124,8 @@ def frames(
     - `motion`: what `record` returned.
     - `samples`: their numbers.
     - `size`: width and height in pixels.
-    - `camera`: the name of one of the model's; its first one when left out, or, in a model that
-      has none, one that follows its heaviest moving body from the side.
+    - `camera`: the name of one of the model's; when left out, the one that sees best what moves
+      (`mujoco_view.best_view`), of the model's or one that is made for it.
 
     **Returns:** a picture `[height, width, 3]` of each.
 
@@ -245,10 +133,10 @@ def frames(
     """
     mujoco = require("mujoco", extra="mujoco")
     model, data = motion.model, mujoco.MjData(motion.model)
-    view = _view(mujoco, model, camera)
     option = mujoco.MjvOption()
     drawn = []
     with canvas(model, size) as draw:
+        view = named_view(model, camera) if camera else best_view(motion, draw, size)
         for sample in samples:
             data.time = motion.clock[sample]
             data.qpos[:] = motion.qpos[sample]
@@ -261,7 +149,8 @@ def frames(
 def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     """Give `draw(data, camera, option, arrows) -> pixels` for pictures of `size`, off the screen.
 
-    `arrows` are pairs of points, tail and tip.
+    `arrows` are pairs of points, tail and tip. With `numbers=True` it gives, in place of colours,
+    the number of the geom that each pixel shows `[height, width]`, -1 for none.
 
     The model's settings of light and buffers are raised to what such pictures need.
 
@@ -288,8 +177,12 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
         scene = mujoco.MjvScene(model, 2000 + 2 * model.ngeom)
         area = mujoco.MjrRect(0, 0, width, height)
 
-        def draw(data: Any, camera: Any, option: Any, arrows: Any) -> Frame:
+        def draw(
+            data: Any, camera: Any, option: Any, arrows: Any, numbers: bool = False
+        ) -> Frame | Int[np.ndarray, "height width"]:
             everything = mujoco.mjtCatBit.mjCAT_ALL
+            for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+                scene.flags[flag] = numbers
             mujoco.mjv_updateScene(model, data, option, None, camera, everything, scene)
             for tail, tip in arrows:
                 geom = scene.geoms[scene.ngeom]
@@ -303,6 +196,8 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
             pixels = np.empty((height, width, 3), np.uint8)
             depth = np.empty((height, width), np.float32)
             mujoco.mjr_readPixels(pixels, depth, area, pen)
+            if numbers:
+                return _geoms(scene, pixels)[::-1]
             # Nothing lies at the far end of the depth buffer, 0 or 1.
             return np.where(((depth > 0) & (depth < 1))[..., None], pixels, BACKGROUND)[::-1]
 
@@ -310,6 +205,17 @@ def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
     finally:
         pen.free()
         context.free()
+
+
+def _geoms(scene: Any, pixels: Frame) -> Int[np.ndarray, "height width"]:
+    """Return the geoms that pixels show whose colours are numbers of a scene."""
+    mujoco = require("mujoco", extra="mujoco")
+    shown = pixels.astype(np.int64) @ np.array([1, 1 << 8, 1 << 16])
+    geom_of = np.full(scene.ngeom + 1, -1)
+    for geom in scene.geoms[: scene.ngeom]:
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and 0 <= geom.segid < scene.ngeom:
+            geom_of[geom.segid + 1] = geom.objid
+    return geom_of[np.where(shown > scene.ngeom, 0, shown)]
 
 
 def _arrows(motion: Motion, data: Any, sample: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -357,43 +263,12 @@ def explain_failure(error: Exception) -> str:
     )
 
 
-def _view(mujoco: Any, model: Any, name: str | None) -> Any:
-    known = [model.camera(i).name for i in range(model.ncam)]
-    view = mujoco.MjvCamera()
-    if name is not None and name not in known:
-        raise unknown_name("camera", name, known)
-    if model.ncam:
-        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        view.fixedcamid = 0 if name is None else known.index(name)
-        return view
-    mujoco.mjv_defaultFreeCamera(model, view)
-    moving = np.flatnonzero(model.body_dofnum)
-    view.azimuth, view.elevation = 100.0, -12.0
-    if moving.size:
-        view.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        view.trackbodyid = int(moving[np.argmax(model.body_mass[moving])])
-        view.distance = 1.6 * model.stat.extent
-    return view
-
-
 def _labelled(
     image: Frame, motion: Motion, sample: int, caption: str
 ) -> UInt8[np.ndarray, "taller width 3"]:
     """Write caption and time above a frame; a red edge from the decisive sample on."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    header = np.full((HEADER, *image.shape[1:]), BACKGROUND, np.uint8)
-    picture = Image.fromarray(np.concatenate([header, image]))
-    pen = ImageDraw.Draw(picture)
-    width, height = picture.size
-    font = ImageFont.load_default(size=13)
     failed = motion.decisive is not None and sample >= motion.decisive
-    ink = (190, 45, 65) if failed else (48, 50, 61)
-    pen.text((10, 5), caption, fill=ink, font=font)
-    pen.text((width - 10, 5), f"{motion.clock[sample]:.2f} s", fill=ink, font=font, anchor="ra")
-    if failed:
-        pen.rectangle((0, 0, width - 1, height - 1), outline=ink, width=3)
-    return np.asarray(picture)
+    return labelled(image, caption, float(motion.clock[sample]), failed)
 
 
 def _folder_of(path: str | Path) -> Path:

@@ -40,9 +40,10 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     widths = [1.5, 1] if bars else [1]
     panels = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
     axes = panels[0]
+    # The axes are those of the first rule, whose box would lie on no others.
     used = [c.feature for rule in rules.rules for c in rule.conditions] if rules else []
-    preferred = importance.ranked[:2] if importance is not None else used
-    across, up = two_features(samples, preferred)
+    ranked = importance.ranked if importance is not None else []
+    across, up = two_features(samples, [*used, *ranked])
     draw_samples(axes, samples, across, up)
     for number, rule in enumerate(rules.rules[:MOST_RULES] if rules else (), 1):
         draw_rule(axes, samples, rule, across, up, f"rule {number}")
@@ -55,7 +56,7 @@ def plot_overview(analysis: Analysis, path: str | Path | None = None) -> Figure:
     if rules is not None and rules.rules:
         first = rules.rules[0]
         lines.append(f"rule 1: {first.words} ({format_percent(first.coverage)} of the failures)")
-    figure.suptitle("\n".join(line[:130] for line in lines), fontsize=9.5)
+    figure.suptitle("\n".join(line[:260] for line in lines), fontsize=9.5)
     return show_or_save(figure, path)
 
 

@@ -6,8 +6,16 @@ import numpy as np
 
 from verifai_jax.analysis._pca import Components
 from verifai_jax.core.figure import Figure
-from verifai_jax.core.text import format_percent, shorten
-from verifai_jax.plotting.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.core.text import format_percent
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 DOTS = 3000
 """Rows drawn at most, of each verdict."""
@@ -48,7 +56,7 @@ def plot_components(components: Components, path: str | Path | None = None) -> F
         bars.barh(
             place, directions[i][shown], height * 0.9, color=color, label=f"component {i + 1}"
         )
-    bars.set_yticks(np.arange(len(shown)), [shorten(names[j], 28) for j in shown])
+    bars.set_yticks(np.arange(len(shown)), [wrap_name(names[j]) for j in shown])
     bars.invert_yaxis()
     bars.axvline(0, color=BOUND, linewidth=0.8)
     bars.set_xlim(-1.05, 1.05)

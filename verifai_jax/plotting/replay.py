@@ -1,7 +1,6 @@
 """One simulation: its signals, the bounds they must keep, and the instant that decided."""
 
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,16 @@ from verifai_jax.mtl.expression import (
     expression,
 )
 from verifai_jax.mtl.formula import Atom, Predicate
-from verifai_jax.plotting.style import BOUND, FAILING, INPUT, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.plotting.style import (
+    BOUND,
+    FAILING,
+    INPUT,
+    SAFE,
+    new_figure,
+    show_or_save,
+    tidy,
+    wrap_name,
+)
 
 MOST_PANELS = 6
 """Signals drawn at most, unless more are monitored."""
@@ -70,7 +78,7 @@ def plot_replay(
     inputs = {n: values for n, values in _input_signals(replay).items() if n not in curves}
     monitored = list(dict.fromkeys(s for f in formulas.values() for s in f.signals()))
     monitored = [signal for signal in monitored if signal in curves]
-    others = [signal for signal in curves if signal not in monitored]
+    others = _telling([signal for signal in curves if signal not in monitored], curves, monitored)
     curves |= inputs
     ordered = [*monitored, *inputs, *others]
     if signals is not None:
@@ -95,8 +103,9 @@ def plot_replay(
         _name_signal(axes, f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
         # A power of ten above the axis, as matplotlib writes it, would cover the predicates there.
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:.10g}".replace("-", "\u2212"))
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:z.10g}".replace("-", "\u2212"))
         named = {}
+        said = "" if decisive is None or decisive[0] != signal else _mark(axes, trace, *decisive)
         for predicate, limits in _bounds(replay, signal, shown).items():
             margin = np.asarray(robustness_signal(predicate, trace, end=replay.problem.end))
             fails = margin < 0
@@ -106,15 +115,13 @@ def plot_replay(
                 _shade(axes, clock, fails)
             color = (FAILING if blamed else BOUND) if fails.any() else SAFE
             named[str(predicate)] = (color, float(margin.min()))
-        _name_bounds(axes, named)
+        _name_bounds(axes, named, said)
         if decisive is not None:
             axes.axvline(clock[decisive[1]], color=FAILING, linewidth=1, linestyle=":")
-    if decisive is not None and decisive[0] in shown:
-        _mark(panels[shown.index(decisive[0])], trace, *decisive)
     left_out = _left_out([signal for signal in ordered if signal not in shown])
     panels[-1].set_xlabel("time [s]" + left_out, wrap=True)
     figure.align_ylabels(panels)
-    worst = f"robustness {replay.rho[name]:.4g}"
+    worst = f"robustness {replay.rho[name]:z.4g}"
     verdict = f"{worst} ({'violated' if replay.violated else 'ok'})"
     if replay.status != Status.OK:
         verdict = f"no verdict ({replay.status.name.lower()})"
@@ -149,6 +156,33 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     at_all = jax.jit(lambda waveforms, clock: {n: jax.vmap(w)(clock) for n, w in waveforms.items()})
     found = at_all(waveforms, clock)
     return {name: np.asarray(found[name]) for name in waveforms}
+
+
+def _telling(
+    names: Sequence[str],
+    curves: Mapping[str, Shaped[np.ndarray, "t *vector"]],
+    shown: Sequence[str],
+) -> list[str]:
+    """Return signals in the order in which they are worth a panel.
+
+    What changes comes before what does not, and one signal of each body (`car_x`, `car_y` are of
+    one) before a second one: `shown` are drawn already.
+    """
+    count: dict[str, int] = {}
+
+    def turn(name: str) -> int:
+        body = name.rpartition("_")[0] or name
+        count[body] = count.get(body, 0) + 1
+        return count[body]
+
+    for name in shown:
+        turn(name)
+    still = {
+        n: np.array_equal(curves[n], np.broadcast_to(curves[n][:1], curves[n].shape)) for n in names
+    }
+    # Each once, in their own order, before they are sorted.
+    place = {name: (still[name], 0 if still[name] else turn(name)) for name in names}
+    return sorted(names, key=place.__getitem__)
 
 
 def _left_out(names: list[str]) -> str:
@@ -303,19 +337,16 @@ def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, "
 
 def _name_signal(axes: Axes, name: str) -> None:
     """Write a name beside its panel, across: panels are less high than names are long."""
-    lines = [""]
-    for part in re.findall(r"[^_. ]*[_. ]|[^_. ]+", name):
-        fits = not lines[-1] or len((lines[-1] + part).rstrip()) <= WIDEST_NAME
-        lines = [*lines[:-1], lines[-1] + part] if fits else [*lines, part]
     axes.set_ylabel(
-        "\n".join(map(str.rstrip, lines)), rotation=0, ha="right", va="center", fontsize=9
+        wrap_name(name, WIDEST_NAME, 4), rotation=0, ha="right", va="center", fontsize=9
     )
 
 
-def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]]) -> None:
+def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]], decided: str) -> None:
     """Write the predicates of a panel above it, one a line, first those that break a formula.
 
     - `predicates`: by their text, each with its colour and its least margin.
+    - `decided`: what decided there, for a line above them; empty for nothing.
     """
     ranks = [FAILING, BOUND, SAFE]
     place = {text: (ranks.index(color), least) for text, (color, least) in predicates.items()}
@@ -324,6 +355,8 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]]) -> None:
     lines = [(text, predicates[text][0]) for text in named]
     if others:
         lines.append((f"and {len(others)} more", predicates[others[0]][0]))
+    if decided:
+        lines.insert(0, (decided, FAILING))
     for number, (text, color) in enumerate(reversed(lines)):
         axes.annotate(
             shorten(text, LONGEST_PREDICATE),
@@ -338,21 +371,11 @@ def _name_bounds(axes: Axes, predicates: dict[str, tuple[str, float]]) -> None:
         )
 
 
-def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> None:
+def _mark(axes: Axes, trace: Trace, signal: str, sample: int) -> str:
+    """Mark the instant that decided; return what is said of it, above the curves."""
     time = float(trace.clock()[sample])
     value = np.asarray(trace.signals[signal])[sample]
     if np.ndim(value):
         value = value[int(np.argmax(np.abs(value)))]
     axes.plot([time], [value], "o", color=FAILING, markersize=6, clip_on=False)
-    right = sample > trace.length / 2
-    low, high = axes.get_ylim()
-    axes.annotate(
-        f"{signal} = {value:.4g} at {format_time(time, 4)} s",
-        (time, value),
-        textcoords="offset points",
-        xytext=(-12 if right else 12, -12 if value > (low + high) / 2 else 8),
-        ha="right" if right else "left",
-        fontsize=8,
-        color=FAILING,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
-    )
+    return f"decided by {signal} = {value:z.4g} at {format_time(time, 4)} s"

@@ -3,10 +3,13 @@
 import logging
 from pathlib import Path
 
+from verifai_jax.core.text import format_error
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.animation import animate
-from verifai_jax.plotting.mujoco_scene import NoRenderer, can_draw, film, record, strip
+from verifai_jax.plotting.gymnasium_film import episode_of, write_episode
+from verifai_jax.plotting.mujoco_motion import can_draw, record
+from verifai_jax.plotting.mujoco_scene import NoRenderer, film, strip
 from verifai_jax.plotting.replay import plot_replay
 from verifai_jax.plotting.robustness_history import plot_robustness_history
 from verifai_jax.plotting.scatter import plot_features
@@ -39,8 +42,9 @@ def write_replay_pictures(
 ) -> list[Path]:
     """Write the pictures of one simulation into a folder, animated too where its problem can.
 
-    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo cannot draw,
-    one line is logged that says what to do, and its pictures are left out.
+    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo, or an
+    environment of Gymnasium, cannot draw, one line is logged that says why, and the pictures are
+    left out.
 
     **Arguments:**
 
@@ -64,4 +68,10 @@ def write_replay_pictures(
             paths.append(film(motion, folder / f"{name}.gif"))
         except NoRenderer as error:
             logging.getLogger(__name__).warning("%s", error)
+    elif (episode := episode_of(replay.problem.system)) is not None:
+        try:
+            if episode.draws:
+                paths.append(write_episode(replay, folder / f"{name}.gif"))
+        except Exception as error:  # What draws there is not this package's.
+            logging.getLogger(__name__).warning("no film: %s", format_error(error))
     return paths

@@ -1,10 +1,23 @@
 """One look for all pictures; its colours are told apart by colour-blind readers too."""
 
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
 
 from verifai_jax.core import figure
 from verifai_jax.core.figure import Axes, Figure
+from verifai_jax.core.text import shorten
+
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
+else:
+    Axis = object
+
+Places = Float[np.ndarray, " n"]
 
 SAFE = "#3a9e7d"
 FAILING = "#d1495b"
@@ -28,7 +41,139 @@ def tidy(axes: Axes) -> None:
 
 
 def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
-    """Write the figure where a path is given; return it for a notebook to show."""
+    """Wrap what would be cut off, and write the figure where a path is given.
+
+    **Returns:** the figure, for a notebook to show.
+    """
+    _wrap_texts(drawn)
     if path is not None:
         drawn.savefig(path)
     return drawn
+
+
+def wrap_name(name: str, width: int = 20, lines: int = 2) -> str:
+    """Break a name into lines behind blanks and signs; one that is too long lacks its middle."""
+    return "\n".join(_broken(shorten(name, width * lines), width))
+
+
+def log_ticks(axis: Axis) -> None:
+    """Name a few numbers on a logarithmic axis: powers of ten, 2 and 5 too where these are few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = axis.get_view_interval()
+    narrow = high / low < 100
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,), numticks=6))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:zg}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def name_points(
+    axes: Axes, names: Sequence[str], x: Places, y: Places, low: Places, high: Places
+) -> None:
+    """Write names beside points, none on another; call it when the limits are set.
+
+    A name that has no room at its point is moved up or down, and a line joins the two.
+
+    **Arguments:**
+
+    - `axes`: with the points.
+    - `names`: of the points at `x` and `y`, in the units of the data.
+    - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
+    """
+    figure: Any = axes.figure
+    figure.draw_without_rendering()
+    renderer = _renderer(figure)
+    points = axes.transData.transform(np.column_stack([x, y]))
+    ends = [axes.transData.transform(np.column_stack([at, y])) for at in (low, high)]
+    taken = [(a - 4, py - 2, b + 4, py + 2) for (a, py), (b, _) in zip(*ends, strict=True)]
+    taken += [(px - 4, py - 4, px + 4, py + 4) for px, py in points]
+    middle = axes.bbox.x0 + 0.6 * axes.bbox.width
+    for name, (px, py) in sorted(zip(names, points.tolist(), strict=True), key=lambda n: -n[1][1]):
+        left = px > middle
+        text = axes.annotate(
+            name, (px, py), xycoords="figure pixels", fontsize=8, ha="right" if left else "left",
+            va="center", textcoords="offset pixels", xytext=(-8 if left else 8, 0),
+        )  # fmt: skip
+        box = text.get_window_extent(renderer)
+        step = 0.55 * box.height
+        for shift in sorted((k * step for k in range(-40, 41)), key=abs):
+            if py + shift < axes.bbox.y0 + step or py + shift > axes.bbox.y1 - step:
+                continue
+            away = 8 if abs(shift) < step else 18
+            x0 = px - away - box.width if left else px + away
+            place = (x0, py + shift - box.height / 2, x0 + box.width, py + shift + box.height / 2)
+            if not any(_overlap(place, other) for other in taken):
+                break
+        else:
+            text.remove()
+            continue
+        taken.append(place)
+        text.remove()
+        # In the units of the data, so that it stays there in a picture of another size.
+        at = axes.transData.inverted().transform((px, py))
+        scale = 72 / figure.dpi
+        axes.annotate(
+            name, tuple(at), fontsize=8, ha="right" if left else "left", va="center",
+            textcoords="offset points", xytext=((-away if left else away) * scale, shift * scale),
+            arrowprops=None if away == 8 else {"arrowstyle": "-", "color": BOUND, "linewidth": 0.5},
+        )  # fmt: skip
+
+
+def _overlap(one: Sequence[float], other: Sequence[float]) -> bool:
+    across = min(one[2], other[2]) > max(one[0], other[0])
+    return bool(across and min(one[3], other[3]) > max(one[1], other[1]))
+
+
+def _broken(line: str, width: int) -> list[str]:
+    """Break a line behind blanks and signs so that each part has at most so many characters."""
+    lines = [""]
+    for part in re.findall(r"[^\s_.,;=]*[\s_.,;=]|[^\s_.,;=]+", line):
+        fits = not lines[-1] or len((lines[-1] + part).rstrip()) <= width
+        lines = [*lines[:-1], lines[-1] + part] if fits else [*lines, part]
+    return [each.rstrip() for each in lines]
+
+
+def _renderer(drawn: Figure) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    return FigureCanvasAgg(drawn).get_renderer()
+
+
+def _wrap_texts(drawn: Figure) -> None:
+    """Break titles and labels of axes that are longer than what they belong to."""
+    renderer = _renderer(drawn)
+    if title := getattr(drawn, "_suptitle", None):
+        _wrap(title, 0.96 * drawn.bbox.width, renderer)
+    panels = [axes for axes in drawn.axes if axes.get_visible()]
+    # To lay a picture out takes longer than to measure its texts: only where one may be too long.
+    narrow = drawn.bbox.width / max(1, len({axes.get_subplotspec() for axes in panels})) * 0.6
+    texts = [text for axes in panels for text, _ in _labels(axes)]
+    if all(_length(text, renderer) < narrow for text in texts):
+        return
+    drawn.draw_without_rendering()
+    for axes in panels:
+        for text, room in _labels(axes):
+            _wrap(text, room, renderer)
+
+
+def _labels(axes: Axes) -> Iterator[tuple[Any, float]]:
+    """Yield titles and labels of axes, each with the pixels that it has."""
+    parts: Any = axes
+    for text in (axes.title, parts._left_title, parts._right_title, axes.xaxis.label):
+        if text.get_text():
+            yield text, axes.bbox.width
+    if axes.yaxis.label.get_text() and axes.yaxis.label.get_rotation() == 90:
+        yield axes.yaxis.label, 1.05 * axes.bbox.height
+
+
+def _length(text: Any, renderer: Any) -> float:
+    box = text.get_window_extent(renderer)
+    return box.height if text.get_rotation() == 90 else box.width
+
+
+def _wrap(text: Any, room: float, renderer: Any) -> None:
+    length = _length(text, renderer)
+    if length > room:
+        lines = text.get_text().split("\n")
+        width = max(12, int(max(map(len, lines)) * room / length))
+        text.set_text("\n".join(part for line in lines for part in _broken(line, width)))

@@ -18,6 +18,7 @@ from verifai_jax.plotting.style import (
     new_figure,
     show_or_save,
     tidy,
+    wrap_name,
 )
 from verifai_jax.sweeps.importance import HyperparameterImportance
 from verifai_jax.sweeps.ranking import (
@@ -226,10 +227,15 @@ def _same_training(table: "pd.DataFrame", row: Mapping[str, Any]) -> Bool[np.nda
 def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
     """Draw the learning curves of the whole trainings of some rows, over environment steps."""
     last = last_checkpoints(sweep.table)
+    used: set[str] = set()
     for row in rows:
         entry: Any = sweep.table.loc[row].to_dict()
         verdict = str(entry["verdict"])
         colour, marker = LOOKS["safe" if verdict.startswith("safe") else verdict or "undecided"]
+        # Of two with one verdict the second has a colour and a line of its own.
+        again = colour in used
+        colour, marker = (RETURN, "s") if again else (colour, marker)
+        used.add(colour)
         end = int(last.index[_same_training(last, entry)][0])
         trace, steps = sweep.curve(end), int(entry["steps"])
         clock, values = np.asarray(trace.clock()), np.asarray(trace["return"])
@@ -241,6 +247,7 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
             markevery=max(1, len(clock) // 8),
             markersize=4,
             linewidth=1.5,
+            linestyle="--" if again else "-",
             label=f"row {row}, {verdict}: {_failures(entry)}",
         )
         if end != row:
@@ -285,7 +292,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             hatch=hatch,
             edgecolor="white",
             linewidth=0,
-            label=f"{what} (model: R² {importance.scores[target]:.2f})",
+            label=f"{what} (model: R² {importance.scores[target]:z.2f})",
         )
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
@@ -296,7 +303,7 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
             linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else "",
         )
-    axes.set_yticks(place, [shorten(str(name), 18) for name in shown.index])
+    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
@@ -329,7 +336,7 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
             label=what,
         )
     axes.axvline(0, color=BOUND, linewidth=0.8)
-    axes.set_yticks(place, [shorten(str(name), 18) for name in shown.index])
+    axes.set_yticks(place, [wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")

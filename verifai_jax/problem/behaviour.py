@@ -108,7 +108,7 @@ class Behaviour:
             number, place = divmod(number, axis.cells)
             width = (axis.high - axis.low) / axis.cells
             begin = axis.low + place * width
-            parts.append(f"{axis.name} {begin:.4g} to {begin + width:.4g}")
+            parts.append(f"{axis.name} {begin:z.4g} to {begin + width:z.4g}")
         return ", ".join(reversed(parts))
 
     def __call__(self, trace: Trace, end: End = "hold") -> Int[Array, " marks"]:

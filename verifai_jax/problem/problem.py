@@ -8,6 +8,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from itertools import pairwise
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.errors import missing_name
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook, text_html
 from verifai_jax.core.precision import truncate_silently
 from verifai_jax.core.programs import ProgramCache, Slot
 from verifai_jax.core.sources import Maker, Sources, made_here, sources_of
@@ -41,7 +43,7 @@ class ProblemError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(InNotebook):
     """A feature space, a system and the properties it must keep, under a name.
 
     **Arguments:**
@@ -72,6 +74,11 @@ class Problem:
     **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, nominal
     features outside the space, or a priority that names no formula or goes round in a circle.
     """
+
+    _internal = frozenset((
+        "black_box", "draws", "form", "made_in", "monitored", "on_backend", "programs",
+        "sources",
+    ))  # fmt: skip
 
     name: str
     space: FeatureSpace
@@ -306,6 +313,11 @@ class Problem:
             function = getattr(self.system, "__wrapped__", self.system)
             why += f"; a system is called with (features, key){defined_at(function)}"
         return ProblemError(f"the system of problem {self.name!r} cannot be simulated: {why}")
+
+    def _repr_html_(self) -> str:
+        title = f"{self.name}: {self.description}" if self.description else self.name
+        rows = (f"<p>{escape(n)}: {f._repr_html_()}</p>" for n, f in self.formulas.items())
+        return "\n".join([text_html(title), *rows, self.space._repr_html_()])
 
     def __str__(self) -> str:
         lines = [f"{self.name}: {self.description}" if self.description else self.name]

@@ -77,7 +77,7 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
         if math.isfinite(ahead) and ahead > duration + 1.01 * form.dt:
             which = "the formula" if len(problem.formulas) == 1 else f"formula {name!r}"
             yield (
-                f"{which} looks {ahead:g} s ahead and a trace lasts {duration:g} s: "
+                f"{which} looks {ahead:zg} s ahead and a trace lasts {duration:zg} s: "
                 f"{END_OF_TRACE[problem.end]}"
             )
 

@@ -94,7 +94,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
             (
                 paragraph(
                     f"Whether a candidate fails more often than {comparison.baseline}, by more "
-                    f"than {100 * first.margin:g} points."
+                    f"than {100 * first.margin:zg} points."
                 ),
                 *([asked] if problem is None else problem_content(problem, about)),
             ),

@@ -12,6 +12,7 @@ from typing import Any
 from verifai_jax.comparison.result import Comparison
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import check_names
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.estimation.result import Estimate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -25,6 +26,7 @@ from verifai_jax.reports.sweep_report import sweep_page
 from verifai_jax.sweeps.result import Sweep
 
 
+@shows_progress("writing the report on")
 def write_report(
     result: Any,
     path: str | Path,
@@ -35,6 +37,7 @@ def write_report(
     studies: bool | None = None,
     modes: int | None = None,
     problem: Problem | None = None,
+    progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON beside it.
 
@@ -52,6 +55,8 @@ def write_report(
     - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
       `vj.modes` finds them; none when left out.
     - `problem`: of an estimate, or the baseline of a comparison, for its property and prior.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** the path of the HTML file.
 

@@ -35,13 +35,13 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     links = tuple(chained(model.inputs))
     chain = links[-1].chain if links else ""
     sure = format_percent(estimate.confidence)
-    interval = f"{estimate.low:.3g} to {estimate.high:.3g}"
-    bound = f"{estimate.upper_bound:.2g}"
+    interval = f"{estimate.low:z.3g} to {estimate.high:z.3g}"
+    bound = f"{estimate.upper_bound:z.2g}"
     if estimate.probability is None:
         headline = f"No estimate of the failure probability; at most {bound}, at {sure}."
     else:
         headline = (
-            f"Fails with probability {estimate.probability:.3g} ({sure} interval {interval}); "
+            f"Fails with probability {estimate.probability:z.3g} ({sure} interval {interval}); "
             f"guaranteed at most {bound}."
         )
     method = METHODS.get(estimate.method or "", "none that gave an estimate")
@@ -63,7 +63,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     if estimate.p0 is not None:
         shown = estimate.upper_bound <= estimate.p0
         words = "is shown" if shown else "is not shown by samples of the prior alone"
-        sentence = f"That the probability is below {estimate.p0:g} {words}."
+        sentence = f"That the probability is below {estimate.p0:zg} {words}."
         claims.append(Claim("C3", sentence, ("the guaranteed bound",), (MODEL, SAMPLES)))
     numbers: list[tuple[str, Child]] = [
         ("simulations", f"{estimate.simulations:,} of {estimate.budget:,}"),

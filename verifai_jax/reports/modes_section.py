@@ -31,7 +31,7 @@ def modes_section(found: Modes, about: About) -> Section:
         content.append(picture(png(found.plot()), "The ways of failing, with their probabilities"))
     for mode in found.modes[:MOST_MODES]:
         content.append(element("h3", f"Mode {mode.number}: its likeliest failure"))
-        out = f"It lies {mode.distance:.3g} standard deviations from the middle of the prior."
+        out = f"It lies {mode.distance:z.3g} standard deviations from the middle of the prior."
         content.append(paragraph(f"{_sentence(mode.cause)} {out}" if mode.cause else out))
         values = [
             (name, f"{number(value)} {about.units.get(name, '')}".strip())
@@ -66,11 +66,11 @@ def _whole(found: Modes) -> str:
     if found.probability is None:
         return (
             f"No way of failing was found in {found.simulations:,} simulations of this search; a "
-            f"failure has probability {found.upper_bound:.2g} at most ({sure} bound)."
+            f"failure has probability {found.upper_bound:z.2g} at most ({sure} bound)."
         )
     text = (
-        f"A failure has probability {found.probability:.3g} ({sure} interval {found.low:.3g} to "
-        f"{found.high:.3g}) under the prior, by {found.simulations:,} simulations."
+        f"A failure has probability {found.probability:z.3g} ({sure} interval {found.low:z.3g} to "
+        f"{found.high:z.3g}) under the prior, by {found.simulations:,} simulations."
     )
     if found.modes:
         low, high = found.unexplained
@@ -83,7 +83,7 @@ def _whole(found: Modes) -> str:
 
 def _probability(mode: Mode, found: Modes) -> str:
     sure = format_percent(found.confidence)
-    return f"{mode.probability:.3g} ({sure} interval {mode.low:.3g} to {mode.high:.3g})"
+    return f"{mode.probability:z.3g} ({sure} interval {mode.low:z.3g} to {mode.high:z.3g})"
 
 
 def _sentence(text: str) -> str:

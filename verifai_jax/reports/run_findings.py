@@ -124,7 +124,7 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
     meaning = f", {MEANING[verdict]}" if verdict in MEANING else ""
     content: list[Child] = [
         element("h3", f"Failure {failure.number}: row {failure.row}, {failure.why}"),
-        paragraph(f"Robustness {float(row['rho']):.6g}; closer replays: {verdict}{meaning}."),
+        paragraph(f"Robustness {float(row['rho']):z.6g}; closer replays: {verdict}{meaning}."),
         *(paragraph(text) for text in (failure.replay.warnings if failure.replay else ())),
         table(heads, values),
     ]
@@ -228,8 +228,8 @@ def not_claimed_rows(run: Run, most: int = 20) -> Iterable[Child]:
     rows = run.table.unconfirmed.sort_values("rho")
     for row_number, row in list(rows.to_dict("index").items())[:most]:
         again = float(row.get("rho_again", math.nan))
-        then = "" if math.isnan(again) else f", {again:.4g} when simulated again"
-        yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:.4g}{then}"
+        then = "" if math.isnan(again) else f", {again:z.4g} when simulated again"
+        yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:z.4g}{then}"
     if len(rows) > most:
         yield f"and {len(rows) - most:,} more"
 

@@ -125,7 +125,7 @@ def _constraint(run: Run, space: FeatureSpace | None) -> list[Markup]:
     if named is None and (space is None or space.where is None):
         return []
     share = (
-        "" if run.acceptance is None else f" It let through {run.acceptance:.3g} of the proposals."
+        "" if run.acceptance is None else f" It let through {run.acceptance:z.3g} of the proposals."
     )
     return [
         paragraph(
@@ -148,7 +148,7 @@ def system_rows(run: Run) -> list[tuple[str, Child]]:
         module = getattr(function, "__module__", "") or ""
         rows.append(("system", element("code", f"{module}.{name}".removeprefix("__main__."))))
         if not problem.black_box and (form := problem.form()) is not None and form.dt is not None:
-            rows.append(("duration", f"{problem.duration:g} s, a sample every {form.dt:g} s"))
+            rows.append(("duration", f"{problem.duration:zg} s, a sample every {form.dt:zg} s"))
         rows.append(("kind", "black box" if problem.black_box else "traced by JAX"))
         if system.exact_step:
             rows.append(("integration step", "belongs to the system, as its authors published it"))

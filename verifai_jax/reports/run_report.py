@@ -196,7 +196,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
         row = run.table.row(failure.row).to_dict()
         where = format_features({name: row[name] for name in run.table.features})
         sentence = (
-            f"The property fails at {where}, by {abs(float(row['rho'])):.4g}: row {failure.row}."
+            f"The property fails at {where}, by {abs(float(row['rho'])):z.4g}: row {failure.row}."
         )
         texts.append((sentence, (f"row {failure.row} of the table", "its replay"), common))
     if (small := studies.shrunk) is not None and small.count:

@@ -21,7 +21,7 @@ from verifai_jax.failure_modes import Modes
 from verifai_jax.failure_modes import modes as find_modes
 from verifai_jax.falsification.run import Run
 from verifai_jax.plotting.animation import animate
-from verifai_jax.plotting.mujoco_scene import can_draw
+from verifai_jax.plotting.mujoco_motion import can_draw
 from verifai_jax.reports.view import rows_to_trace, trace_data
 
 Result = TypeVar("Result")

@@ -137,7 +137,7 @@ def numbers_of(values: Any) -> list[float | int | None]:
 def _number(value: float) -> float | int | None:
     if not math.isfinite(value):
         return None
-    rounded = float(f"{value:.6g}")
+    rounded = float(f"{value:z.6g}")
     return int(rounded) if rounded.is_integer() and abs(rounded) < 1e6 else rounded
 
 
@@ -173,7 +173,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
         )
     decisive = decisive_instant(problem.formulas[replay.worst], trace, problem.end)
     verdict = "violates" if replay.violated else "keeps"
-    words = f"Row {replay.row} {verdict} the property, robustness {replay.rho[replay.worst]:.4g}."
+    words = f"Row {replay.row} {verdict} the property, robustness {replay.rho[replay.worst]:z.4g}."
     if replay.status != 0:
         words, decisive = f"Row {replay.row} has no verdict: {replay.status.name.lower()}.", None
     return {

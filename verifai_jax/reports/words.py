@@ -94,16 +94,16 @@ def _span(interval: Interval | None) -> str:
     if interval is None or interval.everything:
         return ""
     if interval.end == math.inf:
-        return f" from {interval.start:g} s on"
-    return f" from {interval.start:g} s to {interval.end:g} s"
+        return f" from {interval.start:zg} s on"
+    return f" from {interval.start:zg} s to {interval.end:zg} s"
 
 
 def _back(interval: Interval | None) -> str:
     if interval is None or interval.everything:
         return ""
     if interval.end == math.inf:
-        return f", {interval.start:g} s ago or earlier"
-    return f", {interval.start:g} s to {interval.end:g} s ago"
+        return f", {interval.start:zg} s ago or earlier"
+    return f", {interval.start:zg} s to {interval.end:zg} s ago"
 
 
 def domain_words(domain: Domain) -> str:
@@ -217,4 +217,4 @@ def number(value: Any) -> str:
         return one_line(str(value), 80)
     if isinstance(value, int | np.integer):
         return str(int(value))
-    return f"{float(value):.6g}"
+    return f"{float(value):z.6g}"

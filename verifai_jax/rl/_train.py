@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.core.callbacks import Callback, check_callbacks, notify
+from verifai_jax.core.progress import say_done, shows_progress
 from verifai_jax.rl.algorithm import Algorithm
 from verifai_jax.rl.batched_training import BatchedTraining, Configuration
 from verifai_jax.rl.policy import Policy
@@ -49,6 +50,7 @@ class Training:
     checkpoints: tuple[Checkpoint, ...] = ()
 
 
+@shows_progress("training", "steps")
 def train(
     task: Task,
     algorithm: Algorithm | None = None,
@@ -57,6 +59,7 @@ def train(
     steps: int = 200_000,
     checkpoints: Sequence[int] = (),
     callbacks: Iterable[Callback] = (),
+    progress: bool | None = None,
 ) -> Training:
     """Train a policy on a task.
 
@@ -73,6 +76,8 @@ def train(
     - `callbacks`: functions called for each update, in groups every two seconds, with the
       environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
       an episode ended in it.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     **Returns:** the policy with its learning curve.
 
@@ -84,14 +89,14 @@ def train(
 
     def watch(_: int, curve: Float[np.ndarray, " updates"]) -> None:
         nonlocal reported
+        returned = f"mean return {curve[-1]:z.4g}" if len(curve) else ""
+        say_done(len(curve) * algorithm.steps_per_update, steps, returned)
         for update in range(reported, len(curve)):
             values = {"update": update + 1, "mean_return": float(curve[update])}
             notify(called, (update + 1) * algorithm.steps_per_update, values)
         reported = len(curve)
 
-    run = BatchedTraining(
-        [Configuration(task, algorithm, steps, seed)], watch=watch if called else None
-    )
+    run = BatchedTraining([Configuration(task, algorithm, steps, seed)], watch=watch)
     reached = []
     ordered = sorted(set(checkpoints))
     for at in ordered:

@@ -139,7 +139,7 @@ class Sampling:
         distributions = sys.modules["scenic.core.distributions"]
         utils = sys.modules["scenic.core.utils"]
         values = utils.DefaultIdentityDict()
-        seed = f"{float(features.get(SEED, 0.0)):.9g}"
+        seed = f"{float(features.get(SEED, 0.0)):z.9g}"
         with LOCK, _seeded_generators(0):
             if self.scenario.externalSampler is not None:
                 _seed_generators(digest(seed, "external"))

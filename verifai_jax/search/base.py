@@ -19,6 +19,7 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.cube import Cube
+from verifai_jax.core.notebook import ForUsers
 
 KIND = 1 << 16
 """Marks below it are of the first kind, the next so many of the second, and so on."""
@@ -81,13 +82,19 @@ State = TypeVar("State")
 """The state of a search: a pytree of arrays."""
 
 
-class Search(abc.ABC, Generic[State]):
+class Search(ForUsers, abc.ABC, Generic[State]):
     """The contract; `verifai_jax.testing.check_search` tests it.
 
     `cube` and `batch` are static under `jit`. A state from `init` with one `batch` takes part in
     calls with that `batch` only. `ask` may be called several times before a `tell`: where a
     constraint refuses rows, they are replaced by the same rows of the next proposals.
     """
+
+    _internal = frozenset((
+        "differentiates", "learns", "most_at_once", "plan", "samples_prior", "stage",
+        "start_from", "temperature", "total", "wants_clauses", "wants_gradient", "wants_marks",
+        "wants_outcomes", "warm_start",
+    ))  # fmt: skip
 
     wants_gradient: ClassVar[bool] = False
     """Whether `tell` needs `Observations.gradient`."""

@@ -82,7 +82,7 @@ def check_points(search: Search, cube: Cube, points: Float[Any, "n d"]) -> None:
     row, column = (int(i) for i in np.argwhere(~inside)[0])
     raise SearchError(
         f"ask of search {search!r} must return points of the unit cube, all entries in [0, 1]; in "
-        f"row {row} {cube.names[column]} is {values[row, column]:g}. Clip them, as in "
+        f"row {row} {cube.names[column]} is {values[row, column]:zg}. Clip them, as in "
         "jnp.clip(points, 0, 1), or draw others where they are not finite"
     )
 

@@ -186,7 +186,7 @@ def verdict(rate: Rate | None, p: float) -> str:
 
 def safe_at(p: float) -> str:
     """Write the verdict of a policy whose failure rate is below `p`."""
-    return f"safe@{p:g}"
+    return f"safe@{p:zg}"
 
 
 def _border(within: float, outside: float, inside: Callable[[float], bool]) -> float:

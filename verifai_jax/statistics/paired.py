@@ -48,10 +48,10 @@ class PairedDifference:
         if not self.pairs:
             return "unknown (no pair)"
         if self.pairs == 1:
-            return f"{self.mean:.3g} (one pair gives no interval)"
+            return f"{self.mean:z.3g} (one pair gives no interval)"
         return (
-            f"{self.mean:.3g} ({100 * self.confidence:g} % t interval of {self.pairs} paired "
-            f"differences {self.low:.3g} to {self.high:.3g})"
+            f"{self.mean:z.3g} ({100 * self.confidence:zg} % t interval of {self.pairs} paired "
+            f"differences {self.low:z.3g} to {self.high:z.3g})"
         )
 
 

@@ -51,8 +51,8 @@ class PairedRates:
         more = "more" if points >= 0 else "fewer"
         ends = sorted(100 * end if points >= 0 else -100 * end for end in (self.low, self.high))
         return (
-            f"{abs(points):.3g} points {more} ({100 * self.confidence:g} % interval "
-            f"{ends[0]:.3g} to {ends[1]:.3g}, whenever stopped)"
+            f"{abs(points):z.3g} points {more} ({100 * self.confidence:zg} % interval "
+            f"{ends[0]:z.3g} to {ends[1]:z.3g}, whenever stopped)"
         )
 
 

@@ -120,7 +120,7 @@ class HyperparameterImportance:
             if target in self.missing:
                 lines.append(f"{what}: {self.missing[target]}")
                 continue
-            score = f"R^2 {self.scores[target]:.2f} on held-out configurations"
+            score = f"R^2 {self.scores[target]:z.2f} on held-out configurations"
             if not self.is_reliable(target):
                 lines.append(
                     f"{what}: a model of these {self.configurations} configurations does not "
@@ -145,7 +145,7 @@ class HyperparameterImportance:
         if not len(trends):
             return "no single one correlates with it beyond chance"
         order = trends.abs().sort_values(ascending=False).index[:MOST_NAMED]
-        listed = ", ".join(f"{name} ({trends[name]:+.2f})" for name in order)
+        listed = ", ".join(f"{name} ({trends[name]:+z.2f})" for name in order)
         return f"its rank correlations beyond chance: {listed}"
 
     def _directions(self) -> list[str]:
@@ -156,7 +156,7 @@ class HyperparameterImportance:
                 direction, names = components.directions[0], components.names
                 order = np.argsort(-np.abs(direction), kind="stable")[:3]
                 parts = " ".join(
-                    f"{direction[j]:+.2f} {names[j]}" for j in order if abs(direction[j]) >= 0.05
+                    f"{direction[j]:+z.2f} {names[j]}" for j in order if abs(direction[j]) >= 0.05
                 )
                 lines.append(
                     f"{what} configurations vary most along {parts} "
@@ -251,7 +251,7 @@ def _unlearnable(values: np.ndarray, groups: np.ndarray, inputs: int) -> str:
         some = f"{count} configuration{'s' * (count != 1)}" if count else "no configuration"
         return f"{some} with a verdict, too few to learn from (at least {FEWEST})"
     if np.ptp(values) == 0:
-        return f"it is {values[0]:.4g} for every policy"
+        return f"it is {values[0]:z.4g} for every policy"
     return ""
 
 

@@ -83,7 +83,7 @@ def format_summary(findings: Findings) -> str:
     correlation = return_safety_correlation(last_checkpoints(table)) if len(table) else np.nan
     if np.isfinite(correlation):
         lines.append(
-            f"  return, safety  rank correlation {correlation:.2f} "
+            f"  return, safety  rank correlation {correlation:z.2f} "
             "(1: the higher the return the safer, 0: unrelated)"
         )
     if margins is not None and (margins := margins.dropna()).size:
@@ -200,7 +200,7 @@ def _best_lines(findings: Findings) -> list[str]:
         lines.append(f"                  {values}")
     price = f"{int(best['steps']):,} environment steps"
     if np.isfinite(best["training_seconds"]):
-        price += f" in {best['training_seconds']:.1f} s of a core"
+        price += f" in {best['training_seconds']:z.1f} s of a core"
     if best["simulations"] > 0:
         price += f", then {_plural(int(best['simulations']), 'simulation')} for the certificate"
     lines.append(f"                  cost {price}")
@@ -273,13 +273,13 @@ def _reuse(reuse: Mapping[str, tuple[int, int]]) -> str:
 
 
 def _seconds(seconds: Mapping[str, float]) -> str:
-    parts = [f"{value:.1f} s {stage}" for stage, value in seconds.items() if value >= 0.05]
+    parts = [f"{value:z.1f} s {stage}" for stage, value in seconds.items() if value >= 0.05]
     return ", ".join(parts)
 
 
 def _format_return(value: float) -> str:
     """Write a return with four digits, and no exponent where it can be avoided."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:z,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"
 
 
 def _plural(count: int, noun: str) -> str:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.errors import check_names, suggests_options
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import check_options, usual_batch
 from verifai_jax.problem.problem import Problem
@@ -57,6 +58,7 @@ SLACK = 0.05
 
 
 @suggests_options
+@shows_progress("repairing")
 def repair(
     problem: Problem | Run,
     parameters: Any,
@@ -74,6 +76,7 @@ def repair(
     max_seconds: float | None = None,
     precision: str = "float32",
     backend: str | None = None,
+    progress: bool | None = None,
 ) -> Repair:
     """Change parameters as little as makes the formula hold in all counterexamples.
 
@@ -91,6 +94,8 @@ def repair(
     - `gradient`: whether to follow gradients; by default where the system has them without
       changing the backend.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
     - the others as in `falsify`.
 
     **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.

@@ -23,6 +23,7 @@ from verifai_jax.core.budget import Budget, split_budget
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.precision import in_precision
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_options, check_search, usual_batch
 from verifai_jax.problem.dependence import depends_on_key
@@ -62,6 +63,7 @@ EXPLORED = 20_000
 
 
 @suggests_options
+@shows_progress("synthesizing parameters of")
 def synthesize(
     problem: Problem,
     parameters: Sequence[str] | str | None = None,
@@ -77,6 +79,7 @@ def synthesize(
     max_seconds: float | None = None,
     precision: str = "float32",
     backend: str | None = None,
+    progress: bool | None = None,
 ) -> Synthesis:
     """Find features for which the formula holds robustly, whatever the other features are.
 
@@ -94,6 +97,8 @@ def synthesize(
       changing the backend.
     - `batch`: simulations at once.
     - `max_seconds`: wall-clock seconds, of which a fifth is kept for the check.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
     - the others as in `falsify`.
 
     **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.

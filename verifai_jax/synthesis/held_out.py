@@ -65,7 +65,7 @@ class HeldOut:
         if self.failures:
             text += f": failure probability {self.rate}"
         else:
-            text += f": failure probability < {self.bound:.2g} at 95 %"
+            text += f": failure probability < {self.bound:z.2g} at 95 %"
         if self.short:
             text += f"; {self.short} more keep less than the margin"
         if self.without_verdict:

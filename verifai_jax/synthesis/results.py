@@ -10,6 +10,7 @@ import numpy as np
 
 from verifai_jax.core.figure import Figure
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.problem.problem import Problem
 from verifai_jax.synthesis.held_out import HeldOut
 from verifai_jax.synthesis.parametric import held
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Synthesis:
+class Synthesis(InNotebook):
     """Result of `synthesize`: parameters for which a formula holds.
 
     **Fields:** `parameters`: the best found, by name; `robustness`: the least with
@@ -68,21 +69,23 @@ class Synthesis:
         shown = ", ".join(
             f"{name} = {format_value(value)}" for name, value in self.parameters.items()
         )
-        wanted = f" by the margin of {self.margin:g}" if self.margin else ""
+        wanted = f" by the margin of {self.margin:zg}" if self.margin else ""
         lines = [f"synthesis for {self.problem.name}: {shown}"]
         around = self.environments.shape[1] > 1
         if self.robustness == -np.inf:
             lines.append("  no simulation with any parameters had a verdict")
         elif self.holds:
             where = f", the least over {self.attacks} simulated environments" if around else ""
-            lines.append(f"  holds{wanted} with robustness {self.robustness:.4g}{where}")
+            lines.append(f"  holds{wanted} with robustness {self.robustness:z.4g}{where}")
         elif self.robustness >= self.margin:
-            lines.append(f"  no failure was found before the check: {self.robustness:.4g} at least")
+            lines.append(
+                f"  no failure was found before the check: {self.robustness:z.4g} at least"
+            )
         else:
             missing = self.margin - self.robustness
             lines.append(
                 f"  NONE FOUND that holds{wanted}: the best so far has robustness "
-                f"{self.robustness:.4g}, {missing:.4g} too little"
+                f"{self.robustness:z.4g}, {missing:z.4g} too little"
             )
         if self.held_out is not None:
             lines.append(
@@ -100,7 +103,7 @@ class Synthesis:
         return "\n".join(lines)
 
     def _costs(self) -> str:
-        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        text = f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}"
         if self.without_verdict:
             text += f"; {self.without_verdict} gave no verdict"
         if self.environments.shape[1] > 1:
@@ -111,13 +114,13 @@ class Synthesis:
 def format_value(value: object) -> str:
     """Write the value of a parameter."""
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:z.6g}"
     if isinstance(value, int | str | bool):
         return str(value)
     import jax
 
     numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(value)]).tolist()
-    shown = ", ".join(f"{number:.4g}" for number in numbers[:6])
+    shown = ", ".join(f"{number:z.4g}" for number in numbers[:6])
     return f"[{shown}{', ...' * (len(numbers) > 6)}]"
 
 
@@ -159,13 +162,13 @@ class RepairEstimates(NamedTuple):
     def __str__(self) -> str:
         lines = [f"repair of {self.name}, failure probabilities"]
         for when, estimate in (("before", self.before), ("after", self.after)):
-            sure = f"{100 * estimate.confidence:g} %"
+            sure = f"{100 * estimate.confidence:zg} %"
             if estimate.probability is None:
-                text = f"no estimate, at most {estimate.upper_bound:.2g} ({sure} bound)"
+                text = f"no estimate, at most {estimate.upper_bound:z.2g} ({sure} bound)"
             else:
                 text = (
-                    f"{estimate.probability:.3g} ({sure} interval {estimate.low:.3g} to "
-                    f"{estimate.high:.3g}), in {estimate.simulations:,} simulations"
+                    f"{estimate.probability:z.3g} ({sure} interval {estimate.low:z.3g} to "
+                    f"{estimate.high:z.3g}), in {estimate.simulations:,} simulations"
                 )
             lines.append(f"  {when + ':':<8}{text}")
         lines.append(
@@ -177,7 +180,7 @@ class RepairEstimates(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Repair:
+class Repair(InNotebook):
     """Result of `repair`: parameters changed as little as removes the failures.
 
     **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
@@ -257,16 +260,16 @@ class Repair:
         elif self.found:
             lines.append(
                 f"  an attack finds nothing any more; {self.environments} counterexamples are kept "
-                f"with robustness {self.robustness:.4g} at least"
+                f"with robustness {self.robustness:z.4g} at least"
             )
         elif self.stopped == "no parameters":
             lines.append(
-                f"  NO REPAIR FOUND: the best parameters have robustness {self.robustness:.4g} "
+                f"  NO REPAIR FOUND: the best parameters have robustness {self.robustness:z.4g} "
                 f"over {self.environments} counterexamples; this does not prove that none has more"
             )
         else:
             lines.append(
-                f"  NOT FINISHED ({self.stopped}): robustness {self.robustness:.4g} over "
+                f"  NOT FINISHED ({self.stopped}): robustness {self.robustness:z.4g} over "
                 f"{self.environments} counterexamples so far"
             )
         if self.held_out_before is not None:
@@ -286,7 +289,7 @@ class Repair:
             lines.append("  the change made it worse: keep the nominal parameters")
         counts = ", ".join(str(turn.counterexamples) for turn in self.rounds)
         lines.append(f"  counterexamples round by round: {counts}")
-        text = f"{self.simulations:,} simulations in {self.seconds:.1f} s, stopped: {self.stopped}"
+        text = f"{self.simulations:,} simulations in {self.seconds:z.1f} s, stopped: {self.stopped}"
         if self.without_verdict:
             text += f"; {self.without_verdict} gave no verdict"
         lines.append(f"  {text}")
@@ -295,7 +298,7 @@ class Repair:
 
     def _changes(self) -> str:
         if self.arrays:
-            return f"arrays changed by {self.change:.4g} (Euclidean)"
+            return f"arrays changed by {self.change:z.4g} (Euclidean)"
         pairs = []
         for name, value in self.parameters.items():
             same = format_value(self.before[name]) == format_value(value)

@@ -15,6 +15,7 @@ import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
+from verifai_jax.core.notebook import ForUsers
 from verifai_jax.core.trace import Status, Trace
 
 Features: TypeAlias = PyTree
@@ -34,7 +35,7 @@ class Outcome(NamedTuple):
     message: str = ""
 
 
-class System:
+class System(ForUsers):
     """A system under test: a callable `(features, key) -> Trace`, and what else it may offer.
 
     - `black_box`: True for a system that runs on the host; JAX must be able to trace any other.
@@ -52,6 +53,14 @@ class System:
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
     - `likely`: the engine that is likely the fastest on a CPU.
     """
+
+    _internal = frozenset((
+        "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
+        "can_simulate_batch", "can_simulate_each", "effort", "exact_step", "fold",
+        "forward_up_to", "known_signals", "lanes", "likely", "may_draw", "refined", "renewed",
+        "reverse_hint", "simulate_batch", "simulate_each", "switches", "traced_factor",
+        "unroll", "why_error", "why_not", "with_backend",
+    ))  # fmt: skip
 
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.

@@ -142,8 +142,8 @@ class Clusters:
         return late("verifai_jax.plotting.clusters", "plot_clusters")(self, path)
 
     def __str__(self) -> str:
-        score = f", silhouette {self.silhouette:.2f}" if np.isfinite(self.silhouette) else ""
-        radius = f", radius {self.radius:.3g}" if self.radius is not None else ""
+        score = f", silhouette {self.silhouette:z.2f}" if np.isfinite(self.silhouette) else ""
+        radius = f", radius {self.radius:z.3g}" if self.radius is not None else ""
         number = f"{self.count} cluster{'' if self.count == 1 else 's'}"
         lines = [f"{number} of {self.samples.kind} ({self.method}{score}{radius})"]
         features = list(self.samples.names)

@@ -12,9 +12,11 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     variance_of,
 )
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
 
 
+@shows_progress("finding gradients of")
 def gradient_sensitivity(
     problem: Problem,
     samples: int = 1024,
@@ -22,6 +24,7 @@ def gradient_sensitivity(
     seed: int = 0,
     batch: int = 1024,
     temperature: float | None = None,
+    progress: bool | None = None,
 ) -> Sensitivity:
     """Mean squared gradient of the robustness by each feature, and what it bounds.
 
@@ -33,6 +36,8 @@ def gradient_sensitivity(
     - `temperature`: of the smooth robustness that is differentiated; by default a hundredth of the
       standard deviation of the robustness. The bound holds for the smooth robustness, and as far
       as the gradients of the system are its true ones.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     Source: Sobol and Kucherenko, Derivative based global sensitivity measures and their link with
     global sensitivity indices, Mathematics and Computers in Simulation 79 (2009).

@@ -17,9 +17,11 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     variance_of,
 )
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
 
 
+@shows_progress("finding elementary effects in")
 def morris(
     problem: Problem,
     trajectories: int = 32,
@@ -28,6 +30,7 @@ def morris(
     seed: int = 0,
     batch: int = 1024,
     of: str | None = None,
+    progress: bool | None = None,
 ) -> Sensitivity:
     """Elementary effects: how the robustness changes when one feature makes a large step.
 
@@ -40,6 +43,8 @@ def morris(
       probable cells, so that long-tailed features stay finite. A discrete one takes all of its
       values.
     - `of`: name of the formula; the least robustness of all when left out.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     Sources: Morris, Factorial sampling plans for preliminary computational experiments,
     Technometrics 33 (1991); `mu_star` of Campolongo, Cariboni and Saltelli, An effective screening

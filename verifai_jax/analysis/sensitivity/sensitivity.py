@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.errors import check_names
 from verifai_jax.core.lazy import late
+from verifai_jax.core.notebook import InNotebook
 from verifai_jax.core.text import format_percent
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -31,7 +32,7 @@ MOST_SHOWN = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Sensitivity:
+class Sensitivity(InNotebook):
     """Result of a sensitivity analysis.
 
     **Fields:** `method`; `problem`: its name; `table`: one row a unit coordinate, the most
@@ -58,7 +59,7 @@ class Sensitivity:
         lines = [
             f"{self.method} of {self.problem!r} from {self.simulations:,} simulations, robustness "
             f"{'varies' if self.variance else 'does not vary'}: "
-            f"standard deviation {np.sqrt(self.variance):.3g}"
+            f"standard deviation {np.sqrt(self.variance):z.3g}"
         ]
         if self.dropped:
             lines.append(f"{self.dropped:,} simulations had no verdict and were left out")
@@ -156,7 +157,7 @@ def variance_of(rho: Float[np.ndarray, " n"], problem: Problem) -> float:
         )
     if np.ptp(proper) == 0:
         raise ValueError(
-            f"the robustness of problem {problem.name!r} is {proper[0]:.4g} in all of "
+            f"the robustness of problem {problem.name!r} is {proper[0]:z.4g} in all of "
             f"{len(proper)} simulations: there is no variation that features could explain"
         )
     return float(np.var(proper))
@@ -183,13 +184,14 @@ def _words(method: str, row: Any) -> str:
     if "mu_star" in row:
         way = {1.0: ", up on average", -1.0: ", down on average"}.get(np.sign(row["mu"]), "")
         return (
-            f"moves the robustness by {row['mu_star']:.3g} ({row['low']:.3g} to {row['high']:.3g})"
-            f" over its range, standard deviation {row['sigma']:.3g}{way}"
+            f"moves the robustness by {row['mu_star']:z.3g} "
+            f"({row['low']:z.3g} to {row['high']:z.3g}) over its range, "
+            f"standard deviation {row['sigma']:z.3g}{way}"
         )
     if np.isnan(row["bound"]):
         return "discrete: has no gradient"
-    slope = f"typical slope {row['typical']:.3g}"
+    slope = f"typical slope {row['typical']:z.3g}"
     if row["bound"] >= 1:
-        return f"no bound below 100 %: mean squared slope {row['mean_squared']:.3g}, {slope}"
+        return f"no bound below 100 %: mean squared slope {row['mean_squared']:z.3g}, {slope}"
     between = f"{format_percent(row['low'])} to {format_percent(row['high'])}"
     return f"at most {format_percent(row['bound'])} of the variance ({between}), {slope}"

@@ -13,11 +13,13 @@ from verifai_jax.analysis.sensitivity.sensitivity import (
     variance_of,
 )
 from verifai_jax.core.checks import check_count
+from verifai_jax.core.progress import shows_progress
 from verifai_jax.problem.problem import Problem
 
 NOISE = "(simulation noise)"
 
 
+@shows_progress("finding Sobol indices of")
 def sobol_indices(
     problem: Problem,
     samples: int = 4096,
@@ -25,6 +27,7 @@ def sobol_indices(
     seed: int = 0,
     batch: int = 1024,
     of: str | None = None,
+    progress: bool | None = None,
 ) -> Sensitivity:
     """Shares of the robustness's variance that each feature explains, alone and in all.
 
@@ -35,6 +38,8 @@ def sobol_indices(
     - `samples`: base points `N`, best a power of two; `N (d + 2)` simulations for `d` coordinates,
       and `N` more where simulations are random.
     - `of`: name of the formula; the least robustness of all when left out.
+    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+      once a minute elsewhere.
 
     Sources: first-order estimator of Saltelli et al., Variance based sensitivity analysis of model
     output, Computer Physics Communications 181 (2010); total of Jansen, Analysis of variance

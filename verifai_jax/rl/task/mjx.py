@@ -186,7 +186,7 @@ def mjx_task(
     if substeps < 1 or abs(substeps * timestep - control_period) > 1e-6 * timestep:
         raise ValueError(
             "control_period must be a positive multiple of the model's timestep "
-            f"{timestep:g} s; got {control_period!r}"
+            f"{timestep:zg} s; got {control_period!r}"
         )
     check_count("time_limit", time_limit)
     if compiled.nu == 0:

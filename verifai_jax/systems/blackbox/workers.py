@@ -372,7 +372,7 @@ class _Worker:
                 if self.process.poll() is not None:
                     return None
                 if left <= 0:
-                    message = f"the simulation took longer than {timeout:g} s"
+                    message = f"the simulation took longer than {timeout:zg} s"
                     return Outcome(None, Status.TIMEOUT, message)
         except (EOFError, OSError):
             return None

@@ -2,6 +2,7 @@
 
 from verifai_jax.systems.environments._brax import Brax as Brax
 from verifai_jax.systems.environments._brax import brax as brax
+from verifai_jax.systems.environments._gymnasium import EpisodeFunction as EpisodeFunction
 from verifai_jax.systems.environments._gymnasium import gymnasium as gymnasium
 from verifai_jax.systems.environments._gymnax import Gymnax as Gymnax
 from verifai_jax.systems.environments._gymnax import gymnax as gymnax

@@ -12,11 +12,12 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, TypeAlias, cast
 
 import jax
 import numpy as np
+from jaxtyping import UInt8
 
 from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import require, suggests_options, unknown_name
@@ -46,6 +47,7 @@ from verifai_jax.systems.environments.spaces import (
     named_numbers,
     no_action,
 )
+from verifai_jax.systems.pytree_checks import outline
 
 Env: TypeAlias = Any
 """A `gymnasium.Env`; Gymnasium is an optional package, so its types cannot be imported here."""
@@ -83,9 +85,38 @@ class EpisodeFunction:
     def __post_init__(self) -> None:
         self._env: Any = None
         self._decide: Any = None
+        # Pictures by sample, of the samples that are wanted; none is drawn without.
+        self._drawn: dict[int, Any] | None = None
+        self._wanted: Collection[int] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_env": None, "_decide": None}
+
+    @property
+    def draws(self) -> bool:
+        """True for an environment that says that it draws pictures."""
+        metadata = getattr(self.environment, "metadata", None) or {}
+        return "rgb_array" in metadata.get("render_modes", ())
+
+    def frames(
+        self, features: Mapping[str, Any], seed: int, samples: Collection[int]
+    ) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
+        """Simulate again, and return what the environment draws at these samples.
+
+        **Raises:** `ValueError` for an environment that draws no pictures.
+        """
+        if not self.draws:
+            raise ValueError(
+                f"{self.name} draws no pictures: its metadata have no render mode 'rgb_array'"
+            )
+        drawing = self.renewed()
+        drawing._drawn, drawing._wanted = {}, samples
+        try:
+            drawing(features, seed)
+        finally:
+            if callable(close := getattr(drawing._env, "close", None)):
+                close()
+        return {k: _picture(image, self.name) for k, image in drawing._drawn.items()}
 
     def __repr__(self) -> str:
         return self.name
@@ -119,6 +150,8 @@ class EpisodeFunction:
             actions.append(self._act(env, observed, features, k * dt))
             action = actions[k].action
             rows.append(self._sample(env, observation, action, reward, features))
+            if self._drawn is not None and (k in self._wanted or not k):
+                self._drawn[k] = env.render()
             if over or k == self.steps:
                 break
             if changes:
@@ -184,7 +217,8 @@ class EpisodeFunction:
         if self._env is None:
             if isinstance(self.make, str):
                 package = require("gymnasium", extra="gymnasium")
-                self._env = package.make(self.make)
+                mode = {} if self._drawn is None else {"render_mode": "rgb_array"}
+                self._env = package.make(self.make, **mode)
             else:
                 self._env = self.make()
             missing = [n for n in ("reset", "step", "unwrapped") if not hasattr(self._env, n)]
@@ -193,6 +227,10 @@ class EpisodeFunction:
                     f"{self.name} must make a Gymnasium environment; it made {self._env!r}, which "
                     f"has no {missing[0]}"
                 )
+            inner = self._env.unwrapped
+            if self._drawn is not None and getattr(inner, "render_mode", None) != "rgb_array":
+                # Environments ask for it when they draw.
+                inner.render_mode = "rgb_array"
         return self._env
 
     @property
@@ -389,6 +427,21 @@ def gymnasium(
     )
     options: Any = {"workers": workers, "timeout": timeout, "retries": retries}
     return cast("BlackBox | PooledBlackBox", blackbox(episode, seeded=True, **options))
+
+
+def _picture(image: Any, name: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Return what an environment drew, a single picture.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    image = image[-1] if isinstance(image, list) and image else image
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] not in (3, 4) or array.dtype != np.uint8:
+        raise ValueError(
+            f"render of {name} must return a picture [height, width, 3] of bytes; got "
+            f"{outline(image)}"
+        )
+    return array[..., :3]
 
 
 def _arrays(value: object) -> Any:

@@ -468,7 +468,7 @@ def step_count(
         steps = round(duration / dt) if math.isfinite(duration) else 0
         if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt * max(steps, 1):
             raise ValueError(
-                f"duration must be a positive multiple of dt; got (duration={duration}, dt={dt:g})"
+                f"duration must be a positive multiple of dt; got (duration={duration}, dt={dt:zg})"
             )
     chosen = otherwise if steps is None else steps
     if chosen is None:

@@ -330,8 +330,8 @@ class _Rollout:
             count = round(line.period / beat)
             if count < 1 or abs(count * beat - line.period) > 1e-6 * beat:
                 raise ValueError(
-                    f"the period of a delay_line must be {what} ({beat:g} s), or a multiple of it "
-                    f"where it is not pushed each time; got period={line.period:g}"
+                    f"the period of a delay_line must be {what} ({beat:zg} s), or a multiple of it "
+                    f"where it is not pushed each time; got period={line.period:zg}"
                 )
 
 

@@ -418,7 +418,7 @@ class Server(threading.Thread):
                     self._drop(client, "")
                 else:
                     self._send_away(
-                        client, f"no hello came within {connection.GREETING_SECONDS:g} s"
+                        client, f"no hello came within {connection.GREETING_SECONDS:zg} s"
                     )
                     self._flush(client)
             elif self.rules.timeout is not None and client.has:
@@ -428,7 +428,7 @@ class Server(threading.Thread):
     def _end_overdue(self, client: Client, overdue: list[Point]) -> None:
         if not overdue:
             return
-        took = f"took longer than {self.rules.timeout:g} s"
+        took = f"took longer than {self.rules.timeout:zg} s"
         for point in overdue:
             del client.has[point.id]
             message = f"the simulation {took} at {client.name}"
@@ -449,7 +449,7 @@ class Server(threading.Thread):
             self._alone_since = now
         alone, patience = now - self._alone_since, self.rules.patience
         if patience is not None and alone > patience:
-            message = f"no simulator was connected for {patience:g} s"
+            message = f"no simulator was connected for {patience:zg} s"
             log.warning("%s: %d points are given up", message, len(self.waiting) + len(self.lost))
             for point in itertools.chain(self.lost, self.waiting):
                 self._settle(point, Outcome(None, Status.ERROR, message))

@@ -1,0 +1,116 @@
+"""What a notebook shows: results as HTML with pictures, names for people, zeros without a sign."""
+
+import base64
+import io
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import verifai_jax as vj
+
+
+@pytest.fixture(scope="module")
+def problem():
+    def system(features, key):
+        return vj.Trace({"x": features["x"] * jnp.ones(4), "<b>": jnp.zeros(4)}, dt=0.5)
+
+    spec = {"low": "always x < 0.5", "named": 'always "<b>" <= x + 2'}
+    return vj.Problem("a <b> problem", {"x": vj.Box(-1, 1)}, system, spec, description="x & y")
+
+
+@pytest.fixture(scope="module")
+def run(problem):
+    return vj.falsify(problem, "uniform", budget=32, batch=32, progress=False, confirm=False)
+
+
+def pictures(html):
+    found = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
+    return [Image.open(io.BytesIO(base64.b64decode(text))) for text in found]
+
+
+@pytest.mark.thorough
+def test_results_show_themselves(problem, run):
+    replay = run.replay(run.best)
+    shown = {
+        "problem": problem, "run": run, "table": run.table, "space": problem.space,
+        "replay": replay, "trace": replay.trace, "formula": problem.formulas["named"],
+    }  # fmt: skip
+    for name, thing in shown.items():
+        html = thing._repr_html_()
+        # What a person writes is text, never markup.
+        assert "<b>" not in html, name
+    assert "a &lt;b&gt; problem: x &amp; y" in problem._repr_html_()
+    assert r"$\Box \left(\mathit{x} &lt; 0.5\right)$" in problem._repr_html_()
+    assert "Box(-1, 1)" in problem._repr_html_()
+    assert problem.formulas["low"]._repr_latex_() == r"$\Box \left(\mathit{x} < 0.5\right)$"
+    assert "32 simulations" in run._repr_html_()
+    # The table shows what fails, ten rows at most.
+    rows = re.findall(r"<td>True</td>", run.table._repr_html_())
+    assert 0 < len(rows) <= 10
+    (picture,) = pictures(replay._repr_html_())
+    assert picture.size[0] > 400
+    assert "trace of 4 samples every 0.5 s" in replay.trace._repr_html_()
+
+
+def test_results_of_every_verb_show_themselves():
+    from verifai_jax import compositional, counterexamples, failure_modes, synthesis
+    from verifai_jax.core.notebook import InNotebook
+
+    verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Trials, vj.Certificates, vj.Augmentation]
+    verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
+    verbs += [counterexamples.Explained, counterexamples.Shrunk, failure_modes.Mode]
+    verbs += [compositional.Compositional, synthesis.Repair, vj.mtl.Explanation]
+    assert [kind for kind in verbs if not issubclass(kind, InNotebook)] == []
+
+
+def names(thing):
+    return {name for name in dir(thing) if not name.startswith("_")}
+
+
+@pytest.mark.thorough
+def test_completion_shows_what_is_for_users(problem, run):
+    assert names(vj.Box(0, 1)) == {
+        "check", "columns", "contains", "from_intervals", "from_unit", "high", "low", "size",
+        "to_unit",
+    }  # fmt: skip
+    assert names(vj.Categorical("a", "b")) >= {"choices", "probabilities", "check"}
+    assert names(vj.signal("x")) >= {"abs", "max", "norm", "name"}
+    for thing, wanted, internal in (
+        (vj.Normal(0, 1), {"mean", "std"}, {"mark_count", "settled", "tail"}),
+        (problem, {"check", "only", "space", "nominal"}, {"programs", "made_in", "draws"}),
+        (problem.space, {"sample", "domains", "where"}, {"root", "cube", "nudged"}),
+        (problem.system, set(), {"reverse_hint", "lanes", "why_not"}),
+        (problem.formulas["low"], {"horizon", "until", "signals"}, {"below", "children"}),
+        (run, {"replay", "table", "best", "plot"}, {"checkpoint", "damage", "space_data"}),
+        (run.table, {"all", "counterexamples", "safe"}, {"append", "digest", "count_rows"}),
+        (vj.search.Uniform(), {"ask", "tell"}, {"wants_marks", "most_at_once"}),
+    ):
+        assert wanted <= names(thing), thing
+        assert not internal & names(thing), thing
+        # They are there all the same.
+        assert all(hasattr(type(thing), name) or hasattr(thing, name) for name in internal), thing
+
+
+def test_methods_of_a_users_own_class_are_shown():
+    class Steady(vj.search.Uniform):
+        def settle(self):
+            """Settle."""
+
+    assert "settle" in names(Steady())
+
+
+@pytest.mark.thorough
+def test_no_zero_has_a_sign(problem):
+    def still(features, key):
+        return vj.Trace({"x": features["x"] * jnp.zeros(3)}, dt=0.5)
+
+    flat = vj.Problem("flat", {"x": vj.Box(-1, 0)}, still, "always -x >= 0")
+    run = vj.falsify(flat, "uniform", budget=4, batch=4, progress=False, confirm=False)
+    rho = run.table.all["rho"].to_numpy()
+    assert not np.signbit(rho[rho == 0]).any()
+    texts = [str(run), str(run.replay(0)), run._repr_html_(), str(run.replay(0).trace)]
+    texts += [str(vj.Box(-0.0, 1)), str(vj.parse("x > -0.0"))]
+    assert not [text for text in texts if re.search(r"-0(?![.\d])|-0\.0+(?!\d)", text)]
