@@ -8,7 +8,7 @@ Methods of Optimization, 1987, section 14.6); for one clause it is a jump along 
 gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
 does a plain gradient, because the gradients of all clauses count.
 
-The first descent starts near the middle, and its box is the whole cube. It shrinks while points
+The first descent starts in the middle, and its box is the whole cube. It shrinks while points
 turn out no better, several sizes in one batch where there is room, and grows again on success. A
 corner that nothing points out of is left by its weakest coordinates, one at a time, since a small
 derivative says little about the other end of the range. After that, or when gradients are zero or
@@ -34,7 +34,14 @@ from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 from verifai_jax.core.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.clauses import CLAUSES
 from verifai_jax.core.cube import Cube
-from verifai_jax.search.base import Observations, Plan, Search, choose, nearest_to_failing
+from verifai_jax.search.base import (
+    Observations,
+    Plan,
+    Search,
+    choose,
+    draw_uniform,
+    nearest_to_failing,
+)
 from verifai_jax.search.halton import halton_points
 
 NOTHING = -1e8
@@ -43,9 +50,9 @@ NOTHING = -1e8
 LITTLE = 0.9
 """Share of the robustness that is left after a step which is only a little better."""
 
-AROUND = 0.01
-"""Length, in unit coordinates, of the interval around the middle in which the first descent starts:
-where exactly depends on the seed, as all points do."""
+WOBBLE = 0.1
+"""Greatest share by which boxes smaller than the cube are less, in all of a run: with it all points
+of a descent but its start and a corner depend on the seed."""
 
 SIZES = 6
 """Boxes tried at once at most."""
@@ -198,12 +205,13 @@ class Gradient(Search[GradientState]):
         size = jnp.where(differentiates, 0, row // there)
         rows = jnp.where(differentiates, there, jnp.minimum(there * min(SIZES, batch // n), batch))
         box = state.radius[descent] * self.shrinks ** size.astype(jnp.float32)
+        tried_box = jnp.where(box < 1, box * (1 - WOBBLE * draw_uniform(state.key, (1,))), box)
         # No more rows than these are ever simulated.
         most = min(n * min(SIZES, batch // n), batch)
         tried, flipped = jax.lax.cond(
             differentiates,
             lambda: (starts[descent[:most]], jnp.zeros(most, bool)),
-            lambda: self._boxes(state, cube, descent[:most], size[:most], box[:most]),
+            lambda: self._boxes(state, cube, descent[:most], size[:most], tried_box[:most]),
         )
         tried = jnp.pad(tried, ((0, batch - most), (0, 0)), constant_values=0.5)
         u = jnp.where(differentiates, starts[descent], tried)
@@ -349,11 +357,11 @@ class Gradient(Search[GradientState]):
     def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:
-        """Return the points to differentiate: starts of fresh descents, near the middle first."""
+        """Return the points to differentiate: starts of fresh descents, the middle first."""
         number = state.starts + jnp.cumsum(state.fresh).astype(jnp.uint32) - 1
         points = halton_points(number, cube.dim, state.key)
         free = np.array(cube.levels) == 0
-        middle = jnp.where(free, 0.5 + AROUND * (points - 0.5), points)
+        middle = jnp.where(free, 0.5, points)
         points = jnp.where((number == 0)[:, None], middle, points)
         given = jnp.isfinite(state.near)
         points = jnp.where(given[:, None], state.offered, points)

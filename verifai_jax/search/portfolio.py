@@ -171,11 +171,11 @@ class Portfolio(Search[PortfolioState]):
         if state.gradient is not None:
             points, gradient = Gradient().ask(state.gradient, cube, batch)
             plan = Gradient().plan(gradient, cube, batch)
-            # Some descents go first, that from near the middle of the cube before all.
+            # Some descents go first, that from the middle of the cube before all.
             opening = gradient.starts <= max(OPENING, len(gradient.fresh))
             opening &= gradient.useless == 0
             if cube.dim < FEW:
-                opening &= state.barren < OPENING * cube.dim
+                opening &= state.barren < FEW * cube.dim
             turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
