@@ -8,6 +8,7 @@ counterexamples are rows like any other: replayed, shrunk, counted.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,14 +17,13 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.checks import is_number
 from verifai_jax.core.trace import Status, Trace
-from verifai_jax.core.user_errors import format_user_error
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, always, parse, signal
 from verifai_jax.mtl.expression import Number
 from verifai_jax.mtl.formula import Predicate
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system
+from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 FINITE = "finite"
@@ -73,9 +73,10 @@ class CheckedSystem(System):
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         if not (self.black_box and self.verdicts):
             return self._checked(self.system(features, key))
+        trace = outcome_of(partial(self.system, features, key)).trace
         try:
-            return self._checked(self.system(features, key))
-        except (Exception, SystemExit):
+            return self._failed() if trace is None else self._checked(trace)
+        except Exception:
             return self._failed()
 
     def check(self, features: Features) -> None:
@@ -136,10 +137,7 @@ class CheckedSystem(System):
             yield from self.system.simulate_each(features, seeds)
             return
         for i, (each, seed) in enumerate(zip(features, seeds, strict=True)):
-            try:
-                yield i, Outcome(self.system(plain_leaves(each), seed))
-            except (Exception, SystemExit) as error:
-                yield i, Outcome(None, Status.ERROR, format_user_error(error))
+            yield i, outcome_of(partial(self.system, plain_leaves(each), seed))
 
     def _failed(self) -> Trace:
         """Return the trace of a simulation that did not end properly."""

@@ -15,7 +15,9 @@ import jax
 from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compilation import Effort
+from verifai_jax.core.locks import returning_once
 from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.user_errors import format_user_error
 
 Features: TypeAlias = PyTree
 """The features of one simulation, as `FeatureSpace.unflatten` gives them; or of a batch."""
@@ -32,6 +34,25 @@ class Outcome(NamedTuple):
     trace: Trace | None
     status: Status = Status.OK
     message: str = ""
+
+
+def outcome_of(simulate: Callable[[], Any]) -> Outcome:
+    """Simulate once in this process, and return what came of it.
+
+    Whatever a simulator raises is the end of its own row, as it is in a worker: `sys.exit()` and
+    exceptions that are no `Exception` too. Only Ctrl-C ends the run.
+
+    **Arguments:**
+
+    - `simulate`: calls the system.
+    """
+    try:
+        with returning_once():
+            return Outcome(simulate())
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        return Outcome(None, Status.ERROR, format_user_error(error))
 
 
 class System:
