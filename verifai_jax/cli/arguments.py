@@ -194,10 +194,7 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
 
 def load_run(folder: Path, target: str | None) -> "Run":
     """Load the run in a folder, with the problem named, or else the one that the run records."""
-    from verifai_jax.fuzzing.implicit import as_recorded
-
-    problem = load_problem(target or recorded_target(folder))
-    return read_run(folder, as_recorded(problem, read_record(folder)["formulas"]))
+    return read_run(folder, load_problem(target or recorded_target(folder)))
 
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":

@@ -51,6 +51,7 @@ ADDED = (
     "guide",
     "origin",
     "sources",
+    "derived",
 )
 """Entries that may be absent, as from the records of 0.1."""
 DECIDING = (
@@ -194,5 +195,6 @@ _FORMS: dict[str, Callable[[Any], bool]] = {
     "guide": _is_mapping,
     "origin": lambda value: value in ("", *ORIGINS),
     "sources": _is_sources,
+    "derived": _is_mapping,
 }
 """What each entry of a record must be."""

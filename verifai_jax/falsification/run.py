@@ -29,6 +29,7 @@ from verifai_jax.falsification.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
+from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.model_changes import (
     NEAR,
     changed_since,
@@ -99,6 +100,8 @@ class Run:
     - `sources`: what the model was made of when the run began, and again where it went on with
       another one: files with their hashes, and versions, as plain data; empty where that is not
       recorded.
+    - `derived`: what a verb made of the problem that it was given, as plain data; None where it was
+      simulated as it was.
     - `damage`: what of its files could not be read, in words; such a run cannot be resumed.
     """
 
@@ -134,6 +137,7 @@ class Run:
     sources: Sequence[Mapping[str, Any]] = ()
     damage: str = ""
     origin: str = ""
+    derived: Mapping[str, Any] | None = None
 
     @property
     def simulations(self) -> int:
@@ -481,6 +485,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     record = read_record(folder)
     features = tuple(record["features"])
     if problem is not None:
+        problem = as_simulated(problem, record)
         texts = {name: str(formula) for name, formula in problem.formulas.items()}
         for what, recorded, given in (
             ("name", record["name"], problem.name),
@@ -523,7 +528,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
     elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
         damage.append(f"{folder / STATE} is missing, which says what its rows are; {ANEW}")
-    return Run(
+    run = Run(
         table=table,
         folder=folder,
         problem=problem,
@@ -532,3 +537,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
         **{name: record[name] for name in RECORDED},
         **{name: record[name] for name in ADDED if name in record},
     )
+    return as_made(run)
+
+
+def as_made(run: Run) -> Run:
+    """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
+    return run if run.derived is None else late("verifai_jax.fuzzing.run", "as_fuzz_run")(run)

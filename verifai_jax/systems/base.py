@@ -8,7 +8,7 @@
 All else has a default here: a system offers more by overriding it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -71,6 +71,8 @@ class System:
     - `backends`: names of the engines that can simulate this system, for one with several.
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
     - `likely`: the engine that is likely the fastest on a CPU.
+    - `derived`: how a verb made this system of the one that it was given, as plain data for the
+      record of a run; None for a system of a person's own.
     """
 
     black_box: bool = False
@@ -85,6 +87,7 @@ class System:
     backends: tuple[str, ...] = ()
     backend: str | None = None
     likely: str | None = None
+    derived: Mapping[str, Any] | None = None
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""
