@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shlex
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -282,6 +283,29 @@ def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
     for option, value in options.items():
         if value is not None and value != ():
             raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
+
+
+def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
+    """Write the command that goes on with a folder, as a shell reads it.
+
+    **Arguments:**
+
+    - `command`: `falsify` or `sweep`.
+    - `target`: that the folder records; it is named where the record alone would not do.
+    - `options`: that the record does not hold, with their values; those that are None are left out.
+    """
+    from verifai_jax.core.targets import TargetError, target_of_project
+
+    words = ["verifai-jax", command]
+    if target is not None:
+        try:
+            target_of_project(target, folder, kind="problem", remedy="")
+        except TargetError:
+            words.append(target)
+    words += ["--resume", str(folder)]
+    for option, value in options.items():
+        words += [] if value is None else [option, str(value)]
+    return shlex.join(words)
 
 
 def given_or_next(

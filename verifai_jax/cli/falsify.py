@@ -1,6 +1,8 @@
 """`verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000`."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -23,6 +25,7 @@ from verifai_jax.cli.arguments import (
     read_run,
     recorded_target,
     refuse_with_resume,
+    resuming,
 )
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
@@ -187,7 +190,8 @@ def falsify(
                 target=target,
                 executor=executor,
             )
-    print_run(run, pictures)
+    ends = {"--max-seconds": max_seconds, "--stop-after": stop_after, "--within": within}
+    print_run(run, pictures, {**ends, "--decide": decide, "--cluster": cluster})
     check_run(run, fail_on)
 
 
@@ -239,8 +243,14 @@ def check_run(run: "Run", asked: Gate | None) -> None:
     check_gate(asked, failed)
 
 
-def print_run(run: "Run", pictures: bool) -> None:
+def print_run(
+    run: "Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
+) -> None:
     """Print the summary of a run and how to see more of it.
+
+    **Arguments:**
+
+    - `options`: of the command, which the record does not hold and whoever resumes it gives again.
 
     **Raises:** `CommandError` where no simulation has a verdict.
     """
@@ -248,7 +258,7 @@ def print_run(run: "Run", pictures: bool) -> None:
     give_result(**describe_run(run))
     assert run.folder is not None
     if run.stopped == "interrupted":
-        click.echo(f"  resume       verifai-jax falsify --resume {run.folder}")
+        click.echo(f"  resume       {resuming('falsify', run.folder, run.target, options)}")
     click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
         from verifai_jax.plotting import write_run_pictures
