@@ -23,7 +23,7 @@ from verifai_jax.core.checks import check_count
 from verifai_jax.core.errors import suggests_options
 from verifai_jax.core.gaps import with_gaps
 from verifai_jax.core.locks import returning_once
-from verifai_jax.core.trace import Status, Trace
+from verifai_jax.core.trace import Status, Trace, check_code
 from verifai_jax.systems.base import Features, FunctionSystem, Outcome, Seed, System, as_system
 from verifai_jax.systems.blackbox.workers import Pool
 
@@ -425,6 +425,9 @@ def stack_traces(
     """
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}
     first = None if times is None else np.asarray(times)[0]
+    for name, value in (("valid", valid), ("status", status)):
+        known = None if value is None else np.asarray(value)
+        check_code(name, known, "a whole number for each row")
     Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
     # A Trace is checked as one; unflattening is how JAX makes a batch of them.
     whole = Trace({name: np.zeros(1) for name in signals}, 1.0, held=held, finite=finite)
