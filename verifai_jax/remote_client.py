@@ -509,7 +509,7 @@ def address_of(text: str) -> tuple[str, int]:
     **Raises:** `ValueError` for anything else.
     """
     host, _, port = text.rpartition(":")
-    if not host or not port.isdigit():
+    if not host or not port.isdecimal():
         raise ValueError(f"an address is HOST:PORT, such as 127.0.0.1:4567; got {text!r}")
     return host.removeprefix("[").removesuffix("]"), int(port)
 

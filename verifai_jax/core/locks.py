@@ -123,7 +123,7 @@ def _open(path: str, flags: int) -> int:
 
 def _in_use(place: Path, owner: str) -> str:
     process, _, host = owner.partition(" ")
-    if not (process.isdigit() and host.isprintable()):
+    if not (process.isdecimal() and host.isprintable()):
         who = "another process"
     elif int(process) == os.getpid() and host == socket.gethostname():
         who = f"this process ({process}) already"

@@ -44,6 +44,7 @@ from verifai_jax.falsification.record import (
     FORMAT,
     RECORD,
     RECORDED,
+    numeric_features,
     read_record,
     record_checksum,
 )
@@ -196,8 +197,10 @@ class Run:
         return self._rate(confirmed, sum(counts.values()) - confirmed - counts.get("refuted", 0))
 
     def _rate(self, failures: int, undecided: int) -> Rate | None:
+        if not self.prior or self.has_several_models or self.table.changed:
+            return None
         without = self.table.counts.without_verdict
-        if not self.prior or self.simulations == without or self.has_several_models:
+        if self.simulations == without:
             return None
         stopped_by_outcomes = self.stopped in ("stop_after", "stop_when")
         interval = anytime_interval if stopped_by_outcomes else clopper_pearson
@@ -502,7 +505,9 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
             problem = problem.on_backend(record["backend"])
     begun = ErrorTable.exists(folder) or record["stopped"] != "running"
     # A run that was cut off before its first batch came to the disk has no rows yet.
-    table = ErrorTable.load(folder, features) if begun else ErrorTable(features)
+    table = ErrorTable(features)
+    if begun:
+        table = ErrorTable.load(folder, features, numeric_features(record))
     damage, checkpoint = [table.damage] if table.damage else [], None
     try:
         checkpoint = read_checkpoint(folder)
@@ -520,10 +525,12 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
             f"of {folder} are missing or damaged"
         )
     elif checkpoint and not table.missing and checkpoint[ROWS_CHECKSUM] != table.digest(seen):
-        damage.append(
+        changed = (
             f"the first {seen} rows of the table in {folder} are not those that its search had "
             f"seen: they have changed, or are of another run; {ANEW}"
         )
+        table.distrust(changed)
+        damage.append(changed)
     elif not len(table) and record["stopped"] != "running" and not (folder / FINISHED).exists():
         damage = damage or [f"{folder / TAIL} is damaged: it has no row that can be read"]
     elif checkpoint is None and not damage and len(table) and record["stopped"] != "running":
