@@ -164,9 +164,7 @@ def test_names_that_utf8_cannot_hold_are_refused():
         lambda: vj.Problem("\ud800", {"a": vj.Box(0, 1)}, masked, "always x > 0"),
         lambda: vj.Problem("p", {"a": vj.Box(0, 1)}, masked, {"\ud800": "always x > 0"}),
     ):
-        with pytest.raises(
-            ValueError, match="must be a text that UTF-8 can hold; '.ud.*has the lo"
-        ):
+        with pytest.raises(ValueError, match=r"must be a text that UTF-8 can hold; '.*surrogate"):
             make()
 
 
