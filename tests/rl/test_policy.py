@@ -183,16 +183,23 @@ def test_a_file_says_what_it_was_made_with(tmp_path):
         ({"bias1": np.zeros((2, 1))}, r"'bias1' must have shape \[2\]; got \[2, 1\]"),
         ({"weight0": np.zeros(2)}, r"'weight0' has shape \[2\]"),
         ({"n": 10}, "its network has 2 outputs, and its actions need 10"),
-        ({"n": "two"}, "not supported|the number n of its actions"),
+        ({"n": "two"}, "the number n of its actions must be an integer"),
         ({"n": 2.5}, "the number n of its actions must be an integer"),
         ({"mean": np.zeros(3), "scale": np.ones(3)}, r"'mean' must have shape \[2\]; got \[3\]"),
         ({"mean": np.zeros(2)}, "it has only one of the arrays 'mean' and 'scale'"),
         ({"mean": np.zeros(2), "scale": np.zeros(2)}, "'scale' must hold positive numbers"),
         ({"weight7": np.zeros((2, 2))}, "it has an array 'weight7', which belongs to no layer"),
-        ({"squash": "yes"}, "squash must be true or false|only continuous actions"),
-        ({"activation": 7}, "unknown activation"),
-        ({"action": None}, "holds no policy"),
-        ({"action": {"kind": "continuous", "low": 0.0, "high": float("inf"), "size": 2}}, "high"),
+        ({"squash": "yes"}, "its activation must be a text and squash true or false"),
+        ({"activation": 7}, "its activation must be a text"),
+        ({"action": None}, "its action must be an object of kind discrete or continuous"),
+        (
+            {"action": {"kind": "continuous", "low": 0.0, "high": float("inf"), "size": 2}},
+            "high of its action must be a finite",
+        ),
+        (
+            {"action": {"kind": "discrete", "n": 2, "size": 3}},
+            "its action must have n; got n, size",
+        ),
     ],
 )
 def test_a_damaged_policy_is_named_at_load(tmp_path, changed, told):

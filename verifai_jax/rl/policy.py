@@ -209,8 +209,7 @@ def load_policy(path: str | Path) -> Policy:
     """
     arrays, about = _read(path)
     try:
-        action = dict(about["action"])
-        kind = _KINDS[action.pop("kind")](**action)
+        kind = _action_of(about["action"])
         layers, rest = _layers_of(arrays)
         optional = {
             name: jax.device_put(rest.pop(name)) if name in rest else None
@@ -220,6 +219,10 @@ def load_policy(path: str | Path) -> Policy:
             raise ValueError(f"it has an array {min(rest)!r}, which belongs to no layer")
         # Files of before these two were fields have tanh networks that are not squashed.
         how = {name: about[name] for name in ("activation", "squash") if name in about}
+        if not isinstance(how.get("squash", False), bool) or not isinstance(
+            how.get("activation", ""), str
+        ):
+            raise ValueError(f"its activation must be a text and squash true or false; got {how}")
         policy = Policy(layers=layers, action=kind, **optional, **how)
         _check_fits(policy)
         return policy
@@ -228,6 +231,27 @@ def load_policy(path: str | Path) -> Policy:
         raise PolicyFileError(f"{path} holds no policy: {one_line(why)}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise PolicyFileError(f"{path} holds no policy: {one_line(str(error))}") from error
+
+
+def _action_of(data: object) -> Action:
+    """Return the kind of action that a file describes.
+
+    **Raises:** `ValueError` for data that describes none.
+    """
+    if not isinstance(data, dict) or data.get("kind") not in list(_KINDS):
+        raise ValueError(f"its action must be an object of kind {' or '.join(_KINDS)}")
+    kind = _KINDS[data["kind"]]
+    numbers = {name: value for name, value in data.items() if name != "kind"}
+    wanted = [field.name for field in dataclasses.fields(kind)]
+    if sorted(numbers) != sorted(wanted):
+        raise ValueError(f"its action must have {', '.join(wanted)}; got {', '.join(numbers)}")
+    for name, value in numbers.items():
+        if name in ("low", "high"):
+            if not is_number(value) or not math.isfinite(value):
+                raise ValueError(f"{name} of its action must be a finite number; got {value!r}")
+        else:
+            check_count(f"the number {name} of its actions", value)
+    return kind(**numbers)
 
 
 def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.ndarray]]:
@@ -259,18 +283,9 @@ def _check_fits(policy: Policy) -> None:
     **Raises:** `ValueError` for another number of outputs, or a scale that does not fit.
     """
     action, outputs = policy.action, policy.layers[-1][0].shape[1]
-    if isinstance(action, Discrete):
-        check_count("the number n of its actions", action.n, 2)
-        wanted = action.n
-    else:
-        wanted = check_count("the size of its action", action.size)
-        for name, end in (("low", action.low), ("high", action.high)):
-            if not is_number(end) or not math.isfinite(end):
-                raise ValueError(f"{name} of its action must be a finite number; got {end!r}")
+    wanted = action.n if isinstance(action, Discrete) else action.size
     if outputs != wanted:
         raise ValueError(f"its network has {outputs} outputs, and its actions need {wanted}")
-    if not isinstance(policy.squash, bool):
-        raise ValueError(f"squash must be true or false; got {policy.squash!r}")
     sizes = {"mean": policy.layers[0][0].shape[0], "scale": policy.layers[0][0].shape[0]}
     for name, size in {**sizes, "log_std": wanted}.items():
         array = getattr(policy, name)
