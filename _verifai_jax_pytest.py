@@ -207,7 +207,7 @@ def _failure(item: pytest.Item, found: Any, target: str | None) -> str:
     if outcome.replayed is not None:
         files += [str(one.path) for one in outcome.replayed.failing]
     if target is not None and files:
-        again = f"verifai-jax replay-counterexamples {target} {files[0]}"
+        again = shlex.join(["verifai-jax", "replay-counterexamples", target, files[0]])
     else:
         words = ["pytest", item.nodeid]
         if not files:

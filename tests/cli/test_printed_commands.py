@@ -77,7 +77,9 @@ def test_an_interrupted_run(tmp_path, monkeypatch, interrupted, verb, target, op
     output = called(verb, f"spec.py:{target}", *common, "--folder", "runs/a b", codes=(0, 1, 130))
     assert "stopped by Ctrl-C" in output or "interrupted" in output
     called(*printed(output, "runs/a b"), "--no-pictures")
-    called(verb, f"spec.py:{target}", *common, "--folder", "runs/whole")
+    whole_run = called(verb, f"spec.py:{target}", *common, "--folder", "runs/whole")
+    (replay,) = re.findall(r"^  replay +verifai-jax (.+)$", whole_run, re.MULTILINE)
+    assert "robustness" in called(*shlex.split(replay))
     gone_on, whole = (vj.load(f"runs/{name}").table.all for name in ("a b", "whole"))
     assert len(gone_on) == 64
     assert gone_on.equals(whole)

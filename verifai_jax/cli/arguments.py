@@ -187,7 +187,7 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
     if len(run.table.failed) == run.simulations:
         raise CommandError(
             f"no simulation of the run in {folder} had a verdict, of {run.simulations:,}; "
-            f"verifai-jax replay {folder} ROW simulates one again",
+            f"verifai-jax replay {shlex.quote(str(folder))} ROW simulates one again",
             BROKEN,
         )
     return run
@@ -238,7 +238,7 @@ def _describe_place(folder: Path, record: str, missing: str) -> str:
         there = f"; in {beside} there are {', '.join(runs)}" if runs else ""
         return f"no run in {folder}: there is no such folder{there}"
     if is_sweep(folder):
-        goes_on = f"verifai-jax sweep --resume {folder} goes on with it"
+        goes_on = f"{resuming('sweep', folder, None, {})} goes on with it"
         return f"no run in {folder}: it is the folder of a sweep; {goes_on}"
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
@@ -285,6 +285,19 @@ def refuse_with_resume(options: Mapping[str, object], noun: str) -> None:
             raise click.UsageError(f"{option} is fixed in the {noun} that --resume goes on with")
 
 
+def target_apart(folder: Path, target: str | None) -> str | None:
+    """Return the target of a run where its folder alone does not name it for a command."""
+    from verifai_jax.core.targets import TargetError, target_of_project
+
+    if target is None:
+        return None
+    try:
+        target_of_project(target, folder, kind="problem", remedy="")
+    except TargetError:
+        return target
+    return None
+
+
 def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
     """Write the command that goes on with a folder, as a shell reads it.
 
@@ -294,15 +307,8 @@ def resuming(command: str, folder: Path, target: str | None, options: Mapping[st
     - `target`: that the folder records; it is named where the record alone would not do.
     - `options`: that the record does not hold, with their values; those that are None are left out.
     """
-    from verifai_jax.core.targets import TargetError, target_of_project
-
-    words = ["verifai-jax", command]
-    if target is not None:
-        try:
-            target_of_project(target, folder, kind="problem", remedy="")
-        except TargetError:
-            words.append(target)
-    words += ["--resume", str(folder)]
+    apart = target_apart(folder, target)
+    words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]
     for option, value in options.items():
         words += [] if value is None else [option, str(value)]
     return shlex.join(words)

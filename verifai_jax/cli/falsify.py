@@ -1,5 +1,6 @@
 """`verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000`."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -26,6 +27,7 @@ from verifai_jax.cli.arguments import (
     recorded_target,
     refuse_with_resume,
     resuming,
+    target_apart,
 )
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
@@ -216,7 +218,7 @@ def _simulate_shard(
         problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=place
     )
     click.echo(f"  part         {place}")
-    click.echo(f"  merge        verifai-jax merge {place.parent}/*")
+    click.echo(f"  merge        verifai-jax merge {shlex.quote(str(place.parent))}/*")
 
 
 def _resumed_target(folder: Path) -> str:
@@ -267,7 +269,10 @@ def print_run(
             click.echo(f"  picture      {path}")
     failed = run.table.failed
     if len(failed) < run.simulations:
-        click.echo(f"  replay       verifai-jax replay {run.folder} {run.best.name}")
+        words = ["verifai-jax", "replay", str(run.folder), str(run.best.name)]
+        apart = target_apart(run.folder, run.target)
+        words += [] if apart is None else ["--problem", apart]
+        click.echo(f"  replay       {shlex.join(words)}")
         return
     if not run.simulations and run.stopped == "interrupted":
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)

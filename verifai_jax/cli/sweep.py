@@ -231,7 +231,8 @@ def _read_command(place: Path) -> dict[str, Any]:
 def _describe_place(place: Path) -> str:
     """Say what a place without finished work is."""
     if (place / "run.json").is_file():
-        return f": it is the folder of a run; verifai-jax falsify --resume {place} goes on with it"
+        goes_on = resuming("falsify", place, None, {})
+        return f": it is the folder of a run; {goes_on} goes on with it"
     if is_sweep(place):
         return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
     if not place.exists():

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -79,7 +80,8 @@ class SavedCounterexample:
         path = folder / self.name
         content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
         if self.target is not None:
-            content["reproduce"] = f"verifai-jax replay-counterexamples {self.target} {path}"
+            words = ["verifai-jax", "replay-counterexamples", self.target, str(path)]
+            content["reproduce"] = shlex.join(words)
         # Tests of one problem may write it at once, each in a process of its own.
         partial = path.with_suffix(f".{os.getpid()}.part")
         partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
