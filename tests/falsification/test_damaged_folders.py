@@ -193,11 +193,11 @@ def test_a_folder_that_is_whole_is_resumed(problem, whole, folders, tmp_path, mo
 def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tmp_path):
     folder = shutil.copytree(folders / "short", tmp_path / "run")
     frame = pd.read_parquet(folder / FINISHED)
-    frame.loc[40, "rho"] = np.float32(0.125)
+    frame.loc[40, "a"] = np.float32(0.125)
     frame.to_parquet(folder / FINISHED)
     run = vj.load(folder, problem)
     told = "the first 96 rows of the table .* are not those that its search had seen"
-    assert run.table.row(40)["rho"] == 0.125
+    assert run.table.row(40)["a"] == 0.125
     with pytest.raises(ValueError, match=f"cannot go on: {told}.*begin anew, from what it has"):
         vj.resume(folder, problem, budget=160)
     assert run.failure_rate is None
