@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 
 def with_gaps(name: str, signal: Any) -> Any:
@@ -39,7 +40,7 @@ def _listed(name: str, rows: list[Any] | tuple[Any, ...]) -> Any:
     """Return a list of samples as an array; one of values that JAX traces as it is."""
     if any(_is_masked(row) for row in rows):
         return np.ma.array(rows)
-    if any(isinstance(row, jax.core.Tracer) for row in jax.tree.leaves(rows)):
+    if any(isinstance(row, Tracer) for row in jax.tree.leaves(rows)):
         return rows
     try:
         return np.asarray(rows)
